@@ -49,9 +49,10 @@ def kawabata_1981(
 ) -> list[Experiment]:
     """Return biaxial tension of an isoprene rubber vulcanisate at stretches up to 3.7.
 
-    Stretches and engineering stresses, one experiment for each kind of test. Values of the file:
-    MPa. The standard deviation of the stresses, 0.01 MPa, is an assumption; zero of the strain and
-    area count as exact, since one sheet and one instrument gave all tests.
+    Stretches and engineering stresses, one experiment for each kind of test, in the order of
+    `tests`. Values of the file: MPa. The standard deviation of the stresses, 0.01 MPa, is an
+    assumption; zero of the strain and area count as exact, since one sheet and one instrument gave
+    all tests.
 
     Source: S. Kawabata, M. Matsuda, K. Tei, H. Kawai, Experimental survey of the strain energy
     density function of isoprene rubber vulcanizate, Macromolecules 14(1), 154–162 (1981). Numbers
@@ -63,9 +64,14 @@ def kawabata_1981(
         Material law, as of `Body`.
     tests : tuple of str
         Some of "uniaxial", "equibiaxial", "planar" (with the stress along the fixed width), and
-        "biaxial", all other pairs of stretches.
+        "biaxial", all other pairs of stretches. The first three by default.
     largest_stretch : float, optional
-        Largest stretch of the samples to use; all by default.
+        Largest stretch of the samples to use, along either axis; None for all.
+
+    Raises
+    ------
+    InputError
+        For an unknown test or material.
     """
     return [
         _rubber(
@@ -84,7 +90,8 @@ def kawabata_1981(
 def treloar_1944(
     material: MaterialLaw = "gent", *, largest_stretch: float | None = None
 ) -> list[Experiment]:
-    """Return uniaxial tension of vulcanised rubber (8 % S) at 20 °C at stretches up to 7.6.
+    """Return uniaxial tension of vulcanised rubber (8 % S) at 20 °C at stretches up to 7.6, a list
+    of one experiment.
 
     Stretch and engineering stress. Values of the file: MPa, converted from kgf/cm². The standard
     deviation of the stresses, 0.02 MPa, is an assumption.
@@ -98,7 +105,12 @@ def treloar_1944(
     material : str, Material or callable
         Material law, as of `Body`.
     largest_stretch : float, optional
-        Largest stretch of the samples to use; all by default.
+        Largest stretch of the samples to use; None for all.
+
+    Raises
+    ------
+    InputError
+        For an unknown material.
     """
     return [
         _rubber(
@@ -115,7 +127,8 @@ def treloar_1944(
 def diani(
     material: MaterialLaw = "yeoh", *, largest_stretch: float | None = None
 ) -> list[Experiment]:
-    """Return uniaxial tension of calendered rubber along calendering and across, up to 2.4.
+    """Return uniaxial tension of calendered rubber up to a stretch of 2.4: an experiment along the
+    calendering direction, then one across.
 
     The rubber is anisotropic and softens in its first cycles (Mullins effect). Stretch and
     engineering stress; values of the file: MPa. That the stress is engineering follows from its use
@@ -129,7 +142,12 @@ def diani(
     material : str, Material or callable
         Material law, as of `Body`.
     largest_stretch : float, optional
-        Largest stretch of the samples to use; all by default.
+        Largest stretch of the samples to use; None for all.
+
+    Raises
+    ------
+    InputError
+        For an unknown material.
     """
     return [
         _rubber(
@@ -203,7 +221,31 @@ def _rubber(
     largest_stretch: float | None = None,
     is_exact: bool = False,
 ) -> Experiment:
-    """Return the experiment of a table of stretches and stresses, by its name without ending."""
+    """Return the experiment of a table of stretches and stresses of the package.
+
+    Parameters
+    ----------
+    dataset : str
+        Name in `DATASETS`.
+    name : str
+        Name of the table without ending, and of the experiment.
+    material : str, Material or callable
+        Material law.
+    test : str
+        Kind of the test.
+    sigma_pa : float
+        Standard deviation of the stresses.
+    largest_stretch : float, optional
+        Samples with a larger stretch along either axis are left out; None for all samples.
+    is_exact : bool
+        Whether the zero of the strain and the area count as exact; otherwise they have the default
+        uncertainties of `Specimen`.
+
+    Raises
+    ------
+    InputError
+        If there is no such table, or the material or test is unknown.
+    """
     file = dataset_file(dataset, f"{name}.csv")
     table = read_specimen(file, SpecimenLayout(test=test, columns={}))
     limit = float("inf") if largest_stretch is None else largest_stretch

@@ -42,7 +42,8 @@ _IN_CHECKOUT = Path(__file__).parents[2] / "problems"
 
 
 def dataset_folder(name: str) -> Path:
-    """Return the folder of a dataset.
+    """Return the folder of a dataset, which contains its problem file: that of the package, else that
+    of the repository.
 
     Raises
     ------
@@ -65,7 +66,13 @@ def dataset_folder(name: str) -> Path:
 
 
 def dataset_file(name: str, file: str) -> Path:
-    """Return a file of a dataset; raise `InputError` if there is no such dataset."""
+    """Return the path of a file in the folder of a dataset; the file need not exist.
+
+    Raises
+    ------
+    InputError
+        If there is no dataset of this name, or it is not installed.
+    """
     return dataset_folder(name) / file
 
 
@@ -82,21 +89,24 @@ def read_problem(name: str) -> Problem:
 
 
 def copy_dataset(name: str, folder: Path) -> list[Path]:
-    """Copy the files of a dataset into a folder, which is created if necessary.
+    """Copy the files of a dataset into a folder, which is created if necessary; subfolders are not
+    copied.
 
-    Problem files name the JSON schema for editors like those of `create_problem`. Measured data of
-    others come with their licence.
+    Problem files name the JSON schema for editors like those of `create_problem`: by its address if
+    it has one, else the schema is written to the folder, too. Measured data of others come with
+    their licence.
 
     Returns
     -------
     list of Path
-        The problem file, followed by the other files, the licence and the schema.
+        The problem file, followed by the other files by name, the licence and the schema, if there
+        is one.
 
     Raises
     ------
     InputError
         If there is no dataset of this name, one of the files exists, or the folder cannot be
-        created.
+        created. If a file exists, nothing is copied.
     """
     source = dataset_folder(name)
     problem_file = source / DATASETS[name]
@@ -122,7 +132,9 @@ def copy_dataset(name: str, folder: Path) -> list[Path]:
 
 
 def _copy_file(file: Path, copy: Path, schema: str) -> None:
-    """Copy a file of a dataset; a problem file names the schema by an address or file name."""
+    """Copy a file of a dataset; in a TOML file whose first line names a schema, that is replaced by
+    the address or file name `schema`.
+    """
     if file.suffix == ".toml":
         text = file.read_text(encoding="utf-8")
         if text.startswith(_SCHEMA_COMMENT):

@@ -40,12 +40,16 @@ SMOOTH_BELOW_M_S = 1e-4
 
 @cache
 def unit_drag() -> NodeForce:
-    """Return the drag on surface nodes in a fluid of density 1 kg/m³.
+    """Return the drag on surface nodes in a fluid at rest of density 1 kg/m³, the same object at every
+    call.
 
-    Drag is linear in the density.
+    The force on a node with the share A of the surface [m²] is −½ c_d ¼ A √(|v|² + v₀²) v, with v₀
+    =
+    `SMOOTH_BELOW_M_S`; the caller multiplies it by the density.
     """
 
     def air_drag(x: ca.SX, v: ca.SX, at: ForceContext) -> ca.SX:
+        """Return the drag (3,) on a node, in a fluid of density 1 kg/m³."""
         speed = ca.sqrt(ca.sumsqr(v) + SMOOTH_BELOW_M_S**2)
         return -0.5 * DRAG_COEFFICIENT * FACING_SHARE * at.area_m2 * speed * v
 
@@ -55,13 +59,14 @@ def unit_drag() -> NodeForce:
 
 
 def placed_unit_drag(nodes: ElementNodes, volume_m3: Array) -> LocatedForce:
-    """Return `unit_drag` on the nodes of a body that have a share of its surface.
+    """Return `unit_drag` on the nodes of a body that have a share of its surface; it has no constants.
 
     Parameters
     ----------
     nodes : ElementNodes
+        Nodes of the elements, without those of obstacle frames.
     volume_m3 : (n,)
-        Lumped volume of every node of the body, including nodes of obstacle frames.
+        Lumped volume of every node of the body [m³], including nodes of obstacle frames.
     """
     on_surface = np.flatnonzero(surface_shares(nodes)[0] > 0)
     no_constants = np.zeros(0, dtype=np.int64)

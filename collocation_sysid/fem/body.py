@@ -64,7 +64,8 @@ class Linearisation:
         Lower triangles of the symmetric part of ∂f/∂v [N·s/m]; with Rayleigh damping −γ_r K − γ_m
         M.
     by_theta : (T, 3n, k)
-        Derivatives ∂f/∂θ, or by all k inputs.
+        Derivatives by the k constants θ (result of `Body`), or by all k inputs u (result of the
+        sum of forces in `model.forces`).
     by_position_skew : (T, m) or (T, 0)
         Lower triangles of the skew part of ∂f/∂x; empty if it is zero.
     by_velocity_skew : (T, m) or (T, 0)
@@ -218,7 +219,12 @@ class Body(Discretisation):
         if self.scan_conditions is not None:
             require_supported(parts)
         super().__init__(
-            parts, tuple(forces), mesh, element, evaluator, threads
+            parts,
+            tuple(forces),
+            mesh=mesh,
+            element=element,
+            evaluator=evaluator,
+            threads=threads,
         )
         # Lumped volume of every dof (3n,) for each part.
         self._lumped_m3 = [
@@ -240,9 +246,8 @@ class Body(Discretisation):
 
     @property
     def scan_conditions(self) -> UnderGravity | None:
-        """Gravity and held nodes of the scan of the mesh.
-
-        None if the mesh counts as stress-free.
+        """Gravity and held nodes during the scan of the mesh; None if the mesh counts as stress-free,
+        also where `rest_shape` was not stated.
         """
         return (
             self.rest_shape
@@ -258,7 +263,9 @@ class Body(Discretisation):
         )
 
     def rest_shape_failure(self, theta: Theta) -> str | None:
-        """Return why there is no stress-free shape at θ, with a remedy; None if there is one."""
+        """Return the message of the `RestShapeError` at θ (k,), with a remedy; None if there is a
+        stress-free shape, or if the mesh counts as stress-free.
+        """
         if self.inverse_equilibrium is None:
             return None
         try:
@@ -268,7 +275,14 @@ class Body(Discretisation):
         return None
 
     def stress_free_geometry(self, theta: Theta) -> Array:
-        """Return shape gradients and volumes (E, q, 3·nodes + 1) of the stress-free shape at θ."""
+        """Return shape gradients [1/m] and volumes [m³] (E, q, 3·nodes + 1) of the stress-free
+        shape at θ (k,); `geometry` itself if the mesh counts as stress-free.
+
+        Raises
+        ------
+        RestShapeError
+            If no stress-free shape has the mesh as its equilibrium under gravity.
+        """
         if self.inverse_equilibrium is None:
             return self.geometry
         return self._geometry_at(
@@ -276,12 +290,15 @@ class Body(Discretisation):
         )
 
     def with_stress_free(self, positions_m: Array) -> Body:
-        """Return this body with the same masses and another stress-free shape.
+        """Return a copy of this body with the same masses and another stress-free shape.
+
+        The mesh and `nodes_m` stay the computational reference; only `geometry` is that of the new
+        shape, and `rest_shape` is "stress_free". Kernels are built again at their first use.
 
         Parameters
         ----------
         positions_m : (n, 3)
-            Stress-free positions of the nodes.
+            Stress-free positions of all nodes [m], mid nodes included.
         """
         other = copy(self)
         other.geometry = self._geometry_at(positions_m)
@@ -330,7 +347,9 @@ class Body(Discretisation):
 
     @property
     def density_indices(self) -> list[int]:
-        """Indices in θ of the free densities."""
+        """Indices in θ of the free densities, in the order of the parts; empty if all are
+        stated.
+        """
         pairs = zip(self.parts, self._gamma_m_indices, strict=True)
         return [place + 1 for part, place in pairs if part.has_free_density]
 
@@ -351,7 +370,14 @@ class Body(Discretisation):
         }
 
     def _lumped_volume(self, part: BodyPart, shares: ArrayLike = 1.0) -> Array:
-        """Return the lumped volume (n,) of a part [m³], or of given fractions (E,) of its cells."""
+        """Return the lumped volume (n,) of a part [m³], in the mesh; zero at nodes outside the part.
+
+        Parameters
+        ----------
+        part : BodyPart
+        shares : (k,) or float
+            Factors of the volumes of the part's cells; coefficients of a field may be negative.
+        """
         volumes_m3 = self.mesh.volumes_m3[part.cells] * shares
         volume = np.zeros(len(self.nodes_m))
         np.add.at(
@@ -362,12 +388,18 @@ class Body(Discretisation):
         return volume
 
     def with_free_densities(self, parts: Collection[str]) -> Body:
-        """Return this body with the densities of exactly these parts among its constants.
+        """Return a body with the densities of exactly these parts among its constants.
 
         Parameters
         ----------
         parts : collection of str
-            Names of the parts; "" for the cells outside all regions.
+            Names of the parts; "" for the cells outside all regions. Densities of all other parts
+            have their stated values; names that no part has are ignored.
+
+        Returns
+        -------
+        Body
+            This body itself if the densities of exactly these parts are free already.
         """
         free = tuple(
             part
@@ -379,7 +411,9 @@ class Body(Discretisation):
 
     @property
     def field_lengths_m(self) -> dict[str, float]:
-        """Correlation lengths of the fields, by the names of their constants."""
+        """Correlation lengths [m] of the fields, by the names of their constants; empty without
+        fields.
+        """
         return {
             part.field_name: part.field.length_m
             for part in self.parts
@@ -387,8 +421,10 @@ class Body(Discretisation):
         }
 
     def with_field_lengths(self, lengths_m: Mapping[str, float]) -> Body:
-        """Return this body with other correlation lengths [m] of its fields, by the names of the
-        fields' constants; every field must be named.
+        """Return a copy of this body with other correlation lengths [m] of its fields, by the names of
+        the fields' constants (keys of `field_lengths_m`).
+
+        Other names are ignored; a field without a length is a KeyError.
         """
         fields = (
             part.field and part.field.with_length(lengths_m[part.field_name])
@@ -412,9 +448,9 @@ class Body(Discretisation):
         )
 
     def with_fields(self, fields: Mapping[str, FieldModes]) -> Body:
-        """Return this body with other fields, by the names of their constants.
+        """Return a copy of this body with other fields, by the names of their constants.
 
-        Fields that are not named stay.
+        Fields that are not named stay; names of constants without a field are ignored.
         """
         return self.with_parts(
             tuple(
@@ -424,7 +460,11 @@ class Body(Discretisation):
         )
 
     def with_parts(self, parts: tuple[BodyPart, ...]) -> Body:
-        """Return this body with other parts, which have the same cells as before."""
+        """Return a copy of this body with other parts, in the same number and with the same cells.
+
+        Custom forces and friction coefficients stay, and so do stated masses (`node_mass`) and
+        obstacle frames; θ and everything that depends on it follow the new parts.
+        """
         other = copy(self)
         for name in self._cached_names - {
             "pattern",
@@ -432,7 +472,9 @@ class Body(Discretisation):
             "part_of_cells",
         }:
             vars(other).pop(name, None)
-        ConstantsModel.__init__(other, parts, self.forces, self.frictions)
+        ConstantsModel.__init__(
+            other, parts, forces=self.forces, frictions=self.frictions
+        )
         other._evaluators = {}
         other._framed = {}
         return other
@@ -443,20 +485,20 @@ class Body(Discretisation):
         has_skew_contact: bool = False,
         frictions: tuple[Constant, ...] = (),
     ) -> Body:
-        """Return this body with the frames of obstacles: four further nodes each, which no cell
-        has.
+        """Return this body with the frames of obstacles: four further nodes each, which no cell has.
 
-        The nodes are at `frame_nodes_m`, after all others, and have no mass. Bodies with frames are
-        cached.
+        The nodes are at `frame_nodes_m`, after all others, and have no mass. Frames and friction
+        coefficients that the body already has are replaced, not extended. The result is this body
+        itself if nothing changes, and the same object for the same arguments.
 
         Parameters
         ----------
         count : int
-            Number of obstacles.
+            Number of obstacles; 0 removes all frames.
         has_skew_contact : bool
             Whether derivatives of the contact forces have a skew part.
         frictions : tuple of Constant
-            Friction coefficients that are parameters.
+            Friction coefficients that are parameters; the last entries of θ.
         """
         key = count, has_skew_contact, frictions
         if key == (len(self.frames), self.has_skew_contact, self.frictions):
@@ -465,7 +507,9 @@ class Body(Discretisation):
             other = copy(self)
             for name in self._cached_names - {"part_of_cells", "frame_nodes_m"}:
                 vars(other).pop(name, None)
-            ConstantsModel.__init__(other, self.parts, self.forces, frictions)
+            ConstantsModel.__init__(
+                other, self.parts, forces=self.forces, frictions=frictions
+            )
             other.has_skew_contact = has_skew_contact
             other._evaluators = {}
             first = len(self.nodes.points_m)
@@ -500,7 +544,9 @@ class Body(Discretisation):
 
     @cached_property
     def elastic_indices(self) -> list[int]:
-        """Indices in θ on which the stress depends: constants of the materials, and of fields."""
+        """Indices in θ on which the long-term stress depends: constants of the materials, and
+        coefficients of fields that scale a constant of the material or the damping law.
+        """
         indices: list[int] = []
         for part, start, modes in zip(
             self.parts, self.starts, self.field_slices, strict=False
@@ -513,7 +559,9 @@ class Body(Discretisation):
 
     @property
     def mass_kg(self) -> float:
-        """Total mass with the stated densities [kg]."""
+        """Total mass with the stated densities [kg], without tied masses; free densities and density
+        fields do not change it.
+        """
         return float(self.node_mass.sum())
 
     @cached_property
@@ -552,7 +600,9 @@ class Body(Discretisation):
         return slopes
 
     def densities(self, theta: Theta) -> list[float]:
-        """Return the mean density of each part at θ (k,) [kg/m³]."""
+        """Return the mean density of each part at θ (k,) [kg/m³]: the entry of θ if it is free,
+        else the stated value, which a density field does not change.
+        """
         return [
             float(theta[place + 1])
             if part.has_free_density
@@ -563,7 +613,9 @@ class Body(Discretisation):
         ]
 
     def mass_of_dofs(self, theta: Theta) -> Array:
-        """Return the lumped mass (3n,) of every degree of freedom at θ [kg]."""
+        """Return the lumped mass (3n,) of every degree of freedom at θ (k,) [kg], without tied masses;
+        zero at nodes of obstacle frames.
+        """
         if not self.mass_derivatives:
             return self.dof_mass
         return np.sum(self._part_masses(theta), axis=0)
@@ -620,7 +672,9 @@ class Body(Discretisation):
 
     @cached_property
     def placed_forces(self) -> tuple[LocatedForce, ...]:
-        """Custom forces on their nodes or faces."""
+        """Custom forces on their nodes or faces, in the order of `forces`; a force without `nodes`
+        acts on all nodes. Constants of each are the entries of θ after those of the parts.
+        """
         volume = self.dof_volume_m3[::3]
         first = self.starts[-1]
         placed = []
@@ -666,8 +720,13 @@ class Body(Discretisation):
     def joint_pattern_with(
         self, couplings: Sequence[SymmetricPattern]
     ) -> JointPattern:
-        """Return the union of the mesh graph, other couplings and the couplings of custom
+        """Return the union of the mesh graph with further couplings of nodes and those of custom
         forces.
+
+        Parameters
+        ----------
+        couplings : sequence of SymmetricPattern
+            Couplings of the same dofs by other forces.
         """
         custom = (placed.points.couplings for placed in self.placed_forces)
         return JointPattern.from_patterns((self.pattern, *couplings, *custom))
@@ -687,17 +746,19 @@ class Body(Discretisation):
         """
         x = self._state(positions)
         return float(
-            self._evaluate("energy", [x], self.elastic_theta(constants))[0, 0]
+            self._evaluate("energy", [x], theta=self.elastic_theta(constants))[
+                0, 0
+            ]
         )
 
     def elastic_force(self, positions: ArrayLike, **constants: float) -> Array:
         """Return the elastic force −∂Ψ/∂x, (n, 3) [N], at (n, 3) node positions [m].
 
-        See `energy` for the constants.
+        See `energy` for the constants and errors.
         """
         x = self._state(positions)
         force = self._evaluate(
-            "force", [x, np.zeros_like(x)], self.elastic_theta(constants)
+            "force", [x, np.zeros_like(x)], theta=self.elastic_theta(constants)
         )
         return force.reshape(-1, 3)
 
@@ -706,12 +767,13 @@ class Body(Discretisation):
     ) -> sp.csc_array:
         """Return the stiffness K = ∂²Ψ/∂x², sparse (3n, 3n) [N/m], at (n, 3) node positions [m].
 
-        Row 3i + j is coordinate j of node i. See `energy` for the constants.
+        Both triangles are stored. Row 3i + j is coordinate j of node i. See `energy` for the
+        constants and errors.
         """
         x = self._state(positions)
         theta = self.elastic_theta(constants)
         return self.pattern.matrix(
-            -self.linearise(x, np.zeros_like(x), theta).by_position[0]
+            -self.linearise(x, np.zeros_like(x), theta=theta).by_position[0]
         )
 
     # Many states ----------------------------------------------------------------------------
@@ -724,7 +786,9 @@ class Body(Discretisation):
         tied_kg: Array | None = None,
         memory_input: MemoryInput | None = None,
     ) -> Array:
-        """Return the internal force f(x, v; θ), (T, 3n) [N].
+        """Return the internal force f(x, v; θ), (T, 3n) [N]: elastic, viscous and −γ_m M v.
+
+        Weight and custom forces are not included.
 
         Parameters
         ----------
@@ -733,13 +797,21 @@ class Body(Discretisation):
         theta : (k,)
             Constants in the order of `constants`.
         tied_kg : (3n,) or (T, 3n), optional
-            Tied masses, which γ_m damps beside the mass of the body.
+            Tied masses [kg], which γ_m damps beside the mass of the body; None for no tied mass.
         memory_input : MemoryInput, optional
-            Internal variables of a body with memory; zero overstress by default.
+            Internal variables of a body with memory; None for relaxed memory, without overstress
+            and stiffening.
+
+        Raises
+        ------
+        InputError
+            If θ or the node fields have the wrong size.
+        RestShapeError
+            If the mesh is a shape under gravity and no stress-free shape exists at θ.
         """
         x, v = self._states(positions, velocities)
         internal = self._evaluate(
-            "force", [x, v], theta, memory_input=memory_input
+            "force", [x, v], theta=theta, memory_input=memory_input
         )
         return internal - self._damping_coefficients(theta, tied_kg) * v
 
@@ -754,23 +826,39 @@ class Body(Discretisation):
     ) -> Linearisation:
         """Return the internal force and its first derivatives at T states, see `force`.
 
-        The internal variables of a memory are held fixed; `viscoelasticity` provides their
-        derivatives.
+        The internal variables of a memory are constant in the derivatives; `model.viscoelasticity`
+        provides derivatives by them.
 
         Parameters
         ----------
         positions, velocities : (T, n, 3), (T, 3n) or one state (n, 3)
+            Positions [m] and velocities [m/s].
         theta : (k,)
             Constants in the order of `constants`.
         out : (T, linearisation_width), optional
-            Memory for the result, whose arrays are views of it.
+            Contiguous memory for the result, overwritten. All returned arrays are views of it, or
+            of new memory if None.
         tied_kg : (3n,) or (T, 3n), optional
-            Tied masses, which γ_m damps beside the mass of the body.
+            Tied masses [kg], which γ_m damps beside the mass of the body; None for no tied mass.
         memory_input : MemoryInput, optional
-            Internal variables of a body with memory; zero overstress by default.
+            Internal variables of a body with memory; None for relaxed memory, where derivatives by
+            the constants of the memory are zero.
+
+        Raises
+        ------
+        InputError
+            If θ, the node fields or `out` have the wrong size.
+        RestShapeError
+            If the mesh is a shape under gravity and no stress-free shape exists at θ.
         """
         x, v = self._states(positions, velocities)
-        rows = self._evaluate("linearisation", [x, v], theta, out, memory_input)
+        rows = self._evaluate(
+            "linearisation",
+            [x, v],
+            theta=theta,
+            out=out,
+            memory_input=memory_input,
+        )
         size = self.pattern.size
         entries = self.pattern.entry_count
         width = len(self.constants) * size
@@ -790,7 +878,7 @@ class Body(Discretisation):
             spread = self.field_assemblies[number]
             slopes = spread.field.jacobian(np.asarray(theta)[columns])
             spread.assemble_nodal(
-                outputs["by_theta"], slopes, by_theta[:, :, columns]
+                outputs["by_theta"], slopes, out=by_theta[:, :, columns]
             )
         for column, slope in self._damping_derivatives(theta, tied_kg):
             # A density also changes the stress-free shape of a mesh made under gravity.
@@ -873,10 +961,10 @@ class Body(Discretisation):
         tied_kg: Array | None = None,
         memory_input: MemoryInput | None = None,
     ) -> SecondDerivatives:
-        """Return the second derivatives of wᵀ f + σ·S at T states, see `SecondDerivatives` and
-        `force`.
+        """Return the second derivatives of φ = wᵀ f + σ·S at T states, see `SecondDerivatives` and
+        `force`; ∂²φ/∂v² is empty, (T, 0).
 
-        The internal variables of a memory are held fixed.
+        The internal variables of a memory are constant in the derivatives.
 
         Parameters
         ----------
@@ -885,26 +973,54 @@ class Body(Discretisation):
         theta : (k,)
             Constants in the order of `constants`.
         out : (T, curvature_width), optional
-            Memory for the result, whose arrays are views of it.
+            Contiguous memory for the result, overwritten; returned arrays may be views of it.
         tied_kg : (3n,) or (T, 3n), optional
-            Tied masses, which γ_m damps beside the mass of the body.
+            Tied masses [kg], which γ_m damps beside the mass of the body; None for no tied mass.
         memory_input : MemoryInput, optional
-            Internal variables of a body with memory and the weights σ of the stress S.
+            Internal variables of a body with memory and the weights σ of the stress S. None for
+            relaxed memory and σ = 0; without `stress_weights` σ = 0. Ignored if the body has no
+            memory.
+
+        Raises
+        ------
+        InputError
+            If θ, the node fields or `out` have the wrong size.
+        RestShapeError
+            If the mesh is a shape under gravity and no stress-free shape exists at θ.
         """
         x, v, w = self._states(positions, velocities, weights)
         if self.has_memory:
             memory_input = memory_input or self.memory.relaxed(len(x))
-            stress_weights = memory_input.stress_weights
-            if stress_weights is None:
-                stress_weights = np.zeros_like(memory_input.overstress)
-            # The kernel reads H and σ as one row.
-            past = replace(
-                memory_input,
-                overstress=np.hstack([memory_input.overstress, stress_weights]),
-            )
-            rows = self._evaluate("curvature", [x, v, w], theta, out, past)
-        else:
-            rows = self._evaluate("curvature", [x, v, w], theta, out)
+        rows = self._evaluate(
+            "curvature",
+            [x, v, w],
+            theta=theta,
+            out=out,
+            memory_input=_with_weights_appended(memory_input)
+            if self.has_memory and memory_input is not None
+            else None,
+        )
+        curvature = self._curvature_views(rows)
+        for column, slope in self._damping_derivatives(theta, tied_kg):
+            drag = -slope * w
+            curvature.velocity_theta[:, :, column] += drag
+            curvature.theta[:, column] += np.einsum("ti,ti->t", drag, v)
+        self._set_field_curvature(curvature, rows, theta=theta)
+        self._apply_stiffening_to_curvature(curvature, memory_input)
+        for gamma, mass_slopes in zip(
+            self._gamma_m_indices, self._mass_slopes, strict=True
+        ):
+            for place, slope in mass_slopes.items():
+                mixed = -np.einsum("ti,ti,i->t", w, v, slope)
+                curvature.theta_theta[:, place, gamma] = mixed
+                curvature.theta_theta[:, gamma, place] = mixed
+        return curvature
+
+    def _curvature_views(self, rows: Array) -> SecondDerivatives:
+        """Return result rows (T, width) of the kernel "curvature" as views by their meaning, without
+        derivatives by fields; ∂²φ/∂v² is empty.
+        """
+        count = len(rows)
         size = self.pattern.size
         entries = self.pattern.entry_count
         k = len(self.constants)
@@ -913,48 +1029,70 @@ class Body(Discretisation):
             np.cumsum([entries, entries, k * size, k * size, k * k, k]),
             axis=1,
         )
-        x_theta, v_theta = (
-            part.reshape(len(x), size, k) for part in (x_theta, v_theta)
+        return SecondDerivatives(
+            xx,
+            xv,
+            position_theta=x_theta.reshape(count, size, k),
+            velocity_theta=v_theta.reshape(count, size, k),
+            theta_theta=theta_theta.reshape(count, k, k),
+            theta=by_theta,
+            position_velocity_skew=skew,
+            velocity_velocity=np.zeros((count, 0)),
         )
-        for column, slope in self._damping_derivatives(theta, tied_kg):
-            drag = -slope * w
-            v_theta[:, :, column] += drag
-            by_theta[:, column] += np.einsum("ti,ti->t", drag, v)
-        theta_theta = theta_theta.reshape(len(x), k, k)
+
+    def _set_field_curvature(
+        self, curvature: SecondDerivatives, rows: Array, theta: Theta
+    ) -> None:
+        """Set the derivatives by coefficients of fields, in place, from those by the logarithm of
+        each cell.
+
+        Parameters
+        ----------
+        curvature : SecondDerivatives
+            Entries of the coefficients are overwritten.
+        rows : (T, width)
+            Result of the kernel "curvature".
+        theta : (k,)
+        """
         for number, outputs in self._field_outputs("curvature", rows):
-            field_columns = self.field_slices[number]
+            columns = self.field_slices[number]
             spread = self.field_assemblies[number]
-            coefficients = np.asarray(theta)[field_columns]
+            coefficients = np.asarray(theta)[columns]
             slopes = spread.field.jacobian(coefficients)
-            spread.assemble_nodal(
-                outputs["position_theta"], slopes, x_theta[:, :, field_columns]
-            )
-            spread.assemble_nodal(
-                outputs["velocity_theta"], slopes, v_theta[:, :, field_columns]
-            )
-            by_theta[:, field_columns] = outputs["gradient_theta"] @ slopes
+            for output, by_nodes in (
+                ("position_theta", curvature.position_theta),
+                ("velocity_theta", curvature.velocity_theta),
+            ):
+                spread.assemble_nodal(
+                    outputs[output], slopes, out=by_nodes[:, :, columns]
+                )
+            by_logarithm = outputs["gradient_theta"]
+            curvature.theta[:, columns] = by_logarithm @ slopes
             first = self.starts[number]
-            points = self.parts[number].point_constant_count
-            second_by_theta = outputs["theta_theta"].reshape(
-                len(x), len(slopes), -1
-            )
-            mixed = np.einsum(
-                "tek,em->tkm", second_by_theta[:, :, :points], slopes
-            )
-            theta_theta[:, first : first + points, field_columns] = mixed
-            theta_theta[:, field_columns, first : first + points] = (
-                mixed.swapaxes(1, 2)
-            )
-            weighted_slopes = second_by_theta[:, :, points, None] * slopes
+            count = self.parts[number].point_constant_count
+            constants = slice(first, first + count)
+            second = outputs["theta_theta"].reshape(len(rows), len(slopes), -1)
+            mixed = np.einsum("tek,em->tkm", second[:, :, :count], slopes)
+            curvature.theta_theta[:, constants, columns] = mixed
+            curvature.theta_theta[:, columns, constants] = mixed.swapaxes(1, 2)
             by_coefficients = spread.field.weighted_hessian(
-                coefficients, outputs["gradient_theta"]
+                coefficients, by_logarithm
             )
-            theta_theta[:, field_columns, field_columns] = (
-                slopes.T @ weighted_slopes + by_coefficients
+            curvature.theta_theta[:, columns, columns] = (
+                slopes.T @ (second[:, :, count, None] * slopes)
+                + by_coefficients
             )
+
+    def _apply_stiffening_to_curvature(
+        self, curvature: SecondDerivatives, memory_input: MemoryInput | None
+    ) -> None:
+        """Replace first and second derivatives by the stiffening of each part by those by the
+        constants of its memory, in place; see `_apply_stiffening_chain_rule`.
+        """
+        theta_theta = curvature.theta_theta
         for values in (
-            x_theta,
-            v_theta,
+            curvature.position_theta,
+            curvature.velocity_theta,
             theta_theta,
             theta_theta.swapaxes(1, 2),
         ):
@@ -965,27 +1103,10 @@ class Body(Discretisation):
                     :, columns, columns
                 ]
                 theta_theta[:, columns, columns] += (
-                    by_theta[:, first, None, None] * bends
+                    curvature.theta[:, first, None, None] * bends
                 )
-        self._apply_stiffening_chain_rule(by_theta[:, None], memory_input)
-        for gamma, mass_slopes in zip(
-            self._gamma_m_indices, self._mass_slopes, strict=True
-        ):
-            for place, slope in mass_slopes.items():
-                mixed = -np.einsum("ti,ti,i->t", w, v, slope)
-                theta_theta[:, place, gamma] = theta_theta[:, gamma, place] = (
-                    mixed
-                )
-        empty = np.zeros((len(x), 0))
-        return SecondDerivatives(
-            xx,
-            xv,
-            position_theta=x_theta,
-            velocity_theta=v_theta,
-            theta_theta=theta_theta,
-            theta=by_theta,
-            position_velocity_skew=skew,
-            velocity_velocity=empty,
+        self._apply_stiffening_chain_rule(
+            curvature.theta[:, None], memory_input
         )
 
     @cached_property
@@ -1034,8 +1155,8 @@ class Body(Discretisation):
     def _damping_coefficients(
         self, theta: Theta, tied_kg: Array | None
     ) -> Array:
-        """Return the coefficients Σ γ_m M (3n,) or (T, 3n) of mass-proportional damping [N·s/m];
-        see `_damped_masses` for the tied masses.
+        """Return the coefficients Σ γ_m M of mass-proportional damping [N·s/m] at θ (k,): (3n,), or
+        (T, 3n) if `tied_kg` is; see `_damped_masses` for the tied masses.
         """
         # `numpy.sum` of a list takes longer than the products.
         return reduce(
@@ -1049,8 +1170,9 @@ class Body(Discretisation):
     def _damping_derivatives(
         self, theta: Theta, tied_kg: Array | None
     ) -> Iterator[tuple[int, Array]]:
-        """Yield index and derivative of `_damping_coefficients` by each γ_m and by each constant of
-        a density; an index can occur more than once, then derivatives add up.
+        """Yield index in θ and derivative, (3n,) or (T, 3n), of `_damping_coefficients` at `theta`
+        by each γ_m and by each constant of a density; an index can occur more than once, then
+        derivatives add up. `tied_kg` is that of `_damped_masses`.
         """
         yield from self._damped_masses(theta, tied_kg)
         for gamma, own in zip(
@@ -1059,3 +1181,15 @@ class Body(Discretisation):
             yield from (
                 (place, theta[gamma] * slope) for place, slope in own.items()
             )
+
+
+def _with_weights_appended(memory_input: MemoryInput) -> MemoryInput:
+    """Return the memory with rows (T, 2 width) of H, then σ, as the kernel "curvature" reads them;
+    σ is zero where no stress weights are given.
+    """
+    weights = memory_input.stress_weights
+    if weights is None:
+        weights = np.zeros_like(memory_input.overstress)
+    return replace(
+        memory_input, overstress=np.hstack([memory_input.overstress, weights])
+    )

@@ -38,7 +38,9 @@ class SymbolicFunction:
     symbols: dict[PartialIndex, ca.SX] = field(default_factory=dict)
 
     def symbol(self, index: PartialIndex = ()) -> ca.SX:
-        """Return the symbol of a partial derivative; of the function itself by default."""
+        """Return the symbol of a partial derivative, in any order of its index; of the function
+        itself by default. A new symbol is added to `symbols`.
+        """
         key = tuple(sorted(index))
         if key not in self.symbols:
             self.symbols[key] = ca.SX.sym("_".join(map(str, ("partial", *key))))
@@ -60,8 +62,9 @@ class SymbolicFunction:
     def shifted(
         self, indices: Sequence[PartialIndex], arguments: Sequence[int]
     ) -> ca.SX:
-        """Return the symbols (k, a) of the derivatives of k partial derivatives by a of the
-        arguments, which are given by index.
+        """Return the symbols (k, a) of the derivatives of k partial derivatives by a of the arguments,
+        given by index: entry (i, j) is the derivative of the ith by the jth. New symbols are added
+        to `symbols`.
         """
         return ca.vertcat(
             *(

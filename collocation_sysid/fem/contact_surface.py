@@ -63,15 +63,22 @@ class ContactSurface:
     def from_body(
         cls, body: Body, frame: Index, chosen: Selection | None
     ) -> ContactSurface:
-        """Return the contact points of a body and the frame of an obstacle.
+        """Return the contact points of a body and the frame of an obstacle: 3 on each linear face,
+        6 on each quadratic one, face after face.
 
         Parameters
         ----------
         body : Body
+            Body with frames, see `Body.with_frames`.
         frame : (4,) int
             Nodes of the obstacle's frame.
         chosen : Selection or None
-            Faces that may touch; None for all.
+            Faces that may touch; None for the whole surface.
+
+        Raises
+        ------
+        InputError
+            If no face is selected.
         """
         rows = np.arange(len(body.mesh.surface))
         if chosen is not None:

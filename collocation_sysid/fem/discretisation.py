@@ -19,6 +19,7 @@ from ..common.array_types import Array, Index
 from ..errors import InputError
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, PointLaw, energy_kernel
+from .kernel import ElementKernel
 from .kernels import (
     COMPILING,
     Evaluator,
@@ -65,15 +66,21 @@ class Discretisation(ConstantsModel):
     nodes : ElementNodes
         Nodes of the elements.
     nodes_m : (n, 3)
-        Undeformed node positions, including obstacle frames.
+        Undeformed node positions, including obstacle frames [m].
     frames : (k, 4)
-        Indices of the nodes of obstacle frames.
+        Indices of the nodes of obstacle frames; (0, 4) until `Body.with_frames` adds some.
     has_skew_contact : bool
         Whether derivatives of contact forces have a skew part.
     cells : (E, nodes per element)
         Node indices of each element.
     geometry : (E, q, 3·nodes + 1)
         Shape gradients and volumes, see `elements.reference_geometry`.
+
+    Raises
+    ------
+    InputError
+        For an unknown element or evaluator, memory in an element with mean dilatation, constants of
+        equal names, or a material that the evaluator "simd" cannot evaluate.
     """
 
     def __init__(
@@ -131,7 +138,9 @@ class Discretisation(ConstantsModel):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Reasons why the evaluator is not "simd", if the material is the cause."""
+        """Sentences that state why the evaluator is "casadi" although "auto" was chosen; empty if the
+        material is not the cause.
+        """
         return self._choice.notes
 
     def make_evaluator(self, batch: KernelBatch) -> Evaluator:
@@ -177,10 +186,13 @@ class Discretisation(ConstantsModel):
         return None
 
     def point_constants(self, number: int, theta: Theta) -> Array:
-        """Return the constants of the quadrature points of a part at θ, by the index of the part.
+        """Return the constants (`PointLaw.constant_count`,) of the quadrature points of the part
+        with index `number`, at θ (k,).
 
-        For a stress-free shape that is not the mesh, changes of its inputs follow; they are zero,
-        because the shape has been computed at this θ.
+        These are the constants of material and damping law, of a part with memory also the first
+        constant of its first branch, in whose place the caller sets the stiffening. For a
+        stress-free shape that is not the mesh, changes of its inputs follow; they are zero, because
+        the shape has been computed at this θ.
         """
         part_constants = np.asarray(
             self.split_theta(theta)[number], dtype=float
@@ -199,11 +211,11 @@ class Discretisation(ConstantsModel):
         internal_variables: Array | None = None,
         with_second_derivatives: bool = False,
     ) -> Array | None:
-        """Return the data of the quadrature points of a part, or None if they have none.
+        """Return the data of the quadrature points of a part; None if they have none.
 
-        These are the internal variables (T, any), followed by the logarithms of a field; for a
-        stress-free shape that is not the mesh its data (1, any), since such a body has neither
-        memory nor field.
+        These are the internal variables (T, any), followed by the logarithms of a field, the same
+        at all times: (1, any) without internal variables. For a stress-free shape that is not the
+        mesh they are its data (1, any), since such a body has neither memory nor field.
 
         Parameters
         ----------
@@ -211,9 +223,14 @@ class Discretisation(ConstantsModel):
             Index of the part.
         theta : (k,)
         internal_variables : (T, any), optional
-            Internal variables of the points.
+            Internal variables of the points; not used for a stress-free shape that is not the mesh.
         with_second_derivatives : bool
-            Whether to include second derivatives of the stress-free shape.
+            Whether to include second derivatives of the stress-free shape; zero otherwise.
+
+        Raises
+        ------
+        RestShapeError
+            If the mesh is a shape under gravity and no stress-free shape exists at θ.
         """
         if self.inverse_equilibrium is not None:
             return self.inverse_equilibrium.point_data(
@@ -262,15 +279,20 @@ class Discretisation(ConstantsModel):
         return with_ascending_nodes(cells, geometry)
 
     def field_output_slices(self, name: str) -> dict[tuple[int, str], slice]:
-        """Return the slices of a result row that hold derivatives by the logarithm of each cell.
-
-        The keys are the index of the part and the output. Each cell has d numbers of a vector, or
-        one; for ∂²φ/∂θ² those with each θ of the points, with the logarithm, and the first again.
+        """Return the slices of a result row that hold derivatives by the logarithm z of each cell.
 
         Parameters
         ----------
         name : str
-            Kernel.
+            Kernel in `expressions.KERNELS`; the result is empty unless `BY_FIELD` has it.
+
+        Returns
+        -------
+        dict of (int, str) to slice
+            By the index of the part and the name of the output, cell after cell. Each cell has one
+            number for "gradient_theta" (∂φ/∂z), one for every dof of the cell for the outputs that
+            are vectors by θ, and 2 c + 1 for "theta_theta" with the c constants of the points:
+            ∂²φ/∂z∂θ (c), ∂²φ/∂z², and ∂²φ/∂θ∂z (c) again.
         """
         start = self._width_without_fields(name)
         slices = {}
@@ -291,7 +313,9 @@ class Discretisation(ConstantsModel):
 
     @cached_property
     def memory(self) -> MemoryLayout:
-        """Layout of the internal variables of the parts with memory."""
+        """Layout of the internal variables of the parts with memory; of width zero if there are
+        none.
+        """
         first_indices = [
             s + p.law_constant_count
             for p, s in zip(self.parts, self.starts, strict=False)
@@ -305,8 +329,8 @@ class Discretisation(ConstantsModel):
 
     @cached_property
     def is_unsymmetric(self) -> bool:
-        """Whether a derivative of the forces by position or velocity has a skew part: that of a
-        damping law with a stress, of contact with friction, or of a custom force.
+        """Whether a derivative of the forces by position or velocity can have a skew part: that of a
+        damping law given as a stress, of contact (`has_skew_contact`), or of a custom force.
         """
         laws = any(part.damping.stress is not None for part in self.parts)
         return (
@@ -324,12 +348,12 @@ class Discretisation(ConstantsModel):
 
     @cached_property
     def linearisation_width(self) -> int:
-        """Length of one time step's row of `linearise`."""
+        """Length of one time step's row of `Body.linearise`."""
         return self._width("linearisation")
 
     @cached_property
     def curvature_width(self) -> int:
-        """Length of one time step's row of `curvature`."""
+        """Length of one time step's row of `Body.second_derivatives`."""
         return self._width("curvature")
 
     def volume_ratios(self, positions: ArrayLike) -> Array:
@@ -356,7 +380,10 @@ class Discretisation(ConstantsModel):
 
     @cached_property
     def shape_gradients(self) -> sp.csr_array:
-        """Derivatives of the shape functions (3 E q, n), axis by axis at all quadrature points."""
+        """Derivatives of the shape functions by position [1/m], sparse (3 E q, n): all quadrature
+        points for axis x, element by element, then for y, then for z. Frame nodes have empty
+        columns.
+        """
         count, points = self.geometry.shape[:2]
         gradients = self.geometry[..., :-1].reshape(
             count, points, self.element.nodes, 3
@@ -458,24 +485,33 @@ class Discretisation(ConstantsModel):
                 point_data = self.point_data(
                     k, theta, with_second_derivatives=name == "curvature"
                 )
-                evaluate(fields, values, out, self.threads, k > 0, point_data)
+                evaluate(
+                    fields,
+                    values,
+                    out=out,
+                    threads=self.threads,
+                    add=k > 0,
+                    data_of_points=point_data,
+                )
                 continue
             past = memory_input or self.memory.relaxed(len(out))
             for rows, values[-1] in past.equal_stiffening_rows(k):
                 row_fields = [field[rows] for field in fields]
-                point_data = self.point_data(k, theta, past.overstress[rows])
+                point_data = self.point_data(
+                    k, theta, internal_variables=past.overstress[rows]
+                )
                 evaluate(
                     row_fields,
                     values,
-                    out[rows],
-                    self.threads,
-                    k > 0,
-                    point_data,
+                    out=out[rows],
+                    threads=self.threads,
+                    add=k > 0,
+                    data_of_points=point_data,
                 )
         return out
 
     def _width(self, name: str) -> int:
-        """Return the length of a result row of a kernel."""
+        """Return the length of a result row of a kernel, including derivatives by fields."""
         ends = (place.stop for place in self.field_output_slices(name).values())
         return max(ends, default=self._width_without_fields(name))
 
@@ -492,15 +528,49 @@ class Discretisation(ConstantsModel):
         }[name]
 
     def _batch(self, name: str, number: int) -> KernelBatch:
-        """Return the batch of a kernel and part, given by the name of the kernel and the index of
-        the part: where each output goes in the result row.
+        """Return the batch of a kernel for a part: where each output goes in the result row.
 
         A row holds vectors, lower triangles, and columns for all of θ.
+
+        Parameters
+        ----------
+        name : str
+            Kernel in `expressions.KERNELS`.
+        number : int
+            Index of the part.
         """
         part = self.parts[number]
         memory = bool(part.prony) and name != "energy"
         kernel = KERNELS[name](self.element, self.law(number, memory))
         cells, geometry = self.part_elements(part)
+        destinations = self._destinations(name, number, cells, kernel)
+        columns = self._data_columns(name, number, points=geometry.shape[1])
+        return KernelBatch(
+            kernel,
+            cells,
+            geometry=geometry,
+            destinations=destinations,
+            width=self._width(name),
+            data_columns=columns if columns.shape[-1] else None,
+        )
+
+    def _destinations(
+        self, name: str, number: int, cells: Index, kernel: ElementKernel
+    ) -> Index:
+        """Return the position (E, outputs) in a result row of every entry of the outputs of a
+        kernel.
+
+        Parameters
+        ----------
+        name : str
+            Name of the kernel.
+        number : int
+            Index of the part.
+        cells : (E, nodes) int
+            Nodes of the part's elements, in the order of the kernel.
+        kernel : ElementKernel
+        """
+        part = self.parts[number]
         vector, lower = element_destinations(self.pattern, cells)
         total = len(self.constants)
         count = len(cells)
@@ -513,82 +583,75 @@ class Discretisation(ConstantsModel):
             count, -1
         )
         square = (columns[:, None] + total * columns).ravel()
-        first_entry = np.zeros((count, 1), dtype=np.int64)
+        # Positions and length of each kind of output.
+        energy = np.zeros((count, 1), dtype=np.int64), 1
+        nodal = vector, self.pattern.size
+        matrix = lower, self.pattern.entry_count
+        nodal_by_theta = by_theta, total * self.pattern.size
+        theta = np.broadcast_to(columns, (count, len(columns))), total
+        theta_theta = np.broadcast_to(square, (count, len(square))), total**2
         places = {
-            "energy": (first_entry, 1),
-            "force": (vector, self.pattern.size),
-            "by_position": (lower, self.pattern.entry_count),
-            "by_velocity": (lower, self.pattern.entry_count),
-            "by_theta": (by_theta, total * self.pattern.size),
-            "position_position": (lower, self.pattern.entry_count),
-            "position_velocity": (lower, self.pattern.entry_count),
-            "position_theta": (by_theta, total * self.pattern.size),
-            "velocity_theta": (by_theta, total * self.pattern.size),
-            "theta_theta": (
-                np.broadcast_to(square, (count, len(square))),
-                total**2,
-            ),
-            "gradient_theta": (
-                np.broadcast_to(columns, (count, len(columns))),
-                total,
-            ),
-            "by_position_skew": (lower, self.pattern.entry_count),
-            "position_velocity_skew": (lower, self.pattern.entry_count),
+            "energy": energy,
+            "force": nodal,
+            "by_position": matrix,
+            "by_velocity": matrix,
+            "by_theta": nodal_by_theta,
+            "position_position": matrix,
+            "position_velocity": matrix,
+            "position_theta": nodal_by_theta,
+            "velocity_theta": nodal_by_theta,
+            "theta_theta": theta_theta,
+            "gradient_theta": theta,
+            "by_position_skew": matrix,
+            "position_velocity_skew": matrix,
         }
-        used = {output: places[output] for output in kernel.contractions}
-        starts = np.cumsum([0] + [length for _, length in used.values()])
-        positions = {
-            output: place + start
-            for (output, (place, _)), start in zip(
-                used.items(), starts, strict=False
-            )
-        }
-        for (part_index, output), field_slice in self.field_output_slices(
-            name
-        ).items():
+        positions: dict[str, Index] = {}
+        start = 0
+        for output in kernel.contractions:
+            place, length = places[output]
+            positions[output] = place + start
+            start += length
+        field_slices = self.field_output_slices(name)
+        for (part_index, output), field_slice in field_slices.items():
             if part_index == number:
-                field_positions = np.arange(
-                    field_slice.start, field_slice.stop
-                ).reshape(count, -1)
+                own = np.arange(field_slice.start, field_slice.stop)
                 positions[output] = _with_field_columns(
                     positions[output],
-                    field_positions,
+                    own.reshape(count, -1),
                     output=output,
                     constants=part.point_constant_count,
                 )
-        destinations = np.hstack(list(positions.values()))
-        internal_columns = np.zeros(
-            (count, geometry.shape[1], 0), dtype=np.int64
-        )
-        width = 0
-        if memory:
-            places_of = self.memory.part_columns(number)
-            width = self.memory.width
-            sets = 2 if name == "curvature" else 1
-            internal_columns = np.concatenate(
-                [places_of + k * width for k in range(sets)], axis=-1
-            )
-            width *= sets
-        if part.stress_field is not None:
-            logs = np.broadcast_to(
-                width + np.arange(count)[:, None, None],
-                (*internal_columns.shape[:2], 1),
-            )
-            internal_columns = np.concatenate([internal_columns, logs], axis=-1)
+        return np.hstack(list(positions.values()))
+
+    def _data_columns(self, name: str, number: int, points: int) -> Index:
+        """Return the columns (E, q, m) of the data of each quadrature point in a row of data, see
+        `point_data`; m = 0 if the points have none.
+
+        Parameters
+        ----------
+        name : str
+            Name of the kernel; "curvature" reads weights of the stress after the internal
+            variables, "energy" reads neither.
+        number : int
+            Index of the part.
+        points : int
+            Number q of quadrature points of an element.
+        """
         if self.inverse_equilibrium is not None:
-            internal_columns = self.inverse_equilibrium.point_data_columns(
-                number
-            )
-        return KernelBatch(
-            kernel,
-            cells,
-            geometry=geometry,
-            destinations=destinations,
-            width=self._width(name),
-            data_columns=internal_columns
-            if internal_columns.shape[-1]
-            else None,
-        )
+            return self.inverse_equilibrium.point_data_columns(number)
+        part = self.parts[number]
+        count = len(part.cells)
+        columns = [np.zeros((count, points, 0), dtype=np.int64)]
+        width = 0
+        if part.prony and name != "energy":
+            own = self.memory.part_columns(number)
+            for _ in range(2 if name == "curvature" else 1):
+                columns.append(own + width)
+                width += self.memory.width
+        if part.stress_field is not None:
+            logarithms = width + np.arange(count)[:, None, None]
+            columns.append(np.broadcast_to(logarithms, (count, points, 1)))
+        return np.concatenate(columns, axis=-1)
 
 
 def _with_field_columns(

@@ -154,6 +154,8 @@ def reference_geometry(
 ) -> Array:
     """Return shape gradients and volumes at every quadrature point of the undeformed mesh.
 
+    Orientation is not checked: volumes of inverted cells are negative.
+
     Parameters
     ----------
     points_m : (n, 3)
@@ -165,7 +167,7 @@ def reference_geometry(
     Returns
     -------
     (E, q, 3 * nodes + 1) ndarray
-        ∂N_a/∂X_j at column 3a + j, then the volume assigned to the point [m³].
+        ∂N_a/∂X_j [1/m] at column 3a + j, then the volume assigned to the point [m³].
     """
     corners = points_m[cells[:, :4]]
     edges = np.swapaxes(

@@ -87,22 +87,24 @@ class PointLaw:
 
     def psi(self, F: ca.SX, theta: ca.SX) -> ca.SX:
         """Return the energy density [J/m³] at the deformation gradient F (3, 3), from the constants
-        θ of the law, which begin with those of the material.
+        `theta` of the law, which begin with those of the material.
         """
         return self.material.psi(F, theta[: len(self.material.constants)])
 
     def damping_potential(
         self, psi: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX
     ) -> ca.SX:
-        """Return the potential of the damping law; 0 if it has none.
+        """Return the density ψ_d of the potential of the damping law; 0 if it has none.
 
         Parameters
         ----------
         psi : SX
             Energy density as an expression in F.
         F, rate : SX
-            Stacked deformation gradient, with m if the dilatation is averaged, and its rate.
+            Stacked deformation gradient, with m if the dilatation is averaged, and its rate;
+            further symbols of `psi` and their rates may follow if the law accepts them.
         theta : (k,) SX
+            Constants of the law.
         """
         potential = self.damping.potential
         return (
@@ -222,7 +224,9 @@ def _energy_density(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     expression.
     """
     constants = _material_constants(point, law)
-    return law.material.psi_in(point.rule, point.material_gradient, constants)
+    return law.material.psi_in(
+        point.rule, point.material_gradient, values=constants
+    )
 
 
 def _material_constants(point: QuadraturePoint, law: PointLaw) -> ca.SX:
@@ -257,7 +261,9 @@ def _damping_potential(
         rate = ca.vertcat(rate, rates)
     elif law.damping.potential:
         (energy,) = point.rule.eliminate([energy])
-    return law.damping_potential(energy, strain, rate, point.local_constants)
+    return law.damping_potential(
+        energy, strain, rate=rate, theta=point.local_constants
+    )
 
 
 def memory_energy(point: QuadraturePoint) -> ca.SX:
@@ -281,17 +287,24 @@ UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def six_entries(matrix: ca.SX) -> ca.SX:
-    """Return the entries xx, yy, zz, xy, xz, yz of a symmetric matrix."""
+    """Return the entries xx, yy, zz, xy, xz, yz (6,) of a symmetric matrix (3, 3); entries below the
+    diagonal are not read.
+    """
     return ca.vertcat(*[matrix[a, b] for a, b in UPPER])
 
 
 def first_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return the first Piola–Kirchhoff stress P = ∂ψ/∂F, stacked (9,)."""
+    """Return the first Piola–Kirchhoff stress P = ∂ψ/∂F of the elastic law at a point, stacked column
+    after column (9,), by the gradient F of the positions. It contains symbols of `point.rule`.
+    """
     return point.gradient(_energy_density(point, law), point.gradients["x"])
 
 
 def second_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return the second Piola–Kirchhoff stress S = F⁻¹ P by its entries (6,)."""
+    """Return the second Piola–Kirchhoff stress S = F⁻¹ P of the elastic law at a point by its
+    entries xx, yy, zz, xy, xz, yz (6,), without overstress and damping. It contains symbols of
+    `point.rule`.
+    """
     return six_entries(
         ca.inv_minor(point.material_gradient)
         @ ca.reshape(first_piola(point, law), 3, 3)
@@ -302,13 +315,13 @@ def _damping(
     point: QuadraturePoint, law: PointLaw
 ) -> tuple[ca.SX, ca.SX] | None:
     """Return V P_v (9,) of a point and its derivative (9, 9) by F, with the viscous first
-    Piola–Kirchhoff stress P_v and the volume V of the point; None if the damping law is none or has
-    a potential.
+    Piola–Kirchhoff stress P_v and the volume V of the point; None if the damping law has a
+    potential.
     """
     stress_and_slope = law.damping_stress(
         ca.vec(point.material_gradient),
         point.material_gradient_rate,
-        point.local_constants,
+        theta=point.local_constants,
     )
     return (
         None
@@ -322,7 +335,9 @@ def _damping(
 
 @lru_cache(CACHED_KERNELS)
 def energy_kernel(element: Element, law: PointLaw) -> ElementKernel:
-    """Return the kernel of the elastic energy Ψ [J]."""
+    """Return the kernel of the elastic energy Ψ [J] of an element with the long-term law, without
+    damping and memory; the latest kernels are cached.
+    """
     point = quadrature_point(element, law, "x", internal_variable_count=0)
     return kernel_from_outputs(
         "energy",
@@ -333,7 +348,9 @@ def energy_kernel(element: Element, law: PointLaw) -> ElementKernel:
 
 @lru_cache(CACHED_KERNELS)
 def force_kernel(element: Element, law: PointLaw) -> ElementKernel:
-    """Return the kernel of the elastic and damping forces on the nodes [N]."""
+    """Return the kernel of the forces on the nodes [N] of an element: those of the elastic law, of the
+    damping law and of the memory. Its output is "force"; the latest kernels are cached.
+    """
     point = quadrature_point(element, law, "x", "v")
     force = (Derivative(-_potential(point, law), ("x",)),)
     if damping := _damping(point, law):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -20,6 +20,27 @@ from .pattern import SymmetricPattern, dofs_of
 # Number of cached matrices: four for each of the latest eight choices of instances, namely the
 # operator, its transpose, and the assembly of the symmetric and of the skew parts.
 CACHED_MATRICES = 32
+
+
+class NonzeroWeights(NamedTuple):
+    """Nonzero weights of nodes in the vectors of instances, one entry for each axis.
+
+    Attributes
+    ----------
+    instance : (P,) int
+        Index of the instance.
+    coordinate : (P,) int
+        Coordinate of the vectors, among the 3L of an instance.
+    dof : (P,) int
+        Dof of the body, 3 · node + axis.
+    weight : (P,)
+        Weight of the node in the vector.
+    """
+
+    instance: Index
+    coordinate: Index
+    dof: Index
+    weight: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +63,14 @@ class ForcePoints:
 
     @classmethod
     def at_nodes(cls, nodes: Index, node_count: int) -> ForcePoints:
-        """Return instances (i, K) whose vectors are the node positions."""
+        """Return instances whose vectors are the positions of their nodes, L = K, from node indices
+        (i, K) of a body with `node_count` nodes.
+        """
         count = nodes.shape[1]
         return cls(
             nodes,
             np.broadcast_to(np.eye(count), (len(nodes), count, count)),
-            node_count,
+            node_count=node_count,
         )
 
     @property
@@ -62,7 +85,7 @@ class ForcePoints:
 
     @cached_property
     def couplings(self) -> SymmetricPattern:
-        """Pairs of dofs coupled by the nodes of an instance."""
+        """Pairs of dofs coupled by the nodes of an instance, and the diagonal of the whole body."""
         return SymmetricPattern.from_cells(self.nodes, self.node_count)
 
     def vectors(self, x: Array, chosen: Index | None = None) -> Array:
@@ -73,7 +96,7 @@ class ForcePoints:
         x : (T, 3n)
             Positions, or velocities for ẏ.
         chosen : array of int, optional
-            Indices of the instances; all by default.
+            Indices of the instances, in whose order the result is; None for all.
         """
         stacked = self._operator_for("operator", chosen) @ x.T
         return stacked.reshape(
@@ -81,13 +104,14 @@ class ForcePoints:
         ).transpose(1, 2, 0)
 
     def assemble(self, forces: Array, chosen: Index | None = None) -> Array:
-        """Return the nodal forces (T, 3n) of forces (3L, T, i) on the vectors.
+        """Return the nodal forces (T, 3n) of forces (3L, T, i) on the vectors: forces on a node add
+        up.
 
         Parameters
         ----------
         forces : (3L, T, i)
         chosen : array of int, optional
-            Indices of the instances; all by default.
+            Indices of the instances to which `forces` belong; None for all.
         """
         force_rows = forces.transpose(2, 0, 1).reshape(
             len(forces) * forces.shape[2], forces.shape[1]
@@ -191,21 +215,25 @@ class ForcePoints:
     @cached_property
     def _operator(self) -> sp.csr_array:
         """Sparse matrix (i · 3L, 3n) from node positions to vectors."""
-        instance, local, node, weight = self.nonzero_weights
+        entries = self.nonzero_weights
+        rows = entries.instance * self.dofs + entries.coordinate
         shape = self.count * self.dofs, 3 * self.node_count
-        return sp.csr_array(
-            (weight, (instance * self.dofs + local, node)), shape=shape
-        )
+        return sp.csr_array((entries.weight, (rows, entries.dof)), shape=shape)
 
     @cached_property
-    def nonzero_weights(self) -> tuple[Index, Index, Index, Array]:
-        """Instance, coordinate among 3L, dof and weight of all nonzero weights, (P,) each."""
+    def nonzero_weights(self) -> NonzeroWeights:
+        """Nonzero weights of all instances, by instance, then vector, node and axis."""
         instance, vector, place = np.nonzero(self.node_weights)
         weight = self.node_weights[instance, vector, place]
         axes = np.arange(3)
         dofs = dofs_of(self.nodes[instance, place][:, None]).ravel()
-        locals_ = (3 * vector[:, None] + axes).ravel()
-        return np.repeat(instance, 3), locals_, dofs, np.repeat(weight, 3)
+        coordinates = (3 * vector[:, None] + axes).ravel()
+        return NonzeroWeights(
+            instance=np.repeat(instance, 3),
+            coordinate=coordinates,
+            dof=dofs,
+            weight=np.repeat(weight, 3),
+        )
 
     @cached_property
     def _onto_couplings(self) -> sp.csc_array:
@@ -223,12 +251,12 @@ class ForcePoints:
 
         With `skew`, an entry whose dofs are exchanged in the global triangle changes its sign.
         """
-        instance, local, dof, weight = self.nonzero_weights
-        order = np.argsort(instance, kind="stable")
-        instance = instance[order]
-        local = local[order]
-        dof = dof[order]
-        weight = weight[order]
+        entries = self.nonzero_weights
+        order = np.argsort(entries.instance, kind="stable")
+        instance = entries.instance[order]
+        local = entries.coordinate[order]
+        dof = entries.dof[order]
+        weight = entries.weight[order]
         starts = np.searchsorted(instance, np.arange(self.count + 1))
         sizes = np.diff(starts)
         parts = []

@@ -55,7 +55,9 @@ class Phase:
 
     @cached_property
     def function(self) -> ca.Function:
-        """Contribution of one point, with the contractions written out."""
+        """Function of the contribution of one point, with the contractions written out: inputs of
+        `pieces`, and each contracted output as a dense column.
+        """
         sx = self.pieces
         names = sx.name_in()
         inputs = [
@@ -131,7 +133,9 @@ class ElementKernel:
 
     @property
     def point_data_count(self) -> int:
-        """Number of internal variables and other data of a point."""
+        """Number of internal variables and other data of a point; 0 if the kernel has no such
+        input.
+        """
         names = self.pieces.name_in()
         return (
             self.pieces.nnz_in(names.index("carried"))
@@ -240,8 +244,9 @@ def _coupled(
 
 
 def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
-    """Return a piece multiplied with the shape gradients (nodes, 3): unchanged for "none", the node
-    vectors (3·nodes, k) for "nodes", the matrix between nodes for "pairs".
+    """Return a piece multiplied with the shape gradients (nodes, 3), by its contraction `how`:
+    unchanged for "none", the node vectors (3·nodes, k) for "nodes", the lower triangle of the
+    matrix between nodes, stacked column after column, for "pairs".
     """
     if how == "none":
         return piece
@@ -260,8 +265,8 @@ def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
 
 
 def _at_node(stress: ca.SX, gradient: ca.SX) -> ca.SX:
-    """Return the columns of (9, k), conjugate to F, times the shape gradient of one node: (3,
-    k).
+    """Return the columns of `stress` (9, k), conjugate to F, times the shape gradient (1, 3) of one
+    node: (3, k).
     """
     columns = [
         ca.reshape(stress[:, k], 3, 3) @ gradient.T
@@ -393,18 +398,22 @@ class QuadraturePoint:
         return cls(
             element.nodes,
             {name: ca.SX.sym(name, 3 * element.nodes) for name in fields},
-            ca.SX.sym("geometry", 3 * element.nodes + 1),
-            ca.SX.sym("theta", constants),
-            {name: ca.SX.sym(f"gradient_{name}", 9) for name in fields},
-            tuple(ca.SX.sym(f"stretch_{k}") for k in range(stretches)),
-            ca.SX.sym(
+            geometry=ca.SX.sym("geometry", 3 * element.nodes + 1),
+            theta=ca.SX.sym("theta", constants),
+            gradients={
+                name: ca.SX.sym(f"gradient_{name}", 9) for name in fields
+            },
+            stretches=tuple(
+                ca.SX.sym(f"stretch_{k}") for k in range(stretches)
+            ),
+            point_data=ca.SX.sym(
                 "carried",
                 internal_variable_count
                 + bool(scaled)
                 + (rest.count if rest else 0),
             ),
-            scaled,
-            rest,
+            scaled_indices=scaled,
+            rest=rest,
         )
 
     @property
@@ -487,7 +496,9 @@ class QuadraturePoint:
         """Return the derivative of an expression by symbols (k,) along a direction (k,), including
         that through `rule`.
         """
-        return self.rule.directional_derivative(expression, by, direction)
+        return self.rule.directional_derivative(
+            expression, by, direction=direction
+        )
 
     @property
     def strain_rate_symbols(self) -> ca.SX:
@@ -517,13 +528,15 @@ class QuadraturePoint:
         """
         inputs = ca.vertcat(self.gradients["x"], *self.stretches[:2])
         direction = ca.vertcat(self.gradients["w"], *self.stretches[2:])
-        return self.directional_derivative(scalar, inputs, direction)
+        return self.directional_derivative(scalar, inputs, direction=direction)
 
     def derivative(self, scalar: ca.SX, by: By) -> ca.SX:
         """Return a derivative of a scalar by zero, one or two variables; x, v and w stand for their
         gradients (9,), "theta" for the differentiated constants.
 
-        It is the scalar itself, a gradient as a column, or the matrix of second derivatives.
+        Averaged stretches and other symbols are constant. The result is the scalar itself, a
+        gradient as a column (k,), or the matrix (k, l) of second derivatives by the first and the
+        second variable.
         """
         inputs = [
             self.differentiated_constants

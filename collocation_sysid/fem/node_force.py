@@ -62,7 +62,15 @@ class ForceContext(NamedTuple):
     is_start: ca.SX
 
 
-# Offsets of the attributes of an `ForceContext` in the data of a law, in their order.
+class _ForceExpression(NamedTuple):
+    """Output of `NodeForce.expression`, in the symbols of its inputs u and data."""
+
+    u: ca.SX
+    data: ca.SX
+    output: ca.SX
+
+
+# Offsets of the attributes of a `ForceContext` in the data of a law, in their order.
 CONTEXT_OFFSETS = (0, 1, 4, 5, 6, 9, 10, 11)
 CONTEXT_SIZE = CONTEXT_OFFSETS[-1]
 # Corners of a triangle on which laws are tested.
@@ -113,9 +121,9 @@ class NodeForce:
         on: On = "nodes",
         carries: int = 0,
     ) -> NodeForce:
-        """Return a force from a law.
+        """Return a force from a law, after evaluating it once as a check.
 
-        Its arguments after x, v and at are the constants, with their units.
+        Arguments of the law after x, v and at are its constants; their names end with their units.
 
         Parameters
         ----------
@@ -124,17 +132,18 @@ class NodeForce:
         *constants : Constant
             Definitions of constants whose bounds, symbols or scales do not follow from the names.
         nodes : Selection or (k,) int array, optional
-            All by default.
+            None for all.
         name : str, optional
             Name for messages; that of the function by default.
         on : {"nodes", "faces"}
         carries : int
-            Number of internal variables.
+            Number of internal variables of a node or face.
 
         Raises
         ------
         InputError
-            If the law cannot be evaluated, has the wrong shape, or is not finite at rest.
+            If the law cannot be evaluated, has the wrong shape, or is not finite at rest; if a
+            definition is of no argument, or `on` is unknown.
         """
         name = name or str(getattr(law, "__name__", "force")).replace("_", "-")
         definitions = {constant.name: constant for constant in constants}
@@ -162,7 +171,14 @@ class NodeForce:
             raise InputError(
                 f"force {name!r} is on {on!r}; expected one of {', '.join(get_args(On))}"
             )
-        force = cls(name, law, known, chosen, on, carries)
+        force = cls(
+            name,
+            law,
+            constants=known,
+            nodes=chosen,
+            on=on,
+            internal_variable_count=carries,
+        )
         force._check()
         return force
 
@@ -171,14 +187,18 @@ class NodeForce:
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        """Return forces (3k,) on k nodes, followed by the internal variables, as an expression.
+        """Return forces (3k,) on k nodes, followed by the internal variables after the evaluation,
+        as an expression.
+
+        A force on a face is shared by its last three nodes: the corners, or the mid nodes of a
+        quadratic face, whose corners get zero.
 
         Parameters
         ----------
         u : SX
-            Stacked (x, v, constants, before).
-        data : SX
-            Entries of an `ForceContext`.
+            Stacked (x, v, constants, before), with 3k entries of x and v each.
+        data : (11,) SX
+            Entries of a `ForceContext`.
         """
         dofs = (
             u.numel() - len(self.constants) - self.internal_variable_count
@@ -235,7 +255,9 @@ class NodeForce:
         return _as_column(force), _as_column(after)
 
     def input_size(self, dofs: int) -> int:
-        """Return the length of u for this number of dofs."""
+        """Return the length of u of `expression` for a number of position dofs: 3 of a node, 9 or
+        18 of a face.
+        """
         return 2 * dofs + len(self.constants) + self.internal_variable_count
 
     @property
@@ -245,30 +267,37 @@ class NodeForce:
 
     @cached_property
     def has_skew_stiffness(self) -> bool:
-        """Whether the derivative by x is not symmetric."""
+        """Whether the derivative of the force by x is not symmetric at one of three random
+        points.
+        """
         return self._relative_skew_parts[0] > SYMMETRY_TOLERANCE
 
     @cached_property
     def has_skew_damping(self) -> bool:
-        """Whether the derivative by v is not symmetric, as for gyroscopic forces."""
+        """Whether the derivative of the force by v is not symmetric at one of three random points,
+        as for gyroscopic forces.
+        """
         return self._relative_skew_parts[1] > SYMMETRY_TOLERANCE
 
     @cached_property
-    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Symbols u and data, and the expression of the force."""
+    def _symbols(self) -> _ForceExpression:
+        """Expression of the force on a node or the simplest face, in symbols of its inputs."""
         u = ca.SX.sym("u", self.input_size(self._smallest_dofs))
         data = ca.SX.sym("data", CONTEXT_SIZE)
-        return u, data, self.expression(u, data)
+        return _ForceExpression(u, data, output=self.expression(u, data))
 
     @cached_property
     def _force_and_jacobian(self) -> ca.Function:
         """Function of the force and its derivative by u."""
-        u, data, y = self._symbols
-        return ca.Function("slopes", [u, data], [y, ca.jacobian(y, u)])
+        u, data, output = self._symbols
+        slopes = ca.jacobian(output, u)
+        return ca.Function("slopes", [u, data], [output, slopes])
 
     @cached_property
     def _relative_skew_parts(self) -> tuple[float, float]:
-        """Largest relative skew parts of the derivatives by x and by v, at three random points."""
+        """Largest relative skew parts of the derivatives by x and by v, at three random points of a
+        fixed seed; 0 for a derivative that is zero.
+        """
         rng = np.random.default_rng(0)
         largest = np.zeros(2)
         dofs = self._smallest_dofs
@@ -344,10 +373,13 @@ class NodeForce:
     def on_refined_body(self, nodes: Index | None) -> NodeForce:
         """Return this force for a refined body.
 
+        It is the force itself if it acts on all nodes or on a geometric selection, which selects
+        anew.
+
         Parameters
         ----------
         nodes : (k,) int or None
-            Nodes of the refined body, used where a selection cannot select anew.
+            Nodes of the refined body, used in place of indices of nodes of the coarse body.
         """
         finds = self.nodes is None or (
             isinstance(self.nodes, Selection)
@@ -421,7 +453,10 @@ class LocatedForce:
             data = data[:, nodes[:, -3:]].mean(axis=2)
             data[3:] = 0.0
         return cls(
-            force, ForcePoints.at_nodes(nodes, len(volume_m3)), data, columns
+            force,
+            ForcePoints.at_nodes(nodes, len(volume_m3)),
+            data=data,
+            columns=columns,
         )
 
 
@@ -433,7 +468,7 @@ def _as_column(values: Any) -> ca.SX:
 
 
 def face_middle(values: ca.SX) -> ca.SX:
-    """Return the mean over the last three nodes of a face of a nodal quantity (3k,).
+    """Return the mean (3,) over the last three nodes of a face of a nodal vector (3k,), k = 3 or 6.
 
     These nodes share the force on the face: the corners, or the mid nodes of a quadratic face.
     """
@@ -463,9 +498,10 @@ def area_vector(places: Sequence[ca.SX]) -> ca.SX:
 
 
 def surface_shares(mesh: ElementNodes) -> tuple[Array, Array]:
-    """Return the surface area (n,) and outward normal (n, 3) of every node; zero inside.
+    """Return the surface area (n,) [m²] and outward unit normal (n, 3) of every node; zero inside.
 
-    The area belongs to the corners, or to the mid nodes of quadratic faces.
+    The area belongs to the corners, a third of each face, or to the mid nodes of quadratic faces,
+    whose corners have zero area and normal. The normal is the mean by area over the faces.
     """
     faces = mesh.nodes_of_faces(mesh.mesh.surface)
     a, b, c = np.moveaxis(mesh.points_m[faces[:, :3]], 1, 0)

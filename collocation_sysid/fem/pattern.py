@@ -4,12 +4,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
+
+
+class FullEntries(NamedTuple):
+    """Entries of both triangles of a symmetric matrix, with M ≥ m entries.
+
+    Attributes
+    ----------
+    rows, columns : (M,) int
+        Row and column of each entry.
+    source : (M,) int
+        Index of the entry among the m of the lower triangle; the mirrored entry has the same.
+    """
+
+    rows: Index
+    columns: Index
+    source: Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +68,7 @@ class SymmetricPattern:
         codes = np.unique(
             np.append(columns * size + rows, np.arange(size) * (size + 1))
         )
-        return cls(size, codes % size, codes // size)
+        return cls(size, codes % size, columns=codes // size)
 
     @property
     def entry_count(self) -> int:
@@ -60,11 +77,12 @@ class SymmetricPattern:
 
     @cached_property
     def diagonal(self) -> Index:
-        """Position of each diagonal entry (3n,)."""
+        """Index among the entries of each diagonal entry, (3n,)."""
         return np.flatnonzero(self.rows == self.columns)
 
     def positions_of(self, row: Index, column: Index) -> Index:
-        """Return the positions of entries given in either triangle.
+        """Return the indices among the entries of (row, column) pairs given in either triangle, in the
+        shape of `row`.
 
         Raises
         ------
@@ -83,8 +101,8 @@ class SymmetricPattern:
         return positions
 
     @cached_property
-    def full(self) -> tuple[Index, Index, Index]:
-        """Rows, columns and lower-triangle positions of the whole matrix, sorted by column."""
+    def full(self) -> FullEntries:
+        """Entries of both triangles, sorted by column, then row."""
         strict = self.rows != self.columns
         rows = np.concatenate([self.rows, self.columns[strict]])
         columns = np.concatenate([self.columns, self.rows[strict]])
@@ -92,18 +110,20 @@ class SymmetricPattern:
             [np.arange(self.entry_count), np.flatnonzero(strict)]
         )
         order = np.lexsort((rows, columns))
-        return rows[order], columns[order], source[order]
+        return FullEntries(rows[order], columns[order], source=source[order])
 
     def matrix(self, values: NDArray[np.float64]) -> sp.csc_array:
-        """Return the full symmetric matrix with the lower-triangle values (m,)."""
+        """Return the full symmetric matrix, sparse (3n, 3n) with both triangles, with the
+        lower-triangle values (m,).
+        """
         rows, columns, source = self.full
         return sp.csc_array(
             (values[source], (rows, columns)), shape=(self.size, self.size)
         )
 
     def products(self, values: Array, vectors: Array) -> Array:
-        """Return for each t the product (3n,) of the symmetric matrix with lower-triangle values
-        (T, m) and a vector (T, 3n), (T, 3n).
+        """Return for each t the product of the symmetric matrix with lower-triangle values (T, m)
+        and a vector (T, 3n); (T, 3n), for T ≥ 1.
         """
         pairs = zip(values, vectors, strict=True)
         return np.stack(
@@ -129,11 +149,13 @@ class JointPattern:
     @staticmethod
     @lru_cache(maxsize=16)
     def from_patterns(patterns: tuple[SymmetricPattern, ...]) -> JointPattern:
-        """Return the union of patterns of one size; the latest 16 are cached."""
+        """Return the union of patterns of one size, at least one; the latest 16 results are cached
+        by the identity of the patterns.
+        """
         rows = np.concatenate([pattern.rows for pattern in patterns])
         columns = np.concatenate([pattern.columns for pattern in patterns])
         union = SymmetricPattern.from_entries(
-            rows, columns, patterns[0].size // 3
+            rows, columns, nodes=patterns[0].size // 3
         )
         union = (
             patterns[0]
@@ -147,7 +169,10 @@ class JointPattern:
 
     def expand(self, values: Array) -> Array:
         """Return values (T, m) of the first pattern as values (T, M) of the union, with zeros
-        elsewhere; the same array if both patterns are equal.
+        elsewhere.
+
+        The same array is returned if both patterns are equal, or if it is empty, (T, 0), as absent
+        skew parts are.
         """
         if not values.size or values.shape[1] == self.pattern.entry_count:
             return values
@@ -164,7 +189,14 @@ def dofs_of(nodes: Index) -> Index:
 def element_destinations(
     pattern: SymmetricPattern, cells: Index
 ) -> tuple[Index, Index]:
-    """Return the positions of an element's vector and lower-triangle entries in global arrays.
+    """Return the positions of the vectors and lower triangles of elements in global arrays.
+
+    Parameters
+    ----------
+    pattern : SymmetricPattern
+        Pattern that contains all pairs of dofs of an element.
+    cells : (E, nodes) int
+        Nodes of each element, in any order.
 
     Returns
     -------
@@ -172,6 +204,11 @@ def element_destinations(
         Global row of each local one.
     lower : (E, 3·nodes·(3·nodes + 1)/2) ndarray
         Position in `pattern` of each local lower-triangle entry, column after column.
+
+    Raises
+    ------
+    IndexError
+        If an entry is not in the pattern.
     """
     dofs = dofs_of(cells)
     size = dofs.shape[1]
@@ -182,8 +219,8 @@ def element_destinations(
 
 
 def with_ascending_nodes(cells: Index, geometry: Array) -> tuple[Index, Array]:
-    """Return elements (E, nodes) and their geometry (E, q, 3·nodes + 1) with ascending node
-    indices.
+    """Return elements (E, nodes) with ascending node indices, and their geometry
+    (E, q, 3·nodes + 1) with shape gradients in the same order; the arguments are not changed.
     """
     order = np.argsort(cells, axis=1)
     gradients = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)

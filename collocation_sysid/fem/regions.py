@@ -49,13 +49,20 @@ class Region:
     Parameters
     ----------
     name : str
-        Prefix of the names of its constants: ``core.mu_pa``.
+        Prefix of the names of its constants: ``core.mu_pa``. Letters, digits, - and _.
     cells : Selection, (E,) bool or (k,) int array
-        Selection, mask or indices of its cells.
+        Selection, mask or indices of its cells; resolved and checked when a `Body` is built.
     material, damping, density_kg_m3, prony
-        Those of the body where they are None.
+        None: those of the body. An empty `prony` is a region without memory. The density
+        [kg/m³] is that of the region alone.
     field : Field, optional
-        Constant that varies in space within the region.
+        Constant that varies in space within the region; None for none, also if the body has a
+        field.
+
+    Raises
+    ------
+    InputError
+        If the name is empty or has other characters.
     """
 
     name: str
@@ -144,13 +151,15 @@ class BodyPart:
 
     @property
     def gamma_m_index(self) -> int:
-        """Index of γ_m among the constants of the part; the density follows where it is free."""
+        """Index of γ_m among the constants of the part (not in θ); a free density has the next
+        index.
+        """
         return self.law_constant_count + 2 * len(self.prony)
 
     @property
     def point_constant_count(self) -> int:
-        """Number of constants of the quadrature points: of the law, and the stiffening by
-        memory.
+        """Number of constants that the kernel of a quadrature point reads: those of the material
+        and the damping law, and one more, the stiffening by memory, if the part has branches.
         """
         return self.law_constant_count + bool(self.prony)
 
@@ -165,7 +174,9 @@ class BodyPart:
         return self.full_name(self.field.field.parameter) if self.field else ""
 
     def full_name(self, own: str) -> str:
-        """Return the name of a constant with the prefix of the region."""
+        """Return the name of a constant with the prefix of the region: ``core.mu_pa``; `own` itself
+        outside all regions.
+        """
         return f"{self.name}.{own}" if self.name else own
 
 
@@ -179,21 +190,26 @@ def parts_from_regions(
     prony: Sequence[str | Prony] = (),
     field: Field | None = None,
 ) -> tuple[BodyPart, ...]:
-    """Return the parts of a body: the cells outside all regions, if any, then the regions.
+    """Return the parts of a body: the cells outside all regions, if any, then the regions in their
+    order.
 
     Parameters
     ----------
     mesh : TetMesh
-    material, damping, prony, field
+    material, damping, prony
         Laws of the cells outside all regions, and defaults of the regions.
     density_kg_m3, mass_kg : float or None
-        Density outside regions with a density, or mass of the whole body; exactly one of them.
+        Density outside regions with a density [kg/m³], or mass of the whole body [kg]; exactly one
+        of them.
     regions : sequence of Region
+    field : Field, optional
+        Field of the cells outside all regions; regions do not inherit it.
 
     Raises
     ------
     InputError
-        If regions overlap, share a name, are empty, or leave no mass for the rest.
+        If regions overlap, share a name, are empty, or leave no mass for the rest; if a law is
+        unknown, a density is not positive, or a field is stated although every cell is in a region.
     """
     claimed = _cells_of_regions(mesh, regions)
     densities = _densities(
@@ -267,7 +283,9 @@ def _with_field(part: BodyPart, field: Field | None, mesh: TetMesh) -> BodyPart:
         return part
     law = (*part.material.constants, *part.damping.constants)
     kind = TwoPhaseModes if field.prior == TWO_PHASE else FieldModes
-    return replace(part, field=kind.from_field(field, mesh, part.cells, law))
+    return replace(
+        part, field=kind.from_field(field, mesh, cells=part.cells, law=law)
+    )
 
 
 def _densities(
@@ -344,7 +362,13 @@ def _densities(
 
 
 def _cells_of_regions(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
-    """Return the cells of each region, ascending; raise an `InputError` if regions overlap."""
+    """Return the cells of each region, ascending, in the order of the regions.
+
+    Raises
+    ------
+    InputError
+        If regions overlap or share a name, or a region selects no cell.
+    """
     region_of_cell = np.full(len(mesh.tetrahedra), -1)
     claimed: list[Index] = []
     for k, region in enumerate(regions):
@@ -448,12 +472,12 @@ class ConstantsModel:
             self.constants[constant.name] = constant
 
     def constant_sources(self, known: Sequence[str]) -> list[ConstantSource]:
-        """Return for each part the parameters that determine its constants.
+        """Return for each part the parameters that determine its constants, fields excepted.
 
         Parameters
         ----------
         known : sequence of str
-            Names of the given parameters.
+            Names of the given parameters; names that no part uses are ignored.
 
         Raises
         ------
@@ -518,13 +542,17 @@ class ConstantsModel:
     def assemble_theta(self, values: Mapping[str, Any]) -> list[Any]:
         """Return θ as a list from parameters by name: numbers, or CasADi expressions.
 
-        A coefficient of a field that is not among the values is 0, so that the field equals its
-        mean.
+        Parameters
+        ----------
+        values : mapping of str to number or expression
+            Constants, or moduli and `mass_kg` in their place. Names that the body does not use are
+            ignored. A coefficient of a field or a contrast that is missing has its usual value: 0
+            for a coefficient, so that the field equals its mean.
 
         Raises
         ------
         InputError
-            If a constant is missing or given twice.
+            If a constant of a part, force or friction is missing, or a constant is given twice.
         """
         theta = []
         for part, source in zip(
@@ -553,7 +581,9 @@ class ConstantsModel:
         return theta
 
     def theta_from_values(self, values: Mapping[str, float]) -> Array:
-        """Return the constants θ (k,) from parameters by name; names of other bodies are ignored.
+        """Return the constants θ (k,) from parameters by name, see `assemble_theta`.
+
+        Names that the body does not use are ignored.
 
         Raises
         ------
@@ -585,8 +615,9 @@ class ConstantsModel:
     def parts_with_free_density(self, names: Collection[str]) -> list[str]:
         """Return the names of the parts whose densities are given by parameters of these names.
 
-        A density that is stated for a region alone is not a parameter, unless
-        ``core.density_kg_m3`` or ``mass_kg`` is among the names.
+        `mass_kg` among the names frees all densities; ``density_kg_m3`` those that are stated for
+        the body, not for a region alone; ``core.density_kg_m3`` that of the region "core" in any
+        case. "" is the part outside all regions.
         """
         return [
             part.name
@@ -597,12 +628,14 @@ class ConstantsModel:
         ]
 
     def split_theta(self, theta: Any) -> list[Any]:
-        """Return θ, numbers or a CasADi expression, part by part."""
+        """Return the slices of θ (numbers or a CasADi expression) of each part, in the order of
+        `parts`; constants of custom forces and frictions are left out.
+        """
         return [theta[a:b] for a, b in pairwise(self.starts)]
 
     @property
     def field_coefficient_names(self) -> tuple[str, ...]:
-        """Names of the coefficients of the shapes of fields."""
+        """Names of all constants of fields that are coefficients of shapes, in the order of θ."""
         return tuple(
             name for name in self.constants if is_field_coefficient(name)
         )
@@ -618,7 +651,9 @@ class ConstantsModel:
 
     @cached_property
     def field_slices(self) -> list[slice]:
-        """Slice in θ of the coefficients of each part's field."""
+        """Slice in θ of the coefficients of each part's field; of length zero for a part without
+        one.
+        """
         counts = (len(part.field_constants) for part in self.parts)
         ends = self.starts[1:]
         return [

@@ -38,7 +38,9 @@ class RestPointLayout:
 
     @property
     def count(self) -> int:
-        """Number of data of a point."""
+        """Number D (1 + k + k (k + 1)/2) of data of a point: values, first and second
+        derivatives.
+        """
         return self.value_count * (1 + self.input_count + len(self.input_pairs))
 
     def expand(self, data: ca.SX, changes: ca.SX) -> ca.SX:

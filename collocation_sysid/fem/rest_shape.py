@@ -104,9 +104,10 @@ class UnderGravity:
     Parameters
     ----------
     nodes : Selection or (k,) node indices
-        Nodes that were held, such as those in a clamp or on a table.
+        Nodes that were held, such as those in a clamp or on a table; checked by `grasped_nodes`.
     gravity_m_s2 : (3,) array, default (0, 0, -9.81)
-        Gravity in the axes of the mesh; its direction states the pose of the scan.
+        Gravity in the axes of the mesh; its direction states the pose of the scan. Stored as a
+        read-only copy.
 
     Raises
     ------
@@ -364,15 +365,21 @@ class InverseEquilibrium:
     Attributes
     ----------
     points_m : (n, 3)
-        Node positions of the mesh.
+        Node positions of the mesh, without those of obstacle frames.
     gravity_m_s2 : (3,)
         Gravity of the scan.
     free : array of int
         Dofs of the nodes that were not held.
     places : (k,)
-        Indices in θ of the inputs on which the stress-free shape depends.
+        Indices in θ of the inputs on which the stress-free shape depends: elastic constants, then
+        free densities.
     layout : RestPointLayout
         Layout of the data of the points.
+
+    Raises
+    ------
+    InputError
+        If the held nodes of the scan do not exist or lie on one line.
     """
 
     def __init__(self, body: Any) -> None:
@@ -398,7 +405,11 @@ class InverseEquilibrium:
         self._size_m = float(np.linalg.norm(np.ptp(self.points_m, axis=0)))
 
     def solve(self, theta: ArrayLike) -> RestShape:
-        """Return the stress-free shape at θ (k,), with its derivatives; the latest 16 are cached.
+        """Return the stress-free shape at θ (all constants of the body), with its derivatives by the
+        inputs; the latest 16 are cached.
+
+        Newton's method starts from the latest solution if that is near, then from the mesh: where
+        several shapes exist, the result can depend on earlier calls.
 
         Raises
         ------
@@ -417,7 +428,12 @@ class InverseEquilibrium:
     def second_derivatives(self, theta: ArrayLike) -> Array:
         """Return the second derivatives of X by the pairs of inputs of the layout, (pairs, n, 3).
 
-        They are central differences of ∂X.
+        They are central differences of ∂X, from two solutions for each input.
+
+        Raises
+        ------
+        RestShapeError
+            If there is no stress-free shape at θ or nearby.
         """
         constants = np.asarray(theta, dtype=float)
         columns = []
@@ -440,13 +456,20 @@ class InverseEquilibrium:
     def point_data(
         self, theta: ArrayLike, with_second_derivatives: bool = False
     ) -> list[Array]:
-        """Return the data of the points of each part of the body, (1, cells · q · count) each.
+        """Return the data of the points of each part of the body, (1, cells · q · count) each, see
+        `RestPointLayout`. The latest two results are cached; do not modify them.
 
         Parameters
         ----------
         theta : (k,)
+            All constants of the body.
         with_second_derivatives : bool
             Whether to include second derivatives; they are zero otherwise.
+
+        Raises
+        ------
+        RestShapeError
+            If there is no stress-free shape at θ.
         """
         key = (
             np.asarray(theta, dtype=float)[self.places].tobytes(),
@@ -467,8 +490,8 @@ class InverseEquilibrium:
         return self._data[key]
 
     def point_data_columns(self, part: int) -> Index:
-        """Return the columns (E, q, D (1 + k + pairs)) of each point in the data of a part, given
-        by its index.
+        """Return the columns (E, q, `layout.count`) of the data of each point in a row of
+        `point_data`, for the part of this index.
         """
         count, points = self._parts[part][1].shape[:2]
         size = self.layout.count

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from functools import cache, cached_property
 from itertools import permutations
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -31,8 +32,29 @@ _COLUMNS = np.array([0, 0, 0, 1, 1, 2])
 _PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
+class _DofPairs(NamedTuple):
+    """Contributions of the second derivatives of segments to those by pairs of dofs.
+
+    Attributes
+    ----------
+    row, column : (C,) int
+        Dofs, in the lower triangle.
+    weight : (C,)
+        Product of the weights of both dofs.
+    source : (C,) int
+        Index among the 6 J entries: the lower triangle of each of J segments in turn.
+    """
+
+    row: Index
+    column: Index
+    weight: Array
+    source: Index
+
+
 class PolylineLength:
     """Length L(x) [m] of the polyline through points with fixed weights of nodes.
+
+    Derivatives are NaN where two consecutive points coincide.
 
     Parameters
     ----------
@@ -58,14 +80,14 @@ class PolylineLength:
     @cached_property
     def couplings(self) -> SymmetricPattern:
         """Pairs of dofs with a nonzero second derivative, and the diagonal."""
-        rows, columns, *_ = self._pairs
-        return SymmetricPattern.from_entries(rows, columns, self.node_count)
+        pairs = self._pairs
+        return SymmetricPattern.from_entries(
+            pairs.row, pairs.column, nodes=self.node_count
+        )
 
     @cached_property
-    def _pairs(self) -> tuple[Index, Index, Array, Index]:
-        """Lower-triangle dofs, weight and index in (6 J) of the contribution of each pair of
-        nodes.
-        """
+    def _pairs(self) -> _DofPairs:
+        """Contributions of all segments to the second derivatives."""
         segment_parts = []
         for j in range(self._segments):
             segment = self._differences[[j]].tocoo()
@@ -80,15 +102,17 @@ class PolylineLength:
         rows, columns, weights, places = (
             np.concatenate(parts) for parts in zip(*segment_parts, strict=True)
         )
-        return rows, columns, weights, places
+        return _DofPairs(rows, columns, weight=weights, source=places)
 
     @cached_property
     def _assembly_matrix(self) -> sp.csr_array:
         """Matrix (6 J, entries) from second derivatives by d to those by x."""
-        rows, columns, weights, places = self._pairs
-        entries = self.couplings.positions_of(rows, columns)
+        pairs = self._pairs
+        entries = self.couplings.positions_of(pairs.row, pairs.column)
         shape = (6 * self._segments, self.couplings.entry_count)
-        return sp.csr_array((weights, (places, entries)), shape=shape)
+        return sp.csr_array(
+            (pairs.weight, (pairs.source, entries)), shape=shape
+        )
 
     def evaluate(self, x: Array) -> Array:
         """Return the lengths L (T,) at positions (T, 3n)."""
@@ -139,7 +163,9 @@ class PolylineLength:
 
 
 def _directions_and_lengths(vectors: Array) -> tuple[Array, Array]:
-    """Return directions (T, J, 3) and lengths (T, J, 1) of vectors."""
+    """Return directions (T, J, 3) and lengths (T, J, 1) of vectors; directions of length zero are
+    NaN.
+    """
     length = np.linalg.norm(vectors, axis=2, keepdims=True)
     return vectors / length, length
 
@@ -148,6 +174,15 @@ _PERMUTATIONS = [
     (p, float(np.linalg.det(np.eye(3)[list(p)]).round()))
     for p in permutations(range(3))
 ]
+
+
+class _HessianTerms(NamedTuple):
+    """Terms factor · x[dof] of the entries (row, column) of H(x), (M,) each."""
+
+    row: Index
+    column: Index
+    dof: Index
+    factor: Array
 
 
 class EnclosedVolume:
@@ -175,7 +210,7 @@ class EnclosedVolume:
         self._apex = np.tile(self.apex_m, node_count)
 
     def with_apex(self, apex_m: Array) -> EnclosedVolume:
-        """Return this volume with cones from another apex; self if it is the same."""
+        """Return this volume with cones from another apex (3,) [m]; self if it is the same."""
         is_same = (apex_m == self.apex_m).all()
         return (
             self
@@ -184,10 +219,8 @@ class EnclosedVolume:
         )
 
     @cached_property
-    def _terms(self) -> tuple[Index, Index, Index, Array]:
-        """Rows and columns (lower triangle) of H, the dof on which each term depends, and its
-        factor.
-        """
+    def _terms(self) -> _HessianTerms:
+        """Terms of H in the lower triangle."""
         form = _cubic_form(self.faces.shape[1])
         i, j, k = np.nonzero(np.abs(form) > 1e-14)
         term_parts = []
@@ -209,25 +242,29 @@ class EnclosedVolume:
             for parts in zip(*term_parts, strict=True)
         )
         lower = rows >= columns
-        return rows[lower], columns[lower], by[lower], factor[lower]
+        return _HessianTerms(
+            rows[lower], columns[lower], dof=by[lower], factor=factor[lower]
+        )
 
     @cached_property
     def couplings(self) -> SymmetricPattern:
         """Pairs of dofs with a nonzero second derivative, and the diagonal."""
-        rows, columns, *_ = self._terms
-        return SymmetricPattern.from_entries(rows, columns, self.node_count)
+        terms = self._terms
+        return SymmetricPattern.from_entries(
+            terms.row, terms.column, nodes=self.node_count
+        )
 
     @cached_property
     def _hessian_matrix(self) -> sp.csr_array:
         """Matrix (3n, entries) from x to H."""
-        rows, columns, by, factor = self._terms
-        entries = self.couplings.positions_of(rows, columns)
+        terms = self._terms
+        entries = self.couplings.positions_of(terms.row, terms.column)
         shape = (self.couplings.size, self.couplings.entry_count)
-        return sp.csr_array((factor, (by, entries)), shape=shape)
+        return sp.csr_array((terms.factor, (terms.dof, entries)), shape=shape)
 
     @cached_property
     def rim(self) -> Index:
-        """Nodes (k, 2) or (k, 3) of edges with a face on one side only.
+        """Nodes (k, 2), or (k, 3) with the mid node last, of edges with a face on one side only.
 
         Empty for a closed surface.
         """
@@ -259,8 +296,8 @@ class EnclosedVolume:
         return np.asarray((x - self._apex) @ self._hessian_matrix)
 
     def hessian_derivative(self, x: Array, w: Array) -> Array:
-        """Return Σ w_i ∂³V/∂x_i∂x² (T, entries) at positions x, in the directions w, (T, 3n)
-        each.
+        """Return Σ w_i ∂³V/∂x_i∂x² (T, entries) on `couplings` in the directions w (T, 3n); it does
+        not depend on the positions x (T, 3n).
         """
         return np.asarray(w @ self._hessian_matrix)
 

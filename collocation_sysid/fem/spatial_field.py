@@ -86,7 +86,7 @@ class Field:
 
     @property
     def lengths_m(self) -> tuple[float, ...]:
-        """Correlation lengths to choose from [m]."""
+        """Correlation lengths to choose from [m]; one if `length_m` is a number."""
         return (
             self.length_m
             if isinstance(self.length_m, tuple)
@@ -95,7 +95,8 @@ class Field:
 
     @property
     def deviation(self) -> float:
-        """Prior standard deviation: the amplitude, or its default.
+        """Prior standard deviation: the amplitude, or its default for None, which depends on prior and
+        parameter.
 
         The default of a density is smaller, because a density, unlike a logarithm, could become
         negative.
@@ -131,7 +132,10 @@ class Laplacian:
 
     @classmethod
     def from_mesh(cls, mesh: TetMesh, cells: Index, count: int) -> Laplacian:
-        """Return the lowest eigenpairs after the constant eigenvector.
+        """Return the lowest eigenpairs after the constant eigenvector, ascending.
+
+        Signs are such that the entry of largest magnitude at a node is positive. Further
+        eigenvalues of a body of several pieces are zero.
 
         Parameters
         ----------
@@ -144,7 +148,7 @@ class Laplacian:
         Raises
         ------
         InputError
-            If the cells have too few nodes.
+            If the cells have fewer than m + 3 nodes.
         """
         nodes, local_nodes = np.unique(
             mesh.tetrahedra[cells], return_inverse=True
@@ -190,11 +194,13 @@ class Laplacian:
             basis[np.abs(basis).argmax(axis=0), np.arange(count + 1)]
         )
         vectors = (root @ basis[:, 1:])[local_nodes].mean(axis=1).T
-        return cls(np.maximum(values[1:], 0.0), vectors, matrix, basis)
+        return cls(
+            np.maximum(values[1:], 0.0), vectors, matrix=matrix, basis=basis
+        )
 
     def weights(self, length_m: float) -> Array:
-        """Return the prior deviations (m,) of the coefficients of the eigenvectors, up to a
-        factor.
+        """Return 1/(1/l² + λ) (m,) for a correlation length l [m]: the prior deviations of the
+        coefficients of the eigenvectors, up to a factor.
         """
         return 1 / (1 / length_m**2 + self.values)
 
@@ -272,7 +278,7 @@ class FieldModes:
         cells: Index,
         law: tuple[Constant, ...],
     ) -> FieldModes:
-        """Return the shapes of a field on some cells.
+        """Return the shapes of a field on some cells, with the first of its correlation lengths.
 
         Parameters
         ----------
@@ -286,7 +292,8 @@ class FieldModes:
         Raises
         ------
         InputError
-            If the field's parameter is not one of these constants, all moduli, or the density.
+            If the field's parameter is not one of these constants, all moduli, or the density, or
+            if the cells have too few nodes for its shapes.
         """
         names = [constant.name for constant in law]
         moduli = [k for k, name in enumerate(names) if is_modulus(name)]
@@ -298,21 +305,25 @@ class FieldModes:
             raise InputError(
                 f"parameter of a field is {field.parameter!r}; expected one of {', '.join(known)}"
             )
-        laplacian = Laplacian.from_mesh(mesh, cells, field.modes)
+        laplacian = Laplacian.from_mesh(mesh, cells, count=field.modes)
         return cls(
             field,
             laplacian,
-            tuple(scaled),
-            field.lengths_m[0],
-            mesh.volumes_m3[cells],
+            scaled_indices=tuple(scaled),
+            length_m=field.lengths_m[0],
+            volumes_m3=mesh.volumes_m3[cells],
         )
 
     def logarithms(self, coefficients: Array) -> Array:
-        """Return ln c − ln c̄ (E,) in every cell, from the coefficients (k,) of `constants`."""
+        """Return ln c − ln c̄ (E,) in every cell, from the coefficients (k,) of `constants`; for a
+        density it is ρ/ρ_s − 1 instead, see the module.
+        """
         return self.shapes @ coefficients
 
     def jacobian(self, coefficients: Array) -> Array:
-        """Return the derivatives (E, k) of `logarithms` by the coefficients (k,)."""
+        """Return the derivatives (E, k) of `logarithms` by the coefficients (k,), on which they do not
+        depend here.
+        """
         return self.shapes
 
     def weighted_hessian(self, coefficients: Array, weights: Array) -> Array:
@@ -330,7 +341,7 @@ class FieldModes:
 
     @cached_property
     def variance_share(self) -> float:
-        """Share of the prior variance that the shapes represent."""
+        """Share of the prior variance that the shapes represent, between 0 and 1."""
         return self.laplacian.variance_share(self.length_m)
 
     @property
@@ -340,8 +351,9 @@ class FieldModes:
 
     @cached_property
     def shapes(self) -> Array:
-        """Shapes φ (E, m), one column for each coefficient, in the cells of the part, scaled to the
-        prior standard deviation.
+        """Shapes φ (E, m), one column for each coefficient, in the cells of the part.
+
+        Σ_i φ_i² is the same in every cell: the squared prior deviation times `variance_share`.
         """
         unscaled = (
             self.laplacian.weights(self.length_m)[:, None]
@@ -368,14 +380,18 @@ class FieldModes:
         )
 
     def split_in_eight(self) -> FieldModes:
-        """Return this field on a mesh whose cells are split into eight."""
+        """Return this field on a mesh whose cells are split into eight, each in place of one; the
+        shapes have the value of the cell before, and nothing is computed again.
+        """
         vectors = np.repeat(self.laplacian.vectors, 8, axis=1)
         volumes_m3 = np.repeat(self.volumes_m3 / 8, 8)
         laplacian = replace(self.laplacian, vectors=vectors)
         return replace(self, laplacian=laplacian, volumes_m3=volumes_m3)
 
     def with_length(self, length_m: float) -> FieldModes:
-        """Return this field with another correlation length [m]."""
+        """Return this field with another correlation length [m] and the same eigenvectors; it need
+        not be one of `Field.lengths_m`.
+        """
         return replace(self, length_m=length_m)
 
 

@@ -103,7 +103,8 @@ class TwoPhaseModes(FieldModes):
         cells: Index,
         law: tuple[Constant, ...],
     ) -> TwoPhaseModes:
-        """Return the two-phase field of some cells, see `FieldModes.from_field`.
+        """Return the two-phase field of some cells, see `FieldModes.from_field`; all cells are in the
+        surroundings at first.
 
         Raises
         ------
@@ -121,18 +122,22 @@ class TwoPhaseModes(FieldModes):
                 f"length_m of a two-phase field has {len(field.lengths_m)} values; expected one: "
                 "lengths to choose from are for prior = 'smooth'"
             )
-        modes = super().from_field(field, mesh, cells, law)
+        modes = super().from_field(field, mesh, cells=cells, law=law)
         assert isinstance(modes, cls)
         return replace(modes, phase=np.zeros(len(cells)))
 
     @property
     def has_phases(self) -> bool:
-        """Whether the phases are known."""
+        """Whether any element is in an inclusion; false until phases are known, and also if the
+        solution has none.
+        """
         return bool(self.phase.any())
 
     @property
     def smooth_field(self) -> FieldModes:
-        """Smooth field with which the search for the phases starts."""
+        """Smooth field of the same cells and correlation length, with the default amplitude, with
+        which the search for the phases starts.
+        """
         field = replace(self.field, prior=SMOOTH, amplitude=None)
         return FieldModes(
             field,
@@ -158,8 +163,8 @@ class TwoPhaseModes(FieldModes):
         return (CONTRAST,)
 
     def split_in_eight(self) -> TwoPhaseModes:
-        """Return this field on a mesh whose cells are split into eight; phases and samples are
-        those of the cell before.
+        """Return this field on a mesh whose cells are split into eight, each in place of one;
+        phases and samples are those of the cell before.
         """
         finer = super().split_in_eight()
         assert isinstance(finer, TwoPhaseModes)
@@ -171,11 +176,13 @@ class TwoPhaseModes(FieldModes):
         return replace(finer, phase=np.repeat(self.phase, 8), samples=samples)
 
     def logarithms(self, coefficients: Array) -> Array:
-        """Return ln r · h (E,) in every cell, from the contrast (1,)."""
+        """Return ln r · h (E,) in every cell, from the contrast r > 0 itself, not its logarithm,
+        (1,).
+        """
         return np.log(coefficients[0]) * self.phase
 
     def jacobian(self, coefficients: Array) -> Array:
-        """Return the derivatives (E, 1) of `logarithms` by the contrast."""
+        """Return the derivatives h/r (E, 1) of `logarithms` by the contrast r, (1,)."""
         return self.phase[:, None] / coefficients[0]
 
     def weighted_hessian(self, coefficients: Array, weights: Array) -> Array:
@@ -200,23 +207,25 @@ class ElementLogarithms(FieldModes):
 
     @classmethod
     def relative_to(cls, modes: FieldModes, base: Array) -> ElementLogarithms:
-        """Return such a field on the cells of another field.
+        """Return such a field on the cells of another field, with its parameter and correlation
+        length.
 
         Parameters
         ----------
         modes : FieldModes
+            Smooth or two-phase field.
         base : (E,)
-            Logarithms where all coefficients are zero.
+            Logarithms of the constant relative to its mean where all coefficients are zero.
         """
         field = replace(modes.field, prior=SMOOTH, modes=len(base))
         volumes_m3 = modes.volumes_m3
         return cls(
             field,
             modes.laplacian,
-            modes.scaled_indices,
-            modes.length_m,
-            volumes_m3,
-            base,
+            scaled_indices=modes.scaled_indices,
+            length_m=modes.length_m,
+            volumes_m3=volumes_m3,
+            base=base,
         )
 
     @cached_property
@@ -235,5 +244,5 @@ class ElementLogarithms(FieldModes):
 
 
 def is_inclusion(phase: Array) -> NDArray[np.bool_]:
-    """Return a mask (E,) of the elements of inclusions, from phases (E,) between 0 and 1."""
+    """Return a mask (E,) of the elements of inclusions: phases (E,) above 0.5."""
     return phase > 0.5

@@ -111,14 +111,18 @@ class ContactLaw:
 
     @cached_property
     def edges_m(self) -> Array:
-        """Mean edge length (i,) of the face at each point; of all faces if contact is relaxed."""
+        """Mean edge length (i,) of the face at each point [m]; of all faces if contact is
+        relaxed.
+        """
         if self.obstacle.relaxed is not None:
             return np.full(len(self.surface.area_m2), self.surface.edge_m)
         return np.repeat(self.surface.edges_m, self.surface.points_per_face)
 
     @cached_property
     def widths_m(self) -> Array:
-        """Width δ (i,) of the pressure law at each point."""
+        """Width δ (i,) of the pressure law at each point [m]: the stated one, else in proportion to
+        `edges_m`, with the factor of relaxed contact, of friction, or of neither.
+        """
         if self.obstacle.width_m is not None:
             return np.full(len(self.edges_m), self.obstacle.width_m)
         if self.obstacle.relaxed is not None:
@@ -176,8 +180,8 @@ class ContactLaw:
         return stiffness * self.data[3]
 
     def friction_coefficient(self, constants: ca.SX) -> ca.SX:
-        """Return the friction coefficient μ: the stated number, or the last of the law's constants
-        (c,).
+        """Return the friction coefficient μ: the stated number (0 without friction), or the last of
+        the law's constants (c,) if it is a parameter.
         """
         coefficient = self.obstacle.friction
         return (
@@ -207,7 +211,7 @@ class ContactLaw:
 
     @property
     def _frame_size_m(self) -> float:
-        """Length of the axes of the obstacle's frame [m]."""
+        """Length of the axes of the obstacle's frame before it moves [m]."""
         return float(
             self.body.frame_nodes_m[1, 0] - self.body.frame_nodes_m[0, 0]
         )
@@ -249,8 +253,9 @@ class ContactLaw:
     def mean_scaled_pressure(
         self, gaps: tuple[ca.SX, ca.SX], data: ca.SX
     ) -> ca.SX:
-        """Return the mean of b [m] over a step in which the gap changes linearly between two values
-        [m]; `data` (5,) are those of the point.
+        """Return the mean of b [m] over a step in which the gap changes linearly from the first to
+        the second of `gaps` [m]; `data` (5,) are those of the point. Relaxed contact has no such
+        mean.
         """
         width_m = data[2]
         reach = mean_square(*(width_m - gap for gap in gaps))
@@ -504,6 +509,7 @@ class ContactLaw:
         """
 
         def friction_values(u: ca.SX, data: ca.SX) -> ca.SX:
+            """Return the 6 values of friction, with u = (y, ẏ, c)."""
             place, axes, slope, normal_n = self._normal(u, data, pressing=None)
             limit_n, friction, tangential = self._friction(
                 u, place, slope=axes @ slope, normal_n=normal_n
@@ -573,7 +579,9 @@ class Contact(Pointwise):
         return int(self.previous_state is not None)
 
     def scaled_pressures(self, xi: Array) -> Array:
-        """Return the pressures divided by κ, b (1, T, i) [m], at positions ξ (T, 3n)."""
+        """Return the pressures divided by κ, b (1, T, i) [m], at positions ξ (T, 3n) [m], from the
+        gaps there: without an average over the step, and without a given b.
+        """
         gaps = self.law_of_contact.gaps(self.points.vectors(xi))
         data = np.broadcast_to(
             self.law_of_contact.data[:, None], (DATA_COUNT, *gaps.shape)
@@ -634,7 +642,7 @@ class Contact(Pointwise):
         return self
 
     def at_times(self, rows: slice) -> Self:
-        """Return self: contact is the same at all times."""
+        """Return self: contact is the same at all times; a `previous_state` is not cut."""
         return self
 
     def interpolate(self, other: Self, share: float) -> Self:
@@ -674,8 +682,8 @@ class Contact(Pointwise):
         )
 
     def deepest_point(self, x: Array) -> tuple[float, Array]:
-        """Return the depth δ − g [m] of the deepest point at positions x (3n,) [m], and the
-        gradient of its gap (3,), the obstacle's outward normal.
+        """Return the depth δ − g [m] of the point with the smallest gap at positions x (3n,) [m],
+        and the gradient of its gap (3,) in the axes of the world, the obstacle's outward normal.
 
         The depth is negative if no point has a pressure.
         """

@@ -60,7 +60,9 @@ class StencilTables:
     def from_scheme(
         cls, scheme: Scheme, rows: int, first_row: int
     ) -> StencilTables:
-        """Return the tables of rows 0 … `rows` − 1; rows before `first_row` are zero."""
+        """Return the tables of rows 0 … `rows` − 1; rows before `first_row` are zero. Row 0 has the
+        stencil of statics.
+        """
         p, q, w, s = (
             np.zeros((rows, scheme.largest_lag + 1)) for _ in range(4)
         )
@@ -75,7 +77,7 @@ class StencilTables:
             ):
                 table[row, : len(values)] = values
             r[row] = stencil.r
-        return cls(p, q, w, s, r)
+        return cls(p, q, w=w, s=s, r=r)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +137,8 @@ class Dynamics:
     ) -> Dynamics:
         """Discretise an experiment in time.
 
-        The constants of the body are NaN until `with_theta` or `with_inputs` sets them.
+        The constants of the body are NaN until `with_theta` or `with_inputs` sets them. Prescribed
+        positions are those at φ = 0.
 
         Parameters
         ----------
@@ -143,7 +146,12 @@ class Dynamics:
         scheme : str or Scheme
             Scheme or its name; ignored for a static experiment.
         substeps : int
-            Number of time steps between samples; ignored for a static experiment.
+            Number of time steps between samples, at least 1; ignored for a static experiment.
+
+        Raises
+        ------
+        InputError
+            If the scheme is unknown or does not fit the start rule of the experiment.
         """
         if experiment.is_static:
             t_s = experiment.t_s
@@ -161,7 +169,7 @@ class Dynamics:
             table = as_scheme(scheme, experiment.start_rule)
         rows = len(t_s)
         first_row = 0 if experiment.start == "equilibrium" else 1
-        tables = StencilTables.from_scheme(table, rows, first_row)
+        tables = StencilTables.from_scheme(table, rows, first_row=first_row)
         velocity = experiment.start_velocities_m_s
         dofs = experiment.body.pattern.size
         lags = tables.p @ np.arange(tables.p.shape[1])
@@ -209,8 +217,9 @@ class Dynamics:
         )
 
     def rows_to_evaluations(self, row_values: Array) -> Array:
-        """Return quantities of the rows (N, …), distributed to the evaluations by the transpose of
-        the weighted mean that gives a row's value.
+        """Return quantities of the rows (N, …), distributed to the evaluations (N, …) by the
+        transpose of `evaluations_to_rows`. A row without forces has its value at its own
+        evaluation.
         """
         total = self.tables.w.sum(axis=1).reshape(
             (-1,) + (1,) * (row_values.ndim - 1)
@@ -221,7 +230,10 @@ class Dynamics:
         )
 
     def evaluations_to_rows(self, evaluation_values: Array) -> Array:
-        """Return the mean over the evaluations of each row (N, …), weighted like the forces."""
+        """Return the mean over the evaluations of each row (N, …), weighted like the forces; a row
+        without forces has the value of its own evaluation. If all values are equal, the argument
+        itself.
+        """
         return _evaluation_mean(self.tables, evaluation_values)
 
     def truncated_to(self, rows: int) -> Dynamics:
@@ -265,7 +277,7 @@ class Dynamics:
 
     @property
     def largest_lag(self) -> int:
-        """Largest lag of the scheme, in time steps."""
+        """Largest lag l with ∂c_t/∂x_{t−l} ≠ 0 of the scheme, in time steps."""
         return self.tables.p.shape[1] - 1
 
     def evaluation_states(self, x: Array) -> tuple[Array, Array]:
@@ -312,15 +324,16 @@ class Dynamics:
     def histories(
         self, x: Array, previous_states: Mapping[int, Array] | None = None
     ) -> tuple[AnyHistory, ...]:
-        """Return the internal variables along a motion; an empty tuple if there are none.
+        """Return the internal variables along a motion: of the memory, if the body has one, then of
+        each force with internal variables; an empty tuple if there are none.
 
         Parameters
         ----------
         x : (N, 3n)
             Positions [m]; fewer rows for the beginning of the motion.
         previous_states : mapping, optional
-            Given internal variables of the previous evaluation, by the index of the history.
-            Internal variables that are not given are computed from x.
+            Given internal variables of the previous evaluation, by the index of the history in the
+            result. Internal variables that are not given are computed from x.
         """
         if not (
             self.body.has_memory or self.forces.terms_with_internal_variables
@@ -392,7 +405,9 @@ class Dynamics:
         )
 
     def combine(self, table: Array, rows: Array) -> Array:
-        """Return Σ_i table[t, i] rows[t − i] for every t, for `row_count` (N, …)."""
+        """Return Σ_i table[t, i] rows[t − i] for every t, from coefficients (N, lags) and `rows`
+        (N, …), in the shape of `rows`; terms before the start are omitted.
+        """
         return _combine(table, rows)
 
     def combine_transposed(self, table: Array, rows: Array) -> Array:
@@ -486,7 +501,10 @@ class Dynamics:
         out: Array | None = None,
         histories: Sequence[AnyHistory] = (),
     ) -> Linearisation:
-        """Return forces and derivatives at the evaluation states of x (N, 3n).
+        """Return forces and derivatives at the evaluation states of x, for the rows from `first_row`
+        on.
+
+        Forces at temporarily prescribed dofs are included, see `zero_prescribed_forces`.
 
         Parameters
         ----------
@@ -496,7 +514,7 @@ class Dynamics:
             Memory for the result, see `Forces.linearise`.
         histories : sequence of histories
             Internal variables of the motion; computed from x where the sequence is empty. They are
-            held fixed in the derivatives.
+            constant in the derivatives.
         """
         forces = self.forces_with_histories(histories or self.histories(x))
         return forces.linearise(*self.evaluation_states(x), out)
@@ -542,7 +560,9 @@ def _combine(table: Array, rows: Array) -> Array:
 
 
 def _row_masses(tables: StencilTables, at_evaluations: DofMasses) -> DofMasses:
-    """Return the mass in each row, from the mass at the evaluations."""
+    """Return the mass in each row, from the mass at the evaluations: tied masses are averaged with the
+    weights of the forces, the others are constant.
+    """
     return replace(
         at_evaluations, tied_kg=_evaluation_mean(tables, at_evaluations.tied_kg)
     )
@@ -588,21 +608,23 @@ class StencilRow:
 
     @classmethod
     def from_dynamics(cls, dynamics: Dynamics, t: int) -> StencilRow:
-        """Return the coefficients and masses of the row with index t."""
+        """Return the coefficients and masses of the row with index t of equations of motion."""
         tables = dynamics.tables
         step_s = dynamics.step_s
         return cls(
             tuple(tables.p[t].tolist()),
             tuple((tables.q[t] / step_s).tolist()),
-            tuple(tables.w[t].tolist()),
-            tuple((tables.s[t] / step_s**2).tolist()),
-            float(tables.r[t]) / step_s,
-            dynamics.mass.inertia_at(t),
+            w=tuple(tables.w[t].tolist()),
+            s=tuple((tables.s[t] / step_s**2).tolist()),
+            r=float(tables.r[t]) / step_s,
+            mass_kg=dynamics.mass.inertia_at(t),
         )
 
     @cached_property
     def nonzero_lags(self) -> list[int]:
-        """Lags i ≥ 1 for which the force of this row depends on x_{t−i}."""
+        """Lags i ≥ 1 at which p_i or q_i is not zero: the force evaluated in this row depends on
+        x_{t−i}.
+        """
         return [i for i in range(1, len(self.p)) if self.p[i] or self.q[i]]
 
     def block(

@@ -54,7 +54,7 @@ class EquationsAtParameters:
 
     @cached_property
     def theta_p(self) -> Array:
-        """Derivatives ∂θ/∂p of the constants (k, m)."""
+        """Derivatives ∂θ/∂p of the constants (k, m); zero for the nuisance parameters among p."""
         return np.array(self.input_derivatives[0, : len(self.theta)])
 
     @property
@@ -65,12 +65,13 @@ class EquationsAtParameters:
     def force_derivatives(
         self, rows: int | slice, input_slopes: Array
     ) -> Array:
-        """Return the derivatives ∂F/∂p (…, 3n, m) of the total forces at some evaluations.
+        """Return the derivatives ∂F/∂p (…, 3n, m) of the total forces at some evaluations, at fixed
+        states: ∂F/∂u ∂u/∂p.
 
         Parameters
         ----------
         rows : int or slice
-            Indices of the evaluations.
+            Indices of the evaluations; … is empty for an int.
         input_slopes : (…, 3n, U)
             Derivatives of the forces by the inputs at these evaluations.
         """
@@ -102,12 +103,13 @@ class EquationsAtParameters:
     def inertia_derivatives(
         self, rows: int | slice, acceleration: Array, dofs: Index | slice
     ) -> Array | float:
-        """Return ∂(M a)/∂p (…, k, m) of rows at given accelerations; 0 if M is independent of p.
+        """Return ∂(M a)/∂p (…, k, m) of rows at given accelerations; the number 0.0 if M is
+        independent of p.
 
         Parameters
         ----------
         rows : int or slice
-            Indices of the rows.
+            Indices of the rows; … is empty for an int.
         acceleration : (…, k)
             Accelerations of the selected dofs [m/s²].
         dofs : (k,) or slice
@@ -127,12 +129,15 @@ class EquationsAtParameters:
     ) -> tuple[Array, Array]:
         """Return the second derivatives of Σ weights · c by (x, p), (N, 3n, m), and by p, (m, m).
 
+        Those through prescribed positions are not included.
+
         Parameters
         ----------
         x : (N, 3n)
             Positions [m].
         force_curvature : SecondDerivatives
-            Weighted second derivatives of the forces at the evaluations, by x, v and u.
+            Second derivatives of the forces at all N evaluations, by x, v and u, with the weights
+            that the stencils give the forces.
         row_weights : (N, 3n)
             Weights of the residuals c.
         """

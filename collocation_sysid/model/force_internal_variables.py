@@ -26,6 +26,7 @@ from ..fem.body import SecondDerivatives
 from .force_term import States
 from .forces import Forces
 from .point_forces import LawDerivatives, Pointwise, PreviousState
+from .recursion import HistoryGradient
 
 # Number of evaluations whose derivatives are kept at a time; limits memory.
 CHUNK = 16
@@ -83,7 +84,7 @@ class ForceHistory:
         previous = PreviousState(
             np.zeros(shape) if before is None else before, since_s
         )
-        history = cls(forces, number, xi, nu, previous)
+        history = cls(forces, number, xi=xi, nu=nu, previous_state=previous)
         if before is None:
             for k in range(len(xi) - 1):
                 previous.before[:, k + 1] = history.internal_variables(
@@ -133,7 +134,9 @@ class ForceHistory:
         )
 
     def derivatives(self, rows: slice) -> LawDerivatives:
-        """Return the derivatives of F and h at some evaluations, each (d + n, …, T, I)."""
+        """Return the derivatives of F and h at the evaluations `rows`, each (d + n, …, T, I): first
+        those of the d forces, then of the n internal variables.
+        """
         return self._without_static_velocity(
             self.term_at(rows).derivatives(self._states(rows))
         )
@@ -210,9 +213,8 @@ class ForceHistory:
 
     def vector_jacobian_product(
         self, force_weights: Array, by_p: Array
-    ) -> tuple[Array, Array, Array]:
-        """Return the derivatives of Σ λ_k F_k(h_{k−1}) through h by ξ and ν, (N, 3n) each, and by p
-        (m,).
+    ) -> HistoryGradient:
+        """Return the derivatives of Σ λ_k · F_k(h_{k−1}) through the internal variables h.
 
         Parameters
         ----------
@@ -231,7 +233,7 @@ class ForceHistory:
                 pulling.input_gradient() @ by_p[k][self.input_columns]
             )
             pulling.step_back(force_weights[k])
-        return by_xi, by_nu, by_parameters
+        return HistoryGradient(by_xi, by_nu, by_parameters=by_parameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,7 +273,7 @@ class ForcePreviousState:
         return cls(
             number,
             term,
-            term.internal_variables(forces.states_of_terms(x, v)(term)),
+            after=term.internal_variables(forces.states_of_terms(x, v)(term)),
         )
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
@@ -312,7 +314,10 @@ class ForcePreviousState:
         interval_s : float
         """
         return ForcePreviousState.from_state(
-            self.insert_after_interval(forces, interval_s), self.number, x, v
+            self.insert_after_interval(forces, interval_s),
+            self.number,
+            x=x,
+            v=v,
         )
 
 

@@ -172,7 +172,9 @@ class ShapeFunctional(Protocol):
         ...
 
     def hessian_derivative(self, states: Array, ways: Array) -> Array:
-        """Return the derivative (T, m) of the Hessian in the directions `ways` (T, 3n)."""
+        """Return Σ ways_i ∂³S/∂x_i∂x² (T, m) on the couplings: the derivative of the Hessian at
+        positions (T, 3n) in the directions `ways` (T, 3n).
+        """
         ...
 
 
@@ -214,7 +216,9 @@ class Potential(ForceTerm):
         return self.with_inputs(factor * self.amplitude)
 
     def interpolate(self, other: Self, share: float) -> Self:
-        """Return this force with its amplitude interpolated to that of another time."""
+        """Return this force with its amplitude interpolated linearly to that of another time;
+        `share` is 0 for this time and 1 for the other.
+        """
         return self.with_inputs(
             self.amplitude + share * (other.amplitude - self.amplitude)
         )

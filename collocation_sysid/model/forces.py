@@ -76,10 +76,11 @@ class Forces:
         Parameters
         ----------
         experiment : Experiment
-        t_s : (T,)
+        t_s : (T,) or float
             Times of the evaluations.
         theta : (k,), optional
-            Constants of the body; NaN by default.
+            Constants of the body; NaN by default, and with them the masses of parts with free
+            densities.
         step_s : float
             Length of the time steps over which contact pressures are averaged; 0 for the pressures
             at each state.
@@ -103,9 +104,9 @@ class Forces:
         forces = cls(
             Weight.from_experiment(experiment, times),
             further,
-            experiment.coupled_graph,
-            unknown,
-            still,
+            joint_pattern=experiment.coupled_graph,
+            theta=unknown,
+            is_static=still,
         )
         return forces if theta is None else forces.with_theta(theta)
 
@@ -113,17 +114,24 @@ class Forces:
     def of_body_alone(
         cls, body: Body, theta: Sequence[float] | Array
     ) -> Forces:
-        """Return the forces on a body without loads, gravity or contact, at one time.
+        """Return the forces on a body without loads, gravity, air or contact, at one time (0 s).
 
-        Custom forces of the body's own are included.
+        Internal forces at θ (k,) and the custom forces of the body are included.
         """
         custom = custom_force_terms(body, np.zeros(1))
         known = np.asarray(theta, dtype=float)
         weight = Weight.of_body_alone(body).with_theta(known)
-        return cls(weight, custom, body.joint_pattern_with(()), known)
+        return cls(
+            weight,
+            custom,
+            joint_pattern=body.joint_pattern_with(()),
+            theta=known,
+        )
 
     def with_theta(self, theta: Sequence[float] | Array) -> Forces:
-        """Return these forces for a body with constants θ (k,)."""
+        """Return these forces for a body with constants θ (k,), which are copied; masses follow the
+        free densities.
+        """
         known = np.array(theta, dtype=float)
         return replace(self, theta=known, weight=self.weight.with_theta(known))
 
@@ -160,7 +168,7 @@ class Forces:
 
     def with_inputs(self, u: Array) -> Forces:
         """Return these forces at inputs u (T, U): θ from the first time, then the inputs of each
-        term.
+        term, in the order of `terms`.
         """
         forces = self.with_theta(u[0, : self._input_offsets[0]])
         if self._input_offsets[0] == self._input_offsets[-1]:
@@ -177,14 +185,16 @@ class Forces:
         return replace(forces, weight=weight, external_terms=tuple(further))
 
     def at_times(self, rows: slice) -> Forces:
-        """Return these forces at some of the T times, given as a slice."""
+        """Return these forces at some of the T times, given as a slice; `memory_state` is kept as it
+        is.
+        """
         further = tuple(term.at_times(rows) for term in self.external_terms)
         return replace(
             self, weight=self.weight.at_times(rows), external_terms=further
         )
 
     def scaled(self, factor: float) -> Forces:
-        """Return these forces with gravity, loads and other external forces multiplied by a factor.
+        """Return these forces with weight, loads and other external forces multiplied by a factor.
 
         Masses and internal forces are unchanged.
         """
@@ -231,7 +241,8 @@ class Forces:
         return replace(self, external_terms=(*before, term, *after))
 
     def without_contact(self) -> tuple[Forces, list[Contact]]:
-        """Return these forces without the contacts that have an energy, and the contacts removed.
+        """Return these forces without the contacts that have an energy, and a list of the contacts
+        removed, empty if there were none.
 
         The sparsity pattern is unchanged. Contact as complementarity stays.
         """
@@ -266,16 +277,16 @@ class Forces:
         )
 
     def total(self, xi: Array, nu: Array) -> Array:
-        """Return the sum of all forces F (T, 3n) [N] at positions ξ (T, 3n) [m] and velocities ν
-        (T, 3n) [m/s].
+        """Return the sum of all forces F (T, 3n) [N], internal and external, at positions ξ (T, 3n)
+        [m] and velocities ν (T, 3n) [m/s].
         """
         states_for = self.states_of_terms(xi, nu)
         total = self.body.force(
             xi,
             states_for(self.weight).nu,
-            self.theta,
-            self.mass.compact_tied_kg,
-            self.memory_state,
+            theta=self.theta,
+            tied_kg=self.mass.compact_tied_kg,
+            memory_input=self.memory_state,
         )
         for term in self.terms:
             total = total + term.force(states_for(term))
@@ -284,26 +295,29 @@ class Forces:
     def linearise(
         self, xi: Array, nu: Array, out: Array | None = None
     ) -> Linearisation:
-        """Return the forces and their first derivatives by state and inputs.
+        """Return the forces and their first derivatives by state and inputs; columns of `by_theta` are
+        those of θ, then of the inputs of each term.
 
-        Internal variables of `memory_state` and of the terms are held fixed.
+        Internal variables of `memory_state` and of the terms are constant. In a static experiment
+        `by_velocity` has only the parts of terms with `uses_increments`. Skew parts are empty, (T,
+        0), if no force has one.
 
         Parameters
         ----------
         xi, nu : (T, 3n)
             Positions [m] and velocities [m/s].
         out : (T, linearisation_width), optional
-            Memory for the body's part of the result, which holds views of it.
+            Memory for the body's part of the result, which holds views of it; overwritten.
         """
         states_for = self.states_of_terms(xi, nu)
         still_nu = states_for(self.weight).nu
         at = self.body.linearise(
             xi,
             still_nu,
-            self.theta,
-            out,
-            self.mass.compact_tied_kg,
-            self.memory_state,
+            theta=self.theta,
+            out=out,
+            tied_kg=self.mass.compact_tied_kg,
+            memory_input=self.memory_state,
         )
         if self.is_static:
             at.by_velocity[:] = 0.0
@@ -323,7 +337,7 @@ class Forces:
                 ),
             )
         for term, places in self._terms_with_indices:
-            term.add_derivatives(at, places, states_for(term))
+            term.add_derivatives(at, places, states=states_for(term))
         return at
 
     @property
@@ -363,11 +377,11 @@ class Forces:
         at = self.body.second_derivatives(
             xi,
             states_for(self.weight).nu,
-            weights,
-            self.theta,
-            out,
-            self.mass.compact_tied_kg,
-            self.memory_state,
+            weights=weights,
+            theta=self.theta,
+            out=out,
+            tied_kg=self.mass.compact_tied_kg,
+            memory_input=self.memory_state,
         )
         if self.is_static:
             for by_velocity in (
@@ -401,7 +415,10 @@ class Forces:
         for term, places in self._terms_with_indices:
             states = states_for(term)
             term.add_second_derivatives(
-                at, places, states, weights.reshape(states.xi.shape)
+                at,
+                places,
+                states=states,
+                weights=weights.reshape(states.xi.shape),
             )
         return at
 
@@ -426,10 +443,11 @@ class Forces:
         self, xi: Array, nu: Array
     ) -> Callable[[ForceTerm], States]:
         """Return a function that gives each term its states, from positions ξ and velocities ν, (T,
-        3n) or (3n,).
+        3n), or (3n,) for T = 1.
 
         In a static experiment only terms that use displacements since the previous sample
-        (`uses_increments`) get a nonzero ν. The states of the weight are also those of the body.
+        (`uses_increments`) get ν, all others zero. The states of the weight are also those of the
+        body.
         """
         size = self.body.pattern.size
         moving = States(
@@ -469,7 +487,7 @@ class Forces:
         Parameters
         ----------
         number : int
-            Index in `external_terms`; the term must be a `Pointwise`.
+            Index in `external_terms`; the term must be a `Pointwise` (AssertionError otherwise).
         """
         term, places = self._terms_with_indices[1 + number]
         assert isinstance(term, Pointwise)

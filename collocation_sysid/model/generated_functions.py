@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -19,6 +20,14 @@ from ..common.array_types import Array
 from ..fem.kernels import COMPILING, Instances, make_instance_evaluator
 
 Expression = Callable[[ca.SX, ca.SX], ca.SX]
+
+
+class _Symbols(NamedTuple):
+    """Dense expression y (m,) in the symbols u (k,) and data (d,)."""
+
+    u: ca.SX
+    data: ca.SX
+    y: ca.SX
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +52,11 @@ class GeneratedFunction:
     is_compiled: bool = False
 
     def evaluate(self, u: Array, data: Array) -> Array:
-        """Return the values y (m, …) at inputs (k, …) or (k,) and data (d, …)."""
+        """Return the values y (m, …) at inputs (k, …) or (k,) and data (d, …).
+
+        The axes … of the result are those of the data, also if their product is zero; (0, …) are
+        data of an expression that uses none.
+        """
         return self._evaluate_at_instances(self._value, u, data)[0][:, 0]
 
     def evaluate_with_jacobian(
@@ -74,7 +87,7 @@ class GeneratedFunction:
             Weights of the values; 1 by default.
         """
         weights = (
-            np.ones((self._symbols[2].numel(), *data.shape[1:]))
+            np.ones((self._symbols.y.numel(), *data.shape[1:]))
             if weights is None
             else weights
         )
@@ -82,7 +95,7 @@ class GeneratedFunction:
 
     @cached_property
     def dependent_inputs(self) -> NDArray[np.bool_]:
-        """Mask (k,) of the inputs u on which any value y depends."""
+        """Mask (k,) of the inputs u on which any value y depends structurally."""
         u, _, y = self._symbols
         mask = np.zeros(self.input_size, dtype=bool)
         mask[ca.jacobian(y, u).sparsity().get_col()] = True
@@ -116,25 +129,28 @@ class GeneratedFunction:
 
     @cached_property
     def hessian_pattern(self) -> NDArray[np.bool_]:
-        """Mask (k, k) of the structurally nonzero second derivatives of any y."""
+        """Mask (k, k) of the structurally nonzero second derivatives of the sum of all y by u."""
         u, _, y = self._symbols
         second, _ = ca.hessian(ca.sum1(y), u)
         return np.array(ca.DM(second.sparsity(), 1.0).full(), dtype=bool)
 
     @cached_property
-    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Symbols u and data, and the dense expression y of them."""
+    def _symbols(self) -> _Symbols:
+        """Symbols of u and data, and the expression of them."""
         u = ca.SX.sym("u", self.input_size)
         data = ca.SX.sym("data", self.data_size)
-        return u, data, ca.densify(ca.SX(self.expression(u, data)))
+        y = ca.densify(ca.SX(self.expression(u, data)))
+        return _Symbols(u, data, y=y)
 
     @cached_property
     def _value(self) -> ca.Function:
+        """Function of u and data with the values y."""
         u, data, y = self._symbols
         return ca.Function("value", [u, data], [y])
 
     @cached_property
     def _slopes(self) -> ca.Function:
+        """Function of u and data with y and the dense Jacobian ∂y/∂u (m, k)."""
         u, data, y = self._symbols
         return ca.Function(
             "slopes",
@@ -145,6 +161,7 @@ class GeneratedFunction:
 
     @cached_property
     def _curvature(self) -> ca.Function:
+        """Function of u, data and weights (m,) with the dense Hessian (k, k) of weights · y."""
         u, data, y = self._symbols
         weights = ca.SX.sym("weights", y.numel())
         second, _ = ca.hessian(ca.dot(weights, y), u)

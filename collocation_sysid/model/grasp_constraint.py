@@ -69,8 +69,9 @@ class GraspConstraint:
         return prescribed_dofs(self.experiment.grasps)
 
     def evaluate_at(self, phi: Array) -> PrescribedDisplacements:
-        """Return the prescribed positions at nuisance parameters φ (m,) of the experiment, with
-        derivatives by the φ of the motion; derivatives are zero while a dof is free.
+        """Return the prescribed positions at all nuisance parameters φ of the experiment, with
+        derivatives by the m φ of the motion; positions are NaN and derivatives zero while a dof is
+        free.
         """
         if not self.nuisance.affects_grasps:
             return self._constant_positions
@@ -87,9 +88,12 @@ class GraspConstraint:
         return PrescribedDisplacements(self.dofs, positions, by_phi=by_phi)
 
     def displaced_nodes(self, phi: Array) -> tuple[Array, Array]:
-        """Return for each grasped dof the place H X of its node (g, 3) [m], with the hand–eye
-        transform H, and its derivatives (g, 3, m) by the φ of the motion. Nodes of obstacles are
-        not displaced.
+        """Return for each grasped dof the displaced place of its node (g, 3) [m], in the frame of
+        its grasp, and the derivatives (g, 3, m) by the m φ of the motion.
+
+        It is H X with the hand–eye transform H for a node of the body. A node of an obstacle's
+        frame is at X, displaced to first order by offset and tilt of the obstacle; the delay of an
+        obstacle and the zeros of displacements are not included.
         """
         places, by_own = self.nuisance.grasp_motion.evaluate_with_jacobian(
             self._phi_of_grasps(phi), self._points
@@ -135,13 +139,13 @@ class GraspConstraint:
         node_weights[~self._is_body_node] = 0.0
         hessian = np.zeros((len(self.nuisance.motion_indices),) * 2)
         second = self.nuisance.grasp_motion.weighted_hessian(
-            self._phi_of_grasps(phi), self._points, node_weights.T
+            self._phi_of_grasps(phi), self._points, weights=node_weights.T
         )
         hessian[np.ix_(self._columns, self._columns)] = second.sum(axis=2)
         return hessian
 
     def _phi_of_grasps(self, phi: Array) -> Array:
-        """Return the nuisance parameters of the motion H."""
+        """Return the nuisance parameters of the hand–eye transform H, from all φ."""
         return phi[self.nuisance.grasp_indices]
 
     @property
@@ -151,8 +155,8 @@ class GraspConstraint:
 
     @cached_property
     def _direct_derivatives(self) -> Array:
-        """Derivatives of positions (N, g, m) by zeros of displacements and by delays of
-        obstacles.
+        """Derivatives of positions (N, g, m) by zeros of displacements and of the strain, and by
+        delays of obstacles, which enter to first order; zero for all other φ.
         """
         derivatives = np.zeros(
             (len(self.t_s), len(self.dofs), len(self.nuisance.motion_indices))
@@ -239,7 +243,7 @@ class GraspConstraint:
 
     @cached_property
     def _constant_positions(self) -> PrescribedDisplacements:
-        """Prescribed positions where they do not depend on φ."""
+        """Prescribed positions where they do not depend on φ, with derivatives (N, g, 0)."""
         goals_m = self.experiment.prescribed_displacements(self.t_s)[1].reshape(
             len(self.t_s), -1
         )

@@ -93,7 +93,9 @@ class Inputs:
         )
 
     def weighted_hessian(self, p: Array, weights: Array) -> Array:
-        """Return Σ_t weights[t] · ∂²u_t/∂p² (m, m) at parameters p (m,), for weights (N, U)."""
+        """Return Σ_t weights[t] · ∂²u_t/∂p² (m, m), summed over all evaluations and entries, at
+        parameters p (m,), for weights (N, U).
+        """
         hessian = np.zeros((self.parameter_count,) * 2)
         offset = 0
         for each, generated in zip(self.groups, self._functions, strict=True):
@@ -101,7 +103,7 @@ class Inputs:
             if each.data.shape[1] == 1:
                 group_weights = group_weights.sum(axis=1, keepdims=True)
             hessian += generated.weighted_hessian(
-                p, each.data, group_weights
+                p, each.data, weights=group_weights
             ).sum(axis=2)
             offset += each.size
         return hessian
@@ -127,12 +129,16 @@ class Inputs:
 
 
 def with_inputs(dynamics: Dynamics, nuisance: NuisanceMap) -> Dynamics:
-    """Return equations of motion with the inputs that φ changes: gravity and load shares."""
+    """Return equations of motion whose weight has the inputs that φ changes: gravity, if a parameter
+    rotates it, and the shares of loads with an estimated time.
+
+    Values are unchanged until `Dynamics.with_inputs` sets the inputs.
+    """
     forces = dynamics.forces
     loads = [timed.load for timed in nuisance.timed_loads]
     has_gravity_input = len(nuisance.gravity_indices) > 0
     weight = forces.weight.with_load_inputs(
-        has_gravity_input, loads, dynamics.evaluated_s
+        has_gravity_input, loads, t_s=dynamics.evaluated_s
     )
     return replace(dynamics, forces=replace(forces, weight=weight))
 
@@ -143,17 +149,22 @@ def inputs_from_experiment(
     nuisance: NuisanceMap,
     evaluated_s: Array,
 ) -> Inputs:
-    """Return the inputs of an experiment.
+    """Return the inputs of an experiment, in the order that the module states.
 
     Parameters
     ----------
     experiment : Experiment
     parameters : Parameters
-        Parameters of the problem; p begins with the free ones.
+        Parameters of the problem; p begins with the free ones, by their coordinates q.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment; p ends with those of `motion_indices`.
     evaluated_s : (N,)
         Times at which forces are evaluated.
+
+    Raises
+    ------
+    InputError
+        If the parameters do not determine the constants of the body.
     """
     constants = ThetaMap(parameters, experiment.body)
     no_data = np.zeros((0, 1))
@@ -184,6 +195,7 @@ def inputs_from_experiment(
         interval_s = experiment.timestep_s
 
         def change(p: ca.SX, since_s: ca.SX) -> ca.SX:
+            """Return the change of the share, from the time since the stated one [s]."""
             late_s = value(p, phi)
             return sign * (
                 smooth_ramp((since_s - late_s) / interval_s)
@@ -198,6 +210,7 @@ def inputs_from_experiment(
         places = nuisance.actuator_calibration_indices(number)
 
         def driven(p: ca.SX, data: ca.SX) -> ca.SX:
+            """Return the amplitude at the calibration in p."""
             calibration = (
                 nominal + value(p, phi)
                 for nominal, phi in zip(

@@ -28,7 +28,8 @@ def histories_of_trajectory(
     loaded_s: float,
     previous_states: Mapping[int, Array],
 ) -> tuple[AnyHistory, ...]:
-    """Return the internal variables along a motion: of the memory, then of each force.
+    """Return the internal variables along a motion: of the memory, if the body has one, then of each
+    force with internal variables, in the order of the forces.
 
     Parameters
     ----------
@@ -71,13 +72,15 @@ def histories_of_trajectory(
 def insert_histories(
     forces: Forces, histories: Sequence[AnyHistory], rows: slice
 ) -> Forces:
-    """Return the forces of some evaluations with the internal variables of the histories.
+    """Return the forces of some evaluations with the internal variables of the histories; without
+    histories, the forces themselves.
 
     Parameters
     ----------
     forces : Forces
-        Forces at the evaluations `rows`.
+        Forces at the evaluations `rows` alone.
     histories : sequence of histories
+        Histories of the complete motion.
     rows : slice
         Indices of the evaluations.
     """
@@ -104,12 +107,15 @@ def start_states(
         Time for which the body has been in its start shape; infinite if its memory has relaxed.
     """
     states: list[PreviousState] = [
-        ForcePreviousState.from_state(forces, number, x, v)
+        ForcePreviousState.from_state(forces, number, x=x, v=v)
         for number in forces.terms_with_internal_variables
     ]
     if forces.body.has_memory:
         states.insert(
-            0, MemoryState.at_start(forces.body, x, forces.theta, loaded_s)
+            0,
+            MemoryState.at_start(
+                forces.body, x, theta=forces.theta, loaded_s=loaded_s
+            ),
         )
     return tuple(states)
 
@@ -143,5 +149,6 @@ def advance_states(
     `previous_states`; `forces` are those at the later time.
     """
     return tuple(
-        each.advance(forces, x, v, interval_s) for each in previous_states
+        each.advance(forces, x, v=v, interval_s=interval_s)
+        for each in previous_states
     )

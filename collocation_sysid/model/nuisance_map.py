@@ -93,6 +93,24 @@ class TimedLoad(NamedTuple):
         return getattr(self.load, self.change)
 
 
+class CalibrationIndices(NamedTuple):
+    """Indices in φ of the calibration of an actuator; −1 for a parameter that is not estimated.
+
+    Attributes
+    ----------
+    factor : int
+        Index of the factor f.
+    offset : int
+        Index of the loss b.
+    lag : int
+        Index of the logarithm of the lag over the stated lag.
+    """
+
+    factor: int
+    offset: int
+    lag: int
+
+
 @dataclass(frozen=True)
 class NuisanceEntry:
     """One nuisance parameter.
@@ -102,7 +120,9 @@ class NuisanceEntry:
     row : NuisanceRow
         Row of the table of nuisance parameters.
     number : int
-        Index of the component: marker, grasp, actuator, load, camera or sensor of the experiment.
+        Index of the component among those of the kind `row.of`: marker, grasp, actuator (tendons,
+        then pressures), load, camera or sensor of the experiment; 0 for a parameter of the
+        recording.
     axis : int
         Index of the axis of a vector-valued row.
     label : str
@@ -218,21 +238,21 @@ class NuisanceMap:
                 f"{scope.get(e.row.name, experiment.name)}: {e.label}"
                 for e in entries
             ),
-            scales,
-            np.array(reach),
-            experiment.timestep_s,
-            experiment.duration_s,
-            np.array(experiment.gravity_m_s2),
-            middle_m if pivot_m is None else pivot_m,
-            body.nodes_m[
+            scales=scales,
+            step_limits=np.array(reach),
+            interval_s=experiment.timestep_s,
+            duration_s=experiment.duration_s,
+            gravity_m_s2=np.array(experiment.gravity_m_s2),
+            pivot_m=middle_m if pivot_m is None else pivot_m,
+            grasp_pivot_m=body.nodes_m[
                 grasped_nodes if len(grasped_nodes) else slice(None)
             ].mean(axis=0),
-            np.array([a.calibration for a in experiment.actuators]).reshape(
-                -1, 3
-            ),
-            tuple(timed for _, timed in _timed_loads(experiment)),
-            (float(experiment.t_s[0]), float(experiment.t_s[-1])),
-            _strain_shifts_m(experiment),
+            declared_calibration=np.array(
+                [a.calibration for a in experiment.actuators]
+            ).reshape(-1, 3),
+            timed_loads=tuple(timed for _, timed in _timed_loads(experiment)),
+            recorded_s=(float(experiment.t_s[0]), float(experiment.t_s[-1])),
+            strain_shifts_m=_strain_shifts_m(experiment),
         )
         for row in experiment.nuisance.own:
             nuisance_map._require_valid_expression(row)
@@ -284,8 +304,8 @@ class NuisanceMap:
     def iterate_values(
         self, phi: Array
     ) -> Iterator[tuple[NuisanceEntry, str, float]]:
-        """Yield entry, name and value (in the entry's unit) of each parameter at φ, except for the
-        places of markers.
+        """Yield entry, name and value (in the entry's unit) of each parameter at φ (k,), in the
+        order of φ, without the places of markers.
         """
         for entry, name, value in zip(
             self.entries, self.names, phi * self.scales, strict=True
@@ -312,15 +332,17 @@ class NuisanceMap:
         )
 
     def _indices_where(self, chosen: Callable[[NuisanceEntry], bool]) -> Index:
-        """Return the indices in φ of the entries for which a function is true."""
+        """Return the indices in φ, ascending, of the entries for which a function is true; empty if
+        there are none.
+        """
         return np.array(
             [k for k, e in enumerate(self.entries) if chosen(e)], dtype=np.int64
         )
 
     @cached_property
     def motion_indices(self) -> Index:
-        """Indices in φ of the parameters that affect the motion: gravity, grasps, loads,
-        actuators.
+        """Indices in φ, ascending, of the parameters that affect the motion: gravity, grasps,
+        obstacles, loads, actuators.
         """
         return self._indices_where(
             lambda e: not CHANGES_OF_MOTION.isdisjoint(e.row.changes)
@@ -331,9 +353,13 @@ class NuisanceMap:
         """Indices in φ of the calibration of tensions and pressures."""
         return self._indices_where(lambda e: "drives" in e.row.changes)
 
-    def actuator_calibration_indices(self, number: int) -> tuple[int, int, int]:
-        """Return the indices in φ of factor, offset and logarithm of the lag of the actuator with
-        index `number`; −1 for one that is not estimated.
+    def actuator_calibration_indices(self, number: int) -> CalibrationIndices:
+        """Return the indices in φ of the calibration of one actuator.
+
+        Parameters
+        ----------
+        number : int
+            Index of the actuator: tendons first, then pressures.
         """
         columns = {
             TENSION_OFFSET.name: 1,
@@ -344,7 +370,7 @@ class NuisanceMap:
         for k in self.actuator_indices:
             if self.entries[k].number == number:
                 indices[columns.get(self.entries[k].row.name, 0)] = int(k)
-        return indices[0], indices[1], indices[2]
+        return CalibrationIndices(*indices)
 
     def actuator_calibration(self, phi: Array) -> Array:
         """Return factor f, offset b and logarithm of the lag over the stated lag (A, 3) of each
@@ -366,6 +392,8 @@ class NuisanceMap:
     def marker_indices(self, count: int) -> Index:
         """Return the indices in φ (count, f) of the parameters on which the measurement of each of
         `count` markers depends: those of the marker, then those of all markers.
+
+        f is the same for all markers; it may be 0.
         """
         read = self._indices_where(
             lambda e: e.row.reading is not None or e.row.clock is not None
@@ -391,12 +419,13 @@ class NuisanceMap:
         return self._indices_where(lambda e: e.row.clock is not None)
 
     def marker_delay_s(self, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
-        """Return the delay of a marker's measurement relative to the time t_s [s].
+        """Return the delay of a marker's measurement relative to the time t_s [s]: the sum of all
+        clocks, 0 without any.
 
         Parameters
         ----------
         phi : SX
-            Parameters at the indices `places`.
+            Parameters at the indices `places`, in prior standard deviations.
         places : array of int
             Indices in φ of the marker, a row of `marker_indices`.
         t_s : SX
@@ -438,13 +467,15 @@ class NuisanceMap:
 
     @cached_property
     def affects_grasps(self) -> bool:
-        """Whether any φ that affects the motion is not of gravity, so that prescribed positions may
-        change.
+        """Whether any φ that affects the motion is not of gravity; only then may prescribed positions
+        depend on φ (loads and actuators count, too).
         """
         return len(np.setdiff1d(self.motion_indices, self.gravity_indices)) > 0
 
     def displacement_zero_indices(self, number: int) -> Index:
-        """Return the indices in φ of the zeros of a grasp's displacement, axis by axis."""
+        """Return the indices in φ of the zeros of the displacement of the grasp with index
+        `number`, axis by axis; empty if they are not estimated.
+        """
         return self.indices_of_rows(ZERO, component=number)
 
     @cached_property
@@ -455,7 +486,8 @@ class NuisanceMap:
     def obstacle_parameters(
         self, number: int
     ) -> list[tuple[NuisanceRow, int, int]]:
-        """Return row, axis and index in φ of every nuisance parameter of an obstacle.
+        """Return row, axis and index in φ of every nuisance parameter of an obstacle, ascending in
+        φ; empty for a gripper.
 
         Parameters
         ----------
@@ -477,8 +509,14 @@ class NuisanceMap:
     def with_grasps(
         self, grasps: Sequence[Grasp], phi: Array
     ) -> tuple[Grasp, ...]:
-        """Return grasps and obstacles, in the order of the experiment's `grasps`, at their poses at
-        φ: with the hand–eye transform, delays and offsets.
+        """Return grasps and obstacles at their poses at φ (k,): with the hand–eye transform and the
+        zeros of displacement and strain, obstacles with offset, tilt and delay.
+
+        Parameters
+        ----------
+        grasps : sequence of Grasp
+            In the order of the experiment's `grasps`; not modified.
+        phi : (k,)
         """
         motion = self.grasp_motion_matrix(phi)
         return tuple(
@@ -512,7 +550,7 @@ class NuisanceMap:
                 for r in (OBSTACLE_OFFSET, OBSTACLE_TIME)
             )
             return grasp.displaced(
-                offset, deviations.get(OBSTACLE_TILT, zeros), delay_s
+                offset, deviations.get(OBSTACLE_TILT, zeros), delay_s=delay_s
             )
         zero_m = np.zeros(3)
         for place in self.displacement_zero_indices(number):
@@ -526,13 +564,17 @@ class NuisanceMap:
         )
 
     def bounds(self, samples: int) -> tuple[Array, Array]:
-        """Return the lowest and the highest φ (k,) with valid measurements and loads.
+        """Return the lowest and the highest φ with valid measurements and loads, (k,) each.
+
+        They are those of the rows, except for the clock and the times of loads, whose bounds follow
+        from the recording. They may be infinite.
 
         Parameters
         ----------
         samples : int
-            Number of whole samples by which marker measurements are currently shifted; delays may
-            deviate from it by `LARGEST_SHIFT_SAMPLES`.
+            Number of whole samples by which marker measurements are currently shifted. The delay
+            may deviate from it by `LARGEST_SHIFT_SAMPLES` samples, within `LARGEST_DELAY_FRACTION`
+            of the duration, or within `LARGEST_SHIFT_SAMPLES` samples if that is more.
         """
         low = np.array([entry.row.low for entry in self.entries])
         high = np.array([entry.row.high for entry in self.entries])
@@ -557,14 +599,15 @@ class NuisanceMap:
         return low, high
 
     def with_times(self, experiment: Experiment, phi: Array) -> Experiment:
-        """Return the experiment with its loads joining and leaving at the times estimated by φ; the
-        experiment itself if none is estimated.
+        """Return the experiment with its loads joining and leaving at the times estimated by φ
+        (k,); the experiment itself if no time is estimated.
         """
         if not self.timed_loads:
             return experiment
         late_s = (phi * self.scales)[self.indices_of_rows(JOINING)]
 
         def moved(load: Load) -> Load:
+            """Return a load with its estimated times; the load itself if it has none."""
             times = {
                 timed.change: timed.declared_s + float(late)
                 for timed, late in zip(self.timed_loads, late_s, strict=True)
@@ -613,7 +656,9 @@ class NuisanceMap:
         return matrix
 
     def gravity(self, phi: Array) -> Array:
-        """Return gravity (3,) in the frame of the body at φ [m/s²]."""
+        """Return gravity (3,) in the frame of the body at φ (k,) [m/s²]; `gravity_m_s2` itself if
+        no parameter rotates it.
+        """
         if not len(self.gravity_indices):
             return self.gravity_m_s2
         return (
@@ -628,8 +673,9 @@ class NuisanceMap:
         return self.indices_of_rows(TILT, POSE_TURN)
 
     def gravity_expression(self, phi: ca.SX) -> ca.SX:
-        """Return gravity (3,) in the frame of the body as an expression of the φ of
-        `gravity_indices`.
+        """Return gravity (3,) in the frame of the body [m/s²] as an expression of the φ of
+        `gravity_indices` (in prior standard deviations): tilted first, then rotated into the frame
+        of the body.
         """
         values = self.values_by_row(phi, self.gravity_indices)
         gravity = ca.DM(self.gravity_m_s2)
@@ -642,12 +688,13 @@ class NuisanceMap:
     def values_by_row(
         self, phi: ca.SX, places: Index
     ) -> dict[NuisanceRow, ca.SX]:
-        """Return parameters with units by row, each a column vector.
+        """Return parameters with units by row, each a column vector; rows without an index are left
+        out.
 
         Parameters
         ----------
         phi : SX
-            Parameters at the indices `places`.
+            Parameters at the indices `places`, in prior standard deviations.
         places : array of int
             Indices in φ.
         """
@@ -719,7 +766,10 @@ def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
 def _components(
     experiment: Experiment, of: Component
 ) -> Iterable[tuple[int, str]]:
-    """Return index and name of all components of one kind, such as all markers."""
+    """Return index and name of all components of one kind, such as all markers; of the kind "place"
+    only markers whose position is estimated. Indices of obstacles follow those of grasps, those of
+    pressures those of tendons.
+    """
     names = experiment.markers.names
     if of == "recording":
         return [(0, "")]
@@ -804,14 +854,16 @@ def _component_axes(
 
 
 def _wrenches(experiment: Experiment) -> list[Wrench]:
-    """Return the wrench sensors of all grasps."""
+    """Return the wrench sensors of grasps and obstacles, without None for those that have none."""
     return [
         grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None
     ]
 
 
 def _timed_loads(experiment: Experiment) -> list[tuple[str, TimedLoad]]:
-    """Return label and load for every time of a load that is to be estimated."""
+    """Return label and load for every time of a load that is to be estimated, masses first: those that
+    change within the recording. Empty if times count as exact.
+    """
     if not experiment.nuisance.joining_s:
         return []
     verbs: dict[LoadTime, str] = {"from_s": "joining", "until_s": "leaving"}

@@ -55,11 +55,11 @@ def numerical_mode(
     ----------
     scheme : Scheme
     angular_frequency_rad_s : float
-        Angular frequency ω of the undamped oscillation.
+        Angular frequency ω of the undamped oscillation, positive.
     timestep_s : float
         Time step Δt of the grid, i.e. the time between samples divided by the number of substeps.
     damping_ratio : float
-        Physical damping ratio ζ, 0 ≤ ζ < 1.
+        Physical damping ratio ζ, 0 ≤ ζ < 1. The period error is relative to the damped period.
 
     Raises
     ------
@@ -91,8 +91,9 @@ def principal_root(
     Parameters
     ----------
     stencil : Stencil
+        Regular stencil of a scheme.
     h : float
-        Dimensionless time step ωΔt.
+        Dimensionless time step ωΔt, positive.
     damping_ratio : float
         Physical damping ratio ζ.
     """
@@ -113,13 +114,14 @@ def substeps_needed(
     period_error: float = PERIOD_ERROR,
     damping_ratio: float = 0.0,
 ) -> int | None:
-    """Return the fewest substeps that keep numerical damping and period error within limits.
+    """Return the fewest substeps that keep numerical damping and period error within limits, by
+    bisection: both are assumed to decrease with the step.
 
     Parameters
     ----------
     scheme : Scheme
     angular_frequency_rad_s : float
-        Angular frequency ω of the undamped mode.
+        Angular frequency ω of the undamped mode, positive.
     timestep_s : float
         Time between samples.
     damping_limit : float
@@ -133,6 +135,11 @@ def substeps_needed(
     -------
     int or None
         None where `MAX_SUBSTEPS` substeps do not suffice.
+
+    Raises
+    ------
+    InputError
+        For a damping ratio outside [0, 1).
     """
 
     def suffices(substeps: int) -> bool:

@@ -167,7 +167,10 @@ class Parameter:
             )
 
     def _check_fixed(self) -> None:
-        """Raise an `InputError` if the fixed value is inadmissible for the constant."""
+        """Raise an `InputError` if the fixed value is missing, not finite, or not admissible for
+        the constant: below its lower limit (zero is admissible for a logarithmic scale) or at or
+        above its upper one.
+        """
         constant = constant_named(self.name)
         least = (
             constant.at_least
@@ -207,7 +210,9 @@ class Parameter:
             )
 
     def to_coordinate(self, value: float) -> float:
-        """Return the solver's coordinate q of a value."""
+        """Return the solver's coordinate q of a value: its logarithm, or the value divided by
+        `unit`.
+        """
         return (
             float(np.log(value)) if self.scale == "log" else value / self.unit
         )
@@ -217,7 +222,7 @@ class Parameter:
         return float(np.exp(q)) if self.scale == "log" else q * self.unit
 
     def value_derivative(self, value: float) -> float:
-        """Return the derivative of the value by q, at a value."""
+        """Return the derivative of the value by q, at a value (not at a q)."""
         return value if self.scale == "log" else self.unit
 
 
@@ -236,9 +241,12 @@ def complete_parameter(
 ) -> Parameter:
     """Return the complete definition of a parameter, with defaults from its constant.
 
+    The coefficient of a field has the prior N(0, 1) if none is stated.
+
     Parameters
     ----------
     name : str
+        Name with unit and, if it applies to one region only, region.
     user_statement : Unknown, Tied or float
         The user's statement; a number is a fixed value.
 
@@ -246,7 +254,7 @@ def complete_parameter(
     ------
     InputError
         For a guess out of bounds, a linear parameter without a typical change, or a parameter
-        without guess, prior and usual value.
+        without guess, prior and usual value; see also `Parameter`.
     """
     constant = constant_named(name)
     if isinstance(user_statement, Tied):
@@ -352,7 +360,14 @@ class Parameters:
     def from_mapping(
         cls, statements: Mapping[str, Unknown | Tied | float]
     ) -> Parameters:
-        """Return parameters from the user's statements by name; a number is a fixed value."""
+        """Return parameters from the user's statements by name, in their order; a number is a fixed
+        value.
+
+        Raises
+        ------
+        InputError
+            See `complete_parameter` and `Parameters`.
+        """
         return cls(
             tuple(
                 complete_parameter(name, value)
@@ -361,10 +376,10 @@ class Parameters:
         )
 
     def with_fields(self, bodies: Iterable[Body]) -> Parameters:
-        """Return these parameters with those of the bodies' fields that are not stated yet.
+        """Return these parameters, then those of the bodies' fields that are not stated yet:
+        contrasts, then coefficients.
 
-        The coefficients and contrasts of fields are added. A stated contrast that is neither fixed
-        nor has a prior gets the prior of its field.
+        A stated contrast that is neither fixed nor has a prior gets the prior of its field.
         """
         bodies = tuple(bodies)
         names = dict.fromkeys(
@@ -430,8 +445,8 @@ class Parameters:
         )
 
     def scale_and_bounds(self, name: str) -> tuple[bool, tuple[float, float]]:
-        """Return whether a parameter has a linear scale (else a logarithmic one), and its (lower,
-        upper) bounds.
+        """Return whether a parameter has a linear scale (else a logarithmic one), and the (lower,
+        upper) bounds of its value.
 
         The bounds of a derived modulus, or of a fixed or tied parameter, are infinite.
         """
@@ -460,7 +475,7 @@ class Parameters:
 
     @property
     def bounds_q(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of q, (nq,) each."""
+        """Lower and upper bounds of q, (nq,) each, in the order of `free`."""
         return (
             np.array([item.to_coordinate(item.lower) for item in self.free]),
             np.array([item.to_coordinate(item.upper) for item in self.free]),
@@ -468,7 +483,7 @@ class Parameters:
 
     def expressions(self, q: ca.SX) -> dict[str, ca.SX]:
         """Return every parameter, in SI units, as an expression in q (nq,), by name; fixed ones are
-        constants.
+        constants, tied ones multiples of the other parameter.
         """
         by_name = {item.name: ca.SX(item.guess or 0.0) for item in self.items}
         for k, item in enumerate(self.free):
@@ -523,7 +538,7 @@ class Parameters:
 
     def with_guess(self, values: Mapping[str, float]) -> Parameters:
         """Return these parameters with other guesses; for a fixed parameter with another value. The
-        guess of a tied parameter has no effect.
+        guess of a tied parameter has no effect. Parameters that are not named keep theirs.
 
         Raises
         ------
@@ -546,7 +561,12 @@ class Parameters:
         """Return these parameters with some of them fixed at given values; a fixed one loses its
         prior, its bounds and its tie to another.
 
-        Names that do not exist are ignored.
+        Names that do not exist are ignored; parameters that are not named stay.
+
+        Raises
+        ------
+        InputError
+            If a value is inadmissible for its constant.
         """
         return Parameters(
             tuple(
@@ -652,18 +672,20 @@ class ThetaMap:
         )
 
     def theta(self, q: Sequence[float] | Array) -> Array:
-        """Return the constants θ (k,) at q (nq,)."""
+        """Return the constants θ (k,) at q (nq,), in the order of `body.constants`."""
         return self._theta.evaluate(_as_float_array(q), NOTHING)
 
     def jacobian(self, q: Array) -> Array:
-        """Return the derivatives ∂θ/∂q (k, nq)."""
+        """Return the derivatives ∂θ/∂q (k, nq) at q (nq,)."""
         return self._theta.evaluate_with_jacobian(_as_float_array(q), NOTHING)[
             1
         ]
 
     @property
     def derived_names(self) -> tuple[str, ...]:
-        """Names of the derived moduli, such as "young_pa"."""
+        """Names of the derived moduli, such as "young_pa", that are not parameters themselves;
+        empty if there are none.
+        """
         return self._derived[0]
 
     def derived_moduli(self, q: Array) -> tuple[Array, Array]:
@@ -695,6 +717,7 @@ class ThetaMap:
         )
 
         def values(q: ca.SX, _: ca.SX) -> ca.SX:
+            """Return the derived moduli as an expression in q."""
             return _derived_moduli(names, body, theta=self.expression(q))[1]
 
         return derived_names, GeneratedFunction(
@@ -767,7 +790,7 @@ def resolve_theta(
     body: Body,
     values: Parameters | Mapping[str, float] | Sequence[float] | Array,
 ) -> Array:
-    """Return the constants θ (k,) of a body from parameters, values by name, or θ itself.
+    """Return the constants θ (k,) of a body from parameters, values by name, or θ itself (copied).
 
     Parameters
     ----------
@@ -778,7 +801,8 @@ def resolve_theta(
     Raises
     ------
     InputError
-        If names or numbers are missing or unknown.
+        If names are missing or (in a mapping) unknown, a parameter has no guess, or the sequence
+        has another length than the body has constants.
     """
     if isinstance(values, Parameters):
         return body.theta_from_values(values.guesses)

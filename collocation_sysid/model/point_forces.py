@@ -97,7 +97,9 @@ class Pointwise(ForceTerm):
 
     @abstractmethod
     def constant_columns(self, places: AssemblyIndices) -> Index:
-        """Return the columns (c,) of the constants among all inputs."""
+        """Return the columns (c,) of the constants among all inputs u; `places` are those of this
+        term.
+        """
 
     @abstractmethod
     def data(self, chosen: Index | None) -> Array:
@@ -123,8 +125,8 @@ class Pointwise(ForceTerm):
         previous_state: PreviousState,
         variable_weights: Array | None = None,
     ) -> Self:
-        """Return this force with given internal variables, and with weights of h in second
-        derivatives, which are zero for None.
+        """Return this force with given internal variables of the previous evaluations, and with
+        weights of h in second derivatives, (n, T, I), which are zero for None.
         """
         return replace(
             self,  # type: ignore[type-var]
@@ -133,7 +135,8 @@ class Pointwise(ForceTerm):
         )
 
     def interval_and_start(self, times: int) -> tuple[Array, Array]:
-        """Return the time since the previous evaluation (T,), and 1 at the start, else 0 (T,).
+        """Return the time since the previous evaluation (T,) [s], and 1 where it is zero, as at the
+        start, else 0 (T,). Without `previous_state` all evaluations count as starts.
 
         Parameters
         ----------
@@ -215,20 +218,28 @@ class Pointwise(ForceTerm):
         add = points.add_matrices
         depends_on_place = bool(self.law.dependent_inputs[evaluated.y].any())
         if depends_on_place:
-            add(linearisation.by_position, entries, by_x, chosen)
+            add(linearisation.by_position, entries, blocks=by_x, chosen=chosen)
         if (
             depends_on_place
             and self.has_skew_stiffness
             and linearisation.by_position_skew.size
         ):
             add(
-                linearisation.by_position_skew, entries, by_x, chosen, skew=True
+                linearisation.by_position_skew,
+                entries,
+                blocks=by_x,
+                chosen=chosen,
+                skew=True,
             )
         if self.is_nonlinear_in_velocity:
-            add(linearisation.by_velocity, entries, by_v, chosen)
+            add(linearisation.by_velocity, entries, blocks=by_v, chosen=chosen)
         if self.has_skew_damping:
             add(
-                linearisation.by_velocity_skew, entries, by_v, chosen, skew=True
+                linearisation.by_velocity_skew,
+                entries,
+                blocks=by_v,
+                chosen=chosen,
+                skew=True,
             )
         for k, column in enumerate(self.constant_columns(places)):
             linearisation.by_theta[:, :, column] += points.assemble(
@@ -263,24 +274,41 @@ class Pointwise(ForceTerm):
         w = self._weights(evaluated, weights)
         x = evaluated.y
         v = evaluated.v
-        second = self.law.weighted_hessian(evaluated.u, evaluated.data, w)
+        second = self.law.weighted_hessian(
+            evaluated.u, evaluated.data, weights=w
+        )
         add = points.add_matrices
         chosen = evaluated.chosen
         depends_on_place = bool(self.law.dependent_inputs[x].any())
         if depends_on_place:
-            add(curvature.position_position, entries, second[x, x], chosen)
+            add(
+                curvature.position_position,
+                entries,
+                blocks=second[x, x],
+                chosen=chosen,
+            )
         if self.is_nonlinear_in_velocity and depends_on_place:
-            add(curvature.position_velocity, entries, second[x, v], chosen)
+            add(
+                curvature.position_velocity,
+                entries,
+                blocks=second[x, v],
+                chosen=chosen,
+            )
             if curvature.position_velocity_skew.size:
                 add(
                     curvature.position_velocity_skew,
                     entries,
-                    second[x, v],
-                    chosen,
+                    blocks=second[x, v],
+                    chosen=chosen,
                     skew=True,
                 )
         if self.is_nonlinear_in_velocity:
-            add(curvature.velocity_velocity, entries, second[v, v], chosen)
+            add(
+                curvature.velocity_velocity,
+                entries,
+                blocks=second[v, v],
+                chosen=chosen,
+            )
         _, slopes = self.law.evaluate_with_jacobian(evaluated.u, evaluated.data)
         columns = list(
             enumerate(self.constant_columns(places), evaluated.c.start)
@@ -324,7 +352,9 @@ class Pointwise(ForceTerm):
     # Of one that carries ----------------------------------------------------------------------
 
     def internal_variables(self, states: States) -> Array:
-        """Return the internal variables h (n, T, I) after the evaluations."""
+        """Return the internal variables h (n, T, I) of all instances after the evaluations; zero at
+        instances that cannot act.
+        """
         evaluated = self._inputs_at(states)
         return self._expanded(
             self.law.evaluate(evaluated.u, evaluated.data)[evaluated.y.stop :],
@@ -332,7 +362,10 @@ class Pointwise(ForceTerm):
         )
 
     def derivatives(self, states: States) -> LawDerivatives:
-        """Return the first derivatives of F and h by y, ẏ, c and h_{k−1}, (d + n, …, T, I) each."""
+        """Return the first derivatives of F and h at all I instances by y, ẏ, c and h_{k−1}, (d +
+        n, …, T, I) each: first those of the d forces, with `factor`, then of the n internal
+        variables.
+        """
         evaluated = self._inputs_at(states)
         _, slopes = self.law.evaluate_with_jacobian(evaluated.u, evaluated.data)
         slopes[evaluated.y] *= self.factor
@@ -353,7 +386,9 @@ class Pointwise(ForceTerm):
         """
         evaluated = self._inputs_at(states)
         second = self.law.weighted_hessian(
-            evaluated.u, evaluated.data, self._weights(evaluated, weights)
+            evaluated.u,
+            evaluated.data,
+            weights=self._weights(evaluated, weights),
         )
         return evaluated.split(
             self._expanded(second[:, evaluated.b], evaluated), 0
@@ -510,7 +545,8 @@ class CustomForce(Pointwise):
         return replace(self, t_s=self.t_s[rows])
 
     def interpolate(self, other: Self, share: float) -> Self:
-        """Return the force of `other`, at times interpolated linearly between both.
+        """Return the force of `other`, at times interpolated linearly between both: `share` is 0
+        for the times of this force and 1 for those of the other.
 
         Internal variables are those of `other`.
         """
@@ -526,7 +562,7 @@ class CustomForce(Pointwise):
 
     def data(self, chosen: Index | None) -> Array:
         """Return the data (d, T, I) of the law at all instances, in the order in which a
-        `ForceContext` reads them; `chosen` is not used.
+        `ForceContext` reads them; `chosen` is not used, because all instances act.
         """
         data = np.empty((CONTEXT_SIZE, len(self.t_s), self.points.count))
         data[0] = self.t_s[:, None]
@@ -574,5 +610,5 @@ def air_drag_terms(
 
 
 def custom_force_terms(body: Body, t_s: Array) -> tuple[CustomForce, ...]:
-    """Return the custom forces declared for a body, at times (T,)."""
+    """Return the custom forces declared for a body, at times (T,) [s]; empty if there are none."""
     return tuple(CustomForce(placed, t_s) for placed in body.placed_forces)

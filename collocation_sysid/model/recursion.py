@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -22,6 +23,22 @@ from ..common.array_types import Array
 from .generated_functions import GeneratedFunction
 
 Expression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
+
+
+class HistoryGradient(NamedTuple):
+    """Gradient, through internal variables, of a scalar along a motion with N evaluations.
+
+    Attributes
+    ----------
+    by_xi, by_nu : (N, 3n)
+        Derivatives by positions and velocities at the evaluations.
+    by_parameters : (m,)
+        Derivatives by the parameters p.
+    """
+
+    by_xi: Array
+    by_nu: Array
+    by_parameters: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +82,7 @@ class Recursion:
         """Expression R of the stacked inputs u = (h_{k−1}, s_k, s_{k−1}, c), with derivatives."""
 
         def expression(u: ca.SX, data: ca.SX) -> ca.SX:
+            """Return h_k from the stacked inputs."""
             before, now, last, constants = ca.vertsplit(
                 u, [0, *self.input_offsets]
             )
@@ -137,7 +155,9 @@ class RecursionTrajectory:
         """
         data = np.broadcast_to(data, (recursion.data_size, *signal.shape[1:]))
         states = np.zeros((recursion.state_size, *signal.shape[1:]))
-        trajectory = cls(recursion, constants, data, signal, states)
+        trajectory = cls(
+            recursion, constants, data=data, signal=signal, states=states
+        )
         for k in range(signal.shape[1]):
             now = slice(k, k + 1)
             states[:, now] = recursion.step_function.evaluate(
@@ -172,7 +192,8 @@ class RecursionTrajectory:
     def jacobian_vector_product(
         self, signal_changes: Array, constant_changes: Array
     ) -> Array:
-        """Return the changes of the states (n, N, I, c) for c directions at once.
+        """Return the changes of the states (n, N, I, c) for c directions at once, including those
+        through earlier states.
 
         Parameters
         ----------
@@ -194,7 +215,8 @@ class RecursionTrajectory:
         return changes
 
     def vector_jacobian_product(self, weights: Array) -> tuple[Array, Array]:
-        """Return the gradient of Σ weights · h by the signal (i, N, I) and by the constants (C,).
+        """Return the gradient of Σ weights · h, over all times and instances, by the signal (i, N,
+        I) and by the constants (C,).
 
         Parameters
         ----------

@@ -69,9 +69,10 @@ class Scheme:
     start: tuple[Stencil, ...]
 
     def stencil(self, row: int) -> Stencil:
-        """Return the stencil of a row, given by its index.
+        """Return the stencil of a row, given by its index from 0.
 
-        Row 0, which exists where an experiment starts in equilibrium, has the stencil of statics.
+        Row 0, which exists where an experiment starts in equilibrium, has the stencil of statics;
+        rows after those of `start` have the regular one.
         """
         if row == 0:
             return STATIC
@@ -173,7 +174,8 @@ def as_scheme(
     ----------
     scheme_or_name : str or Scheme
     start_rule : {"standard", "paper"}
-        "paper" drops the inertia of the first step (a = 0); for backward Euler only.
+        "standard": the scheme as it is. "paper" drops the inertia of the first step (a = 0); for
+        backward Euler only.
 
     Raises
     ------

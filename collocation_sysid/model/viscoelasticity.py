@@ -35,7 +35,7 @@ from ..fem.body import Body, SecondDerivatives
 from ..fem.laws.memory import MemoryInput, MemoryLayout, fading_coefficients
 from .forces import Forces
 from .generated_functions import GeneratedFunction
-from .recursion import Recursion
+from .recursion import HistoryGradient, Recursion
 
 # Number of evaluations whose stress derivatives are kept at a time; limits memory.
 EVALUATIONS_PER_CHUNK = 16
@@ -158,7 +158,7 @@ class FadingCoefficients:
             theta[places][..., None], (2, branches, len(until_next_s))
         )
         (c, d, a), by = COEFFICIENTS.evaluate_with_jacobian(u, data)
-        return cls(places, u, data, c, d, a, by)
+        return cls(places, u, data=data, c=c, d=d, a=a, by=by)
 
     def jacobian_vector_product(self, theta_q: Array) -> tuple[Array, Array]:
         """Return the derivatives (q, B, N) of the coefficients d and a along the q directions
@@ -224,7 +224,7 @@ class MemoryHistory:
         """
         stress = body.stresses.stress(xi, theta)
         fades = FadingCoefficients.from_body(
-            body, theta, until_next_s, loaded_s
+            body, theta, until_next_s=until_next_s, loaded_s=loaded_s
         )
         if previous_variables is None:
             borne = body.memory.to_branches(stress)
@@ -234,7 +234,14 @@ class MemoryHistory:
                 previous_variables[k + 1] = (
                     d[k] * previous_variables[k] + a[k] * borne[k]
                 )
-        return cls(body, theta, xi, stress, fades, previous_variables)
+        return cls(
+            body,
+            theta,
+            xi=xi,
+            stress=stress,
+            fading=fades,
+            previous_variables=previous_variables,
+        )
 
     @property
     def memory(self) -> MemoryLayout:
@@ -318,8 +325,8 @@ class MemoryHistory:
 
     @property
     def recursion_residuals(self) -> Array:
-        """Residuals m_k − d_k m_{k−1} − a_k S_k for k = 0 … N − 2 (N − 1, all branches) [Pa]; zero
-        if m satisfies the recursion.
+        """Residuals m_k − d_k m_{k−1} − a_k S_k for k = 0 … N − 2 (N − 1, all branches) [Pa]; zero if
+        `previous_variables` satisfy the recursion, as those do that are computed from the states.
         """
         d, a = (
             self.memory.repeat_over_points(each[:, :-1])
@@ -362,17 +369,14 @@ class MemoryHistory:
             yield (
                 rows,
                 self.body.stresses.stress_theta_derivatives(
-                    self.xi[rows], self.theta, theta_q
+                    self.xi[rows], self.theta, theta_q=theta_q
                 ),
             )
 
     def vector_jacobian_product(
         self, force_weights: Array, by_p: Array
-    ) -> tuple[Array, Array, Array]:
-        """Return the derivatives of Σ λ_k f_H(H_k) through H by ξ and ν, (N, 3n) each, and by p
-        (m,).
-
-        Those by ν are zero.
+    ) -> HistoryGradient:
+        """Return the derivatives of Σ λ_k · f_H(H_k) through H; those by ν are zero.
 
         Parameters
         ----------
@@ -388,7 +392,7 @@ class MemoryHistory:
         stresses = self.body.stresses
         d = self.memory.repeat_over_points(self.fading.d)
         pushes = self.memory.to_branches(
-            stresses.memory_force_vjp(self.xi, force_weights, self.theta)
+            stresses.memory_force_vjp(self.xi, force_weights, theta=self.theta)
         )
         mu = np.zeros_like(pushes)
         for k in range(len(mu) - 1, 0, -1):
@@ -402,10 +406,10 @@ class MemoryHistory:
         for rows, slopes in self.stress_derivatives(theta_q):
             by_q += np.einsum("tqp,tp->q", slopes, sigma[rows])
         by_parameters[used] = by_q
-        return (
-            stresses.stress_vjp(self.xi, sigma, self.theta),
+        return HistoryGradient(
+            stresses.stress_vjp(self.xi, sigma, theta=self.theta),
             np.zeros_like(self.xi),
-            by_parameters,
+            by_parameters=by_parameters,
         )
 
     def add_curvature(self, curvature: SecondDerivatives, mu: Array) -> None:
@@ -443,7 +447,9 @@ class MemoryHistory:
             memory.repeat_over_points(np.eye(len(memory.branches)))
         ):
             weights = memory.sum_over_branches(branch_mask * mu)
-            by_xi = self.body.stresses.stress_vjp(self.xi, weights, self.theta)
+            by_xi = self.body.stresses.stress_vjp(
+                self.xi, weights, theta=self.theta
+            )
             for place, factor in zip(
                 places[:, number], mixed[:, number], strict=True
             ):
@@ -483,8 +489,8 @@ class MemoryState:
     def at_start(
         cls, body: Body, x: Array, theta: Array, loaded_s: float
     ) -> MemoryState:
-        """Return the memory in the start shape x (3n,) [m], loaded for a time `loaded_s` [s];
-        infinite if the memory has relaxed.
+        """Return the memory in the start shape x (3n,) [m] of a body with constants θ (k,), which
+        has been loaded for a time `loaded_s` [s]; infinite if the memory has relaxed.
         """
         return MemoryHistory.from_states(
             body,
@@ -516,7 +522,8 @@ class MemoryState:
     def advance(
         self, forces: Forces, x: Array, v: Array, interval_s: float
     ) -> MemoryState:
-        """Return the memory in the state x (3n,) one interval later.
+        """Return the memory in the state x (3n,) [m] that follows after an interval [s]; `self` is
+        unchanged.
 
         Forces and velocity are not used.
         """
@@ -544,7 +551,8 @@ class MemoryState:
 
 
 def with_start_memory(forces: Forces, loaded_s: float) -> Forces:
-    """Return forces on the start shape, with the overstress of a load that was applied recently.
+    """Return forces on the start shape, with the additional stiffness of a load that was applied a
+    time `loaded_s` [s] ago: Q = g e^(−t/τ) S.
 
     The forces are unchanged for a body without memory, or if `loaded_s` is infinite.
     """
@@ -552,7 +560,9 @@ def with_start_memory(forces: Forces, loaded_s: float) -> Forces:
     if not body.has_memory or np.isinf(loaded_s):
         return forces
     past = body.memory.relaxed(1)
-    c = FadingCoefficients.from_body(body, forces.theta, np.ones(1), loaded_s).c
+    c = FadingCoefficients.from_body(
+        body, forces.theta, until_next_s=np.ones(1), loaded_s=loaded_s
+    ).c
     for branch, own in zip(body.memory.branches, c, strict=True):
         past.stiffening[:, branch.part] += own
     return replace(forces, memory_state=past)
@@ -610,7 +620,9 @@ class MemoryForwardColumns:
         """
         self._state[:] = self.history.xi[self.next]
         return self.stresses.memory_force(
-            self._state, self.memory.sum_over_branches(self.columns), self.theta
+            self._state,
+            self.memory.sum_over_branches(self.columns),
+            theta=self.theta,
         ).T
 
     def advance(
@@ -639,7 +651,7 @@ class MemoryForwardColumns:
         else:
             stress.fill(0.0)
         self.stresses.stress_jvp(
-            self._state, self._direction, self.theta, stress
+            self._state, self._direction, theta=self.theta, out=stress
         )
         for column, slope in zip(
             self._moduli, self._elastic_stress_derivatives(k), strict=True
@@ -666,7 +678,7 @@ class MemoryForwardColumns:
             first = k - k % EVALUATIONS_PER_CHUNK
             xi = self.history.xi[first : first + EVALUATIONS_PER_CHUNK]
             self._by_moduli = self.stresses.stress_theta_derivatives(
-                xi, self.theta, self._theta_q
+                xi, self.theta, theta_q=self._theta_q
             )
         return self._by_moduli[k % EVALUATIONS_PER_CHUNK]
 
@@ -694,7 +706,7 @@ class MemoryAdjoint:
         )
         state = history.xi[k]
         by_x = history.body.stresses.stress_vjp(
-            state[None], weights[None], history.theta
+            state[None], weights[None], theta=history.theta
         )[0]
         return by_x, np.zeros_like(by_x)
 
@@ -711,7 +723,7 @@ class MemoryAdjoint:
         state = history.xi[k][None]
         weight = force_weight[None]
         push = history.body.stresses.memory_force_vjp(
-            state, weight, history.theta
+            state, weight, theta=history.theta
         )[0]
         d = history.memory.repeat_over_points(history.fading.d[:, k])
         self.columns = d * self.columns + history.memory.to_branches(push)

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -91,9 +91,8 @@ class DofMasses:
 
     @cached_property
     def compact_tied_kg(self) -> Array | None:
-        """Tied masses as (3n,) if they are constant in time, else (T, 3n).
-
-        None if there are none.
+        """Tied masses as (3n,) if they are stored as constant in time (a view with stride 0), else
+        (T, 3n); None if they are constant and zero.
         """
         if not len(self.tied_kg) or self.tied_kg.strides[0]:
             return self.tied_kg
@@ -135,7 +134,9 @@ class Weight(ForceTerm):
 
     @classmethod
     def from_experiment(cls, experiment: Experiment, t_s: ArrayLike) -> Weight:
-        """Return the weight and loads of an experiment at the times `t_s` (T,)."""
+        """Return the weight and loads of an experiment at the times `t_s` (T,); a free density
+        gives NaN masses until `with_theta`.
+        """
         applied = experiment.declared_node_forces_n(t_s)
         body = experiment.body
         tied = np.repeat(experiment.point_mass_at_nodes_kg(t_s), 3, axis=1)
@@ -150,10 +151,10 @@ class Weight(ForceTerm):
         return cls(
             body,
             mass,
-            experiment.gravity_m_s2,
-            applied,
-            False,
-            *_no_loads(applied),
+            gravity_m_s2=experiment.gravity_m_s2,
+            applied_n=applied,
+            has_gravity_input=False,
+            **_zero_loads(applied)._asdict(),
         )
 
     @classmethod
@@ -164,10 +165,19 @@ class Weight(ForceTerm):
         mass = DofMasses(
             _own_kg(body), nothing, displaced_kg=no_air_kg, added_kg=no_air_kg
         )
-        return cls(body, mass, np.zeros(3), nothing, False, *_no_loads(nothing))
+        return cls(
+            body,
+            mass,
+            gravity_m_s2=np.zeros(3),
+            applied_n=nothing,
+            has_gravity_input=False,
+            **_zero_loads(nothing)._asdict(),
+        )
 
     def with_theta(self, theta: Theta) -> Self:
-        """Return this weight for a body with constants θ, which contain free densities."""
+        """Return this weight for a body with constants θ (k,); self if no density is free, because
+        then masses do not depend on θ.
+        """
         if not self.body.mass_derivatives:
             return self
         return replace(
@@ -192,21 +202,16 @@ class Weight(ForceTerm):
         t_s : (T,)
             Times of the evaluations [s].
         """
-        kg, newtons, share = _no_loads(self.applied_n, len(loads))
+        joining = _zero_loads(self.applied_n, len(loads))
+        nodes = self.body.pattern.size // 3
         for k, load in enumerate(loads):
-            nodes = kg.shape[1] // 3
             if isinstance(load, PointMass):
-                kg[k] = np.repeat(load.node_mass_kg(nodes), 3)
+                joining.joining_kg[k] = np.repeat(load.node_mass_kg(nodes), 3)
             else:
-                newtons[k] = load.node_forces_n(t_s, nodes).reshape(
-                    len(t_s), -1
-                )
+                forces_n = load.node_forces_n(t_s, nodes)
+                joining.joining_n[k] = forces_n.reshape(len(t_s), -1)
         return replace(
-            self,
-            has_gravity_input=has_gravity_input,
-            joining_kg=kg,
-            joining_n=newtons,
-            share=share,
+            self, has_gravity_input=has_gravity_input, **joining._asdict()
         )
 
     @property
@@ -216,7 +221,9 @@ class Weight(ForceTerm):
 
     def with_inputs(self, u: Array) -> Self:
         """Return this weight at inputs u (T, size): gravity from the first time if it is an input,
-        then the shares of the loads.
+        then the shares of the loads, as changes from the stated shares.
+
+        Tied masses and applied forces follow the shares; self if there are no inputs.
         """
         if not self.size:
             return self
@@ -310,8 +317,19 @@ class Weight(ForceTerm):
         places: AssemblyIndices,
         states: States,
     ) -> None:
-        """Add the forces and their first derivatives to a linearisation, in place, at the input
-        columns `places`; the states are not used.
+        """Add the forces and their first derivatives by the inputs and by free densities to a
+        linearisation, in place.
+
+        Velocities and θ of `states` enter the derivatives by the shares of loads, through the
+        damping γ_m of their masses; the damping force itself is part of `Body.force`.
+
+        Parameters
+        ----------
+        linearisation : Linearisation
+            Shared arrays; modified.
+        places : AssemblyIndices
+            Columns of the inputs; its entries are not used.
+        states : States
         """
         np.add(linearisation.force, self.external_n, out=linearisation.force)
         for density, slope in self.body.mass_derivatives.items():
@@ -336,8 +354,20 @@ class Weight(ForceTerm):
         states: States,
         weights: Array,
     ) -> None:
-        """Add the derivatives of Σ weights · F, for weights (T, 3n), to a curvature, in place, at
-        the input columns `places`; the states are not used.
+        """Add the derivatives of Σ weights · F by inputs, free densities and velocities to a
+        curvature, in place.
+
+        Those by velocities and γ_m follow from the damping of joining masses.
+
+        Parameters
+        ----------
+        curvature : SecondDerivatives
+            Shared arrays; modified.
+        places : AssemblyIndices
+            Columns of the inputs; its entries are not used.
+        states : States
+        weights : (T, 3n)
+            Weights of the forces.
         """
         for density, slope in self.body.mass_derivatives.items():
             curvature.theta[:, density] += weights @ (slope * self.gravity)
@@ -379,16 +409,29 @@ class Weight(ForceTerm):
 
 
 def _own_kg(body: Body) -> Array:
-    """Return the masses (3n,) of a body whose constants are not known yet.
-
-    NaN for free densities.
+    """Return the masses (3n,) of a body whose constants are not known yet [kg]; NaN where a density or
+    a density field is a parameter.
     """
     return body.mass_of_dofs(np.full(len(body.constants), np.nan))
 
 
-def _no_loads(rows: Array, count: int = 0) -> tuple[Array, Array, Array]:
-    """Return zero arrays for `joining_kg` (count, 3n), `joining_n` (count, T, 3n) and `share` (T,
-    count) of `count` loads.
+class _JoiningLoads(NamedTuple):
+    """Arrays of the L loads whose time is estimated, see `Weight`.
+
+    Attributes
+    ----------
+    joining_kg : (L, 3n)
+    joining_n : (L, T, 3n)
+    share : (T, L)
+    """
+
+    joining_kg: Array
+    joining_n: Array
+    share: Array
+
+
+def _zero_loads(rows: Array, count: int = 0) -> _JoiningLoads:
+    """Return arrays of zeros for a number of loads.
 
     Parameters
     ----------
@@ -397,10 +440,10 @@ def _no_loads(rows: Array, count: int = 0) -> tuple[Array, Array, Array]:
     count : int
     """
     times, dofs = rows.shape
-    return (
+    return _JoiningLoads(
         np.zeros((count, dofs)),
         np.zeros((count, times, dofs)),
-        np.zeros((times, count)),
+        share=np.zeros((times, count)),
     )
 
 

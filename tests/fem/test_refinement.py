@@ -107,6 +107,15 @@ def test_a_refined_body_keeps_its_terms():
     ]
 
 
+@pytest.mark.parametrize("stated", [{"mass_kg": 0.2}, {"density_kg_m3": 30.0}])
+def test_a_refined_body_has_a_declared_mass_if_the_body_has(stated):
+    """The effect of the body's size depends on it, see `systematic_effects`."""
+    body = Body(box_mesh((0.1, 0.1, 0.1), (1, 1, 1)), **stated)
+    finer = refine_body(body)
+    assert finer.has_declared_mass == ("mass_kg" in stated)
+    assert finer.mass_kg == pytest.approx(body.mass_kg)
+
+
 @pytest.mark.parametrize("element", ["tet4", "tet10"])
 def test_a_grasp_holds_the_same_faces_on_the_finer_mesh(element):
     hung = hung_cube(4)

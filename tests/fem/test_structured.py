@@ -7,7 +7,14 @@ import pytest
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.mesh import TetMesh
-from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_mesh
+from collocation_sysid.fem.meshes.structured import (
+    box_mesh,
+    box_of_edge,
+    count_box_elements,
+    count_cylinder_elements,
+    cylinder_mesh,
+    cylinder_of_edge,
+)
 
 
 @pytest.fixture
@@ -85,3 +92,19 @@ def test_cylinder_is_a_conforming_prism_of_good_elements(rings, layers):
 def test_structured_meshes_refuse_impossible_sizes(make):
     with pytest.raises(InputError, match="needs"):
         make()
+
+
+@pytest.mark.parametrize("edge_length_m", [0.0, -0.01, float("nan")])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda edge_m: box_of_edge((0.1, 0.1, 0.1), edge_m),
+        lambda edge_m: count_box_elements((0.1, 0.1, 0.1), edge_m),
+        lambda edge_m: cylinder_of_edge(0.1, 0.1, edge_m),
+        lambda edge_m: count_cylinder_elements(0.1, 0.1, edge_m),
+    ],
+)
+def test_an_edge_length_that_is_not_positive_is_refused(make, edge_length_m):
+    """A negative one would give a single cell along each axis."""
+    with pytest.raises(InputError, match=r"edge_length_m.*positive length"):
+        make(edge_length_m)

@@ -102,9 +102,12 @@ def choose_evaluator(choice: str = "auto") -> str:
 
 
 def _requested_evaluator(choice: str) -> str:
-    """Return the choice, or for "auto" that of the environment variable.
+    """Return the choice, or for "auto" that of the environment variable: "auto" itself if none is set.
 
-    An `InputError` if unknown.
+    Raises
+    ------
+    InputError
+        If choice or variable is unknown.
     """
     if choice == "auto":
         choice = os.environ.get("COLLOCATION_SYSID_EVALUATOR", "auto")
@@ -155,6 +158,11 @@ class EvaluatorChoice:
         Evaluator in use; changes to "casadi" on a fallback.
     notes : tuple of str
         Reasons of a fallback.
+
+    Raises
+    ------
+    InputError
+        See `choose_evaluator`.
     """
 
     def __init__(self, choice: str = "auto") -> None:
@@ -165,7 +173,8 @@ class EvaluatorChoice:
     def check(self, function: ca.Function) -> None:
         """Check, without compiling, whether the evaluator supports all operations of a function.
 
-        If not, fall back to CasADi's evaluator.
+        If not, fall back to CasADi's evaluator: `name` and `notes` change. CasADi's evaluator
+        supports all.
 
         Raises
         ------
@@ -211,13 +220,15 @@ class EvaluatorChoice:
 
 
 def make_instance_evaluator(function: ca.Function, compiled: bool) -> Instances:
-    """Return an evaluator of a function at many instances.
+    """Return an evaluator of a function at many instances, see `instances`.
 
     Parameters
     ----------
     function : casadi.Function
+        Function of dense inputs.
     compiled : bool
-        Whether to compile the function; CasADi's evaluator is used where that is not possible.
+        Whether to compile the function; CasADi's evaluator is used, without a note, where that is
+        not possible, or "casadi" is chosen by the environment variable.
     """
     if compiled and choose_evaluator() == "simd":
         # What llvmlite raises where it cannot compile, and what there is no instruction for.
@@ -227,7 +238,9 @@ def make_instance_evaluator(function: ca.Function, compiled: bool) -> Instances:
 
 
 def make_combiner(plan: CombinationPlan) -> Combiner:
-    """Return the loop that fills sparse values according to a plan, compiled if llvmlite can."""
+    """Return the loop that fills sparse values according to a plan, compiled if llvmlite can, else in
+    NumPy; see `combine.combine_with_numpy` for its arguments.
+    """
     if find_spec("llvmlite"):
         try:
             return compile_combiner(plan)

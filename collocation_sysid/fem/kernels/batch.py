@@ -57,22 +57,23 @@ class Evaluator(Protocol):
         add: bool = False,
         data_of_points: Array | None = None,
     ) -> None:
-        """Overwrite `out`, or add to it.
+        """Sum the kernel over elements and quadrature points, for each time step.
 
         Parameters
         ----------
         fields : sequence of (T, 3n)
-            Node fields of the kernel.
+            Node fields of the kernel, contiguous.
         theta : (k,)
-            Constants.
+            Constants of the points, not of the body.
         out : (T, width)
-            Result; modified.
+            Result; overwritten, or added to if `add`.
         threads : int
-            Number of threads.
+            Number of threads over which time steps are distributed.
         add : bool
             Whether to add to `out`.
         data_of_points : (T, any) or (1, any), optional
-            Data of the points, (1, any) if they are equal at all times.
+            Data of the points, (1, any) if they are equal at all times; None for a kernel without
+            data.
         """
         ...
 
@@ -122,7 +123,9 @@ class CasadiEvaluator:
         add: bool = False,
         data_of_points: Array | None = None,
     ) -> None:
-        """Sum the kernel over elements and points into `out` (T, width); see `Evaluator`."""
+        """Sum the kernel over elements and points into `out` (T, width); see `Evaluator`. One
+        thread is used, whatever `threads` is.
+        """
         for t in range(len(out)):
             inputs = [field[t][self._dofs] for field in fields]
             if (

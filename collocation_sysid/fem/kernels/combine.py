@@ -50,7 +50,8 @@ def combine_with_numpy(plan: CombinationPlan) -> Combiner:
     """Return the reference combiner, one indexed NumPy statement for each task.
 
     The combiner ``combine(start, stop, a, b, values)`` executes the tasks of column blocks `start`
-    … `stop` − 1 on the rows of a and b, and writes to `values` in place.
+    … `stop` − 1 and writes to `values` in place: a task sets values[targets + offset] to α a[row,
+    sources] + β b[row, sources], or adds that; a matrix with the coefficient 0 is not read.
     """
 
     def combine(
@@ -75,8 +76,15 @@ def combine_with_numpy(plan: CombinationPlan) -> Combiner:
 
 
 def compile_combiner(plan: CombinationPlan) -> Combiner:
-    """Return a compiled combiner with the same arguments and result as that of
-    `combine_with_numpy`.
+    """Return a compiled combiner with the arguments and result of that of `combine_with_numpy`.
+
+    Rows of a and b must be contiguous and equally far apart. Both matrices are read whatever their
+    coefficients.
+
+    Raises
+    ------
+    RuntimeError
+        If LLVM cannot compile the code.
     """
     from .jit import NativeCode, compile_function
 
@@ -156,6 +164,9 @@ def _emit() -> Any:
         )
 
         def loop(accumulate: bool) -> None:
+            """Emit the loop over the entries of a task that overwrites the values, or adds to
+            them.
+            """
             with for_range(builder, I64(0), stop=length, name="entry") as i:
                 source = builder.sext(
                     builder.load(builder.gep(sources_here, [i])), I64

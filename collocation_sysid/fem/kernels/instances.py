@@ -26,11 +26,13 @@ def make_casadi_instance_evaluator(function: ca.Function) -> Instances:
     """Return the reference evaluator: the function mapped over instances by CasADi.
 
     It takes a list of arrays (size, instances), one for each input, and returns such a list of
-    outputs; each size is the number of structural nonzeros.
+    outputs; each size is the number of structural nonzeros, and rows of outputs are in CasADi's
+    order, column after column.
     """
     mapped: dict[int, ca.Function] = {}
 
     def evaluate(inputs: list[Array]) -> list[Array]:
+        """Return the outputs (size, instances) at inputs (size, instances)."""
         count = inputs[0].shape[1]
         arguments = [np.ascontiguousarray(each.T, float) for each in inputs]
         outputs = [
@@ -60,12 +62,14 @@ def make_casadi_instance_evaluator(function: ca.Function) -> Instances:
 
 def compile_instance_evaluator(function: ca.Function) -> Instances:
     """Return an evaluator in vector code, each lane of which is one instance; arguments and results
-    are those of `make_casadi_instance_evaluator`.
+    are those of `make_casadi_instance_evaluator`. There must be at least one instance.
 
     Raises
     ------
     VectorCodeError
         For operations that vector code does not support.
+    RuntimeError
+        If LLVM cannot compile the code.
     """
     from .instructions import require_supported_operations
     from .jit import NativeCode, address, compile_function, vector_lanes
@@ -85,6 +89,7 @@ def compile_instance_evaluator(function: ca.Function) -> Instances:
     )
 
     def evaluate(inputs: list[Array]) -> list[Array]:
+        """Return the outputs (size, instances) at inputs (size, instances)."""
         count = inputs[0].shape[1]
         padded_count = -(-count // lanes) * lanes
         if padded_count > count:
@@ -126,12 +131,14 @@ def _emit(function: ca.Function, lanes: int) -> Any:
         first = b.mul(block, I64(lanes))
 
         def pointer(array: int, entry: int) -> Value:
+            """Return the pointer to an entry of an array at the instances of the block."""
             place = b.gep(
                 places[array], [b.add(b.mul(I64(entry), count), first)]
             )
             return b.bitcast(place, vector.as_pointer())
 
         def read(array: int, entry: int) -> Value:
+            """Load an entry of an input at the instances of the block."""
             return b.load(pointer(array, entry), align=8)
 
         for output, entry, value in emit_function(

@@ -33,7 +33,7 @@ TAIL = (
 
 
 def _inverse_error(x: ca.SX) -> ca.SX:
-    """Return the inverse error function of x as an expression."""
+    """Return the inverse error function of x as an expression: ±∞ at ±1, NaN beyond."""
     away_from_zero = _ratio(TAIL, ca.sqrt(-ca.log((1 - ca.fabs(x)) / 2)))
     y = ca.if_else(
         ca.fabs(x) < 0.7,
@@ -48,7 +48,9 @@ def _inverse_error(x: ca.SX) -> ca.SX:
 
 
 def _ratio(coefficients: tuple[tuple[float, ...], ...], z: ca.SX) -> ca.SX:
-    """Return the ratio of two polynomials at z, given by their coefficients."""
+    """Return the ratio of two polynomials at z, given by the coefficients (numerator, denominator),
+    the highest power first.
+    """
     numerator, denominator = (
         ca.polyval(ca.SX(part), z) for part in coefficients
     )
@@ -146,6 +148,7 @@ def _emit_intrinsic(name: str) -> Emit:
     """Return the emitter of a vector intrinsic of LLVM."""
 
     def emit(b: Builder, *operands: Value) -> Value:
+        """Emit the call of the intrinsic."""
         vector = operands[0].type
         full_name = f"llvm.{name}.v{vector.count}f64"
         return b.call(
@@ -160,6 +163,7 @@ def _emit_library_call(name: str) -> Emit:
     """Return the emitter of a function of the C library, called lane by lane."""
 
     def emit(b: Builder, *operands: Value) -> Value:
+        """Emit a call for each lane."""
         function = _declare(b.module, name, kind=DOUBLE, operands=len(operands))
         # Otherwise a call may set errno, and the compiler keeps even those that are repeated.
         function.attributes.add("readnone")
@@ -175,7 +179,9 @@ def _emit_library_call(name: str) -> Emit:
 def _declare(
     module: ir.Module, name: str, kind: ir.Type, operands: int
 ) -> ir.Function:
-    """Return a function of the module, declared if necessary."""
+    """Return the function `name` of the module, declared with results and `operands` arguments of
+    one kind if necessary.
+    """
     declared = module.globals.get(name)
     return declared or ir.Function(
         module, ir.FunctionType(kind, [kind] * operands), name
@@ -192,8 +198,9 @@ def _emit_comparison(sign: str) -> Emit:
 
 
 def _comparison(b: Builder, sign: str, x: Value, y: Value) -> Value:
-    # As in C: NaN differs from everything, itself included.
-    """Return a comparison as a vector of booleans."""
+    """Return a comparison of two vectors by a sign such as "<" as a vector of booleans; as in C, NaN
+    differs from everything, itself included.
+    """
     return (b.fcmp_unordered if sign == "!=" else b.fcmp_ordered)(sign, x, y)
 
 

@@ -44,7 +44,9 @@ FUNCTIONS_IN_MEMORY = 128
 def for_range(
     builder: Builder, start: Value, stop: Value, name: str
 ) -> Iterator[Value]:
-    """Emit a loop over start ≤ i < stop; the context gives i."""
+    """Emit a loop over start ≤ i < stop in steps of 1; the body of the context is that of the loop,
+    and the context gives i. `name` appears in the LLVM code only.
+    """
     before = builder.block
     head = builder.append_basic_block(f"{name}.head")
     body = builder.append_basic_block(f"{name}.body")
@@ -94,7 +96,9 @@ def _initialise() -> None:
 
 
 def _target_machine(quickly: bool) -> llvm.TargetMachine:
-    """Return a code generator for this CPU; the engine that uses it owns and frees it."""
+    """Return a code generator for this CPU, without optimisation if `quickly`; the engine that uses it
+    owns and frees it.
+    """
     _initialise()
     return llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(),
@@ -145,7 +149,14 @@ class NativeCode:
 
 @lru_cache(FUNCTIONS_IN_MEMORY)
 def compile_function(code: NativeCode) -> CompiledFunction:
-    """Return the compiled function; the latest 128 are kept and shared by all bodies."""
+    """Return the compiled function; the latest 128 are kept, by name, key and signature, and shared by
+    all bodies.
+
+    Raises
+    ------
+    RuntimeError
+        If LLVM cannot compile the code.
+    """
     return CompiledFunction(code)
 
 
@@ -183,7 +194,7 @@ def address(array: NDArray[Any]) -> int:
 
 
 def _object_code(code: NativeCode, machine: llvm.TargetMachine) -> bytes:
-    """Return the object code from the cache, or compile and store it."""
+    """Return the object code from the cache, or compile it for `machine` and store it."""
     host = f"{llvmlite_version} {llvm.llvm_version_info} {llvm.get_host_cpu_name()} "
     host += llvm.get_host_cpu_features().flatten()
     cache_key = (
@@ -211,7 +222,9 @@ def _source_digest() -> str:
 def _compile(
     module: ir.Module, machine: llvm.TargetMachine, quickly: bool
 ) -> bytes:
-    """Return the object code of an LLVM module."""
+    """Return the object code of an LLVM module for a machine, without optimisation if `quickly`; the
+    target triple of the module is set.
+    """
     module.triple = machine.triple
     parsed = llvm.parse_assembly(str(module))
     parsed.verify()
@@ -228,7 +241,7 @@ OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 def cache_folder() -> Path:
     """Return the folder of compiled kernels: ``COLLOCATION_SYSID_CACHE``, or the user's cache
-    folder.
+    folder. It need not exist.
     """
     override = os.environ.get("COLLOCATION_SYSID_CACHE")
     return Path(override) if override else user_cache_path("collocation_sysid")
@@ -251,7 +264,9 @@ def load_object(key: str) -> bytes | None:
 
 
 def store_object(key: str, code: bytes) -> None:
-    """Store code in the cache; do nothing if the folder cannot be written or trusted."""
+    """Store code in the cache under a key, in place of what is there; do nothing if the folder
+    cannot be written or trusted (the latter with a warning). The folder is created if missing.
+    """
     folder = cache_folder()
     with suppress(OSError):
         for missing in [p for p in (folder, *folder.parents) if not p.exists()][
@@ -296,9 +311,12 @@ def _digest(key: str, code: bytes) -> bytes:
 
 
 def _read_private_file(path: Path) -> bytes:
-    """Return the content of a plain file that belongs to the user alone.
+    """Return the content of a plain file that belongs to the user alone; links are not followed.
 
-    An OSError for any other.
+    Raises
+    ------
+    OSError
+        For any other file, or if there is none.
     """
     flags = (
         os.O_RDONLY
@@ -324,7 +342,7 @@ def _is_trusted(folder: Path) -> bool:
 
 @cache
 def _warn_once(fault: str) -> None:
-    """Warn once that compiled kernels are not stored."""
+    """Warn with a `RuntimeWarning` that compiled kernels are not stored, once for each reason."""
     warnings.warn(
         f"compiled kernels are not cached: {fault}; set COLLOCATION_SYSID_CACHE to a folder of "
         "your own (chmod 700)",

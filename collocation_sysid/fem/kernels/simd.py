@@ -45,9 +45,19 @@ OPTIMISED_FROM_POINTS = 200
 class SimdEvaluator:
     """Evaluator of a `KernelBatch` by native vector code, with time steps distributed over threads.
 
+    Arrays passed to a call must be contiguous float64 arrays of the right shapes; this is not
+    checked.
+
     Parameters
     ----------
     batch : KernelBatch
+
+    Raises
+    ------
+    VectorCodeError
+        For operations that vector code does not support.
+    RuntimeError
+        If LLVM cannot compile the kernel.
     """
 
     def __init__(self, batch: KernelBatch) -> None:
@@ -122,6 +132,7 @@ class SimdEvaluator:
         stride = fields[0].shape[1]
 
         def run(start: int, stop: int) -> None:
+            """Evaluate the time steps `start` … `stop` − 1."""
             self._run(
                 start,
                 stop,
@@ -144,7 +155,9 @@ def _emit_kernel(kernel: ElementKernel, points: int, lanes: int) -> ir.Module:
 def _block_major(
     array: NDArray[np.int64], by_block: tuple[int, int]
 ) -> NDArray[np.int32]:
-    """Return an array (blocks · lanes, k) as contiguous (blocks, k, lanes)."""
+    """Return an array (blocks · lanes, …) as contiguous 32-bit integers (blocks, k, lanes), where k
+    is the number of entries of a row, for `by_block` = (blocks, lanes).
+    """
     blocked = array.reshape(*by_block, -1)
     return np.ascontiguousarray(np.swapaxes(blocked, 1, 2), dtype=np.int32)
 
@@ -357,7 +370,9 @@ class _KernelEmitter:
         return self.module
 
     def _buffer(self, count: int, name: str) -> Value:
-        """Allocate aligned memory for `count` vectors."""
+        """Allocate memory for `count` vectors in the entry of the function, aligned to 64 bytes and
+        not initialised; `name` appears in the LLVM code only.
+        """
         buffer = self.builder.alloca(
             DOUBLE, size=I64(count * self.lanes), name=name
         )
@@ -365,9 +380,8 @@ class _KernelEmitter:
         return buffer
 
     def _clear(self, row: ir.Value, length: ir.Value) -> None:
-        """Set the outputs of one time step to zero.
-
-        They stay in the cache while they are summed.
+        """Set `length` doubles from the pointer `row` on to zero: the outputs of one time step,
+        which stay in the cache while they are summed.
         """
         b = self.builder
         bytes_ = ir.IntType(8).as_pointer()
@@ -379,17 +393,19 @@ class _KernelEmitter:
         )
 
     def _pointer(self, base: Value, entry: Value) -> Value:
-        """Return the pointer to a vector entry of a buffer."""
+        """Return the pointer to the vector with the index `entry` in a buffer that begins at
+        `base`.
+        """
         b = self.builder
         address = b.gep(base, [b.mul(entry, I64(self.lanes))])
         return b.bitcast(address, self.vector.as_pointer())
 
     def _load(self, base: Value, entry: Value) -> Value:
-        """Load a vector entry of a buffer."""
+        """Load the vector with the index `entry` from a buffer that begins at `base`."""
         return self.builder.load(self._pointer(base, entry), align=8)
 
     def _store(self, value: Value, base: Value, entry: Value) -> None:
-        """Store a vector entry of a buffer."""
+        """Store a vector at the index `entry` of a buffer that begins at `base`."""
         self.builder.store(value, self._pointer(base, entry), align=8)
 
     def _splat(self, scalar: Value) -> Value:
@@ -400,7 +416,17 @@ class _KernelEmitter:
         return value
 
     def _gather(self, rows: list, nodes: Value, gathered: list) -> None:
-        """Load the three coordinates of every node of W elements, field by field."""
+        """Emit the load of the three coordinates of every node of W elements.
+
+        Parameters
+        ----------
+        rows : list of pointers
+            Node fields at one time step.
+        nodes : pointer
+            Offsets 3i of the nodes i of the block (nodes, W), as 32-bit integers.
+        gathered : list of pointers
+            Buffer of 3·nodes vectors for each field; overwritten.
+        """
         b = self.builder
         with for_range(
             b, I64(0), stop=I64(self.size // 3), name="node"
@@ -423,7 +449,18 @@ class _KernelEmitter:
     def _scatter(
         self, value: Value, targets: Value, k: Value, row: Value
     ) -> None:
-        """Add the W lanes of one output entry at the destinations of their elements."""
+        """Emit the addition of the W lanes of one output entry at the destinations of their elements.
+
+        Parameters
+        ----------
+        value : vector
+        targets : pointer
+            Destinations of the outputs of the block (outputs, W), as 32-bit integers.
+        k : integer
+            Index of the output entry.
+        row : pointer
+            Result row of the time step; added to.
+        """
         b = self.builder
         first = b.mul(k, I64(self.lanes))
         for lane in range(self.lanes):
@@ -462,9 +499,20 @@ class _KernelEmitter:
     def _evaluate_pieces(
         self, phase: _PhaseLayout, inputs: list, pieces: Value
     ) -> None:
-        """Evaluate the pieces of one quadrature point and store them."""
+        """Emit the evaluation of the pieces of one quadrature point, and store them.
+
+        Parameters
+        ----------
+        phase : _PhaseLayout
+        inputs : list
+            For each input of the phase a buffer, or a list of vectors; for phases after the first
+            one the totals come last, of which the uncontracted sums are read.
+        pieces : pointer
+            Buffer of the pieces, one after the other; overwritten.
+        """
 
         def read(slot: int, entry: int) -> Value:
+            """Return an entry of the input with the index `slot`."""
             if isinstance(inputs[slot], list):
                 return inputs[slot][entry]
             place = self.sums[entry] if slot == len(inputs) - 1 else entry
@@ -483,8 +531,20 @@ class _KernelEmitter:
         half: Value,
         totals: Value,
     ) -> None:
-        """Add the pieces of one quadrature point to the totals, contracted as in
+        """Emit the addition of the pieces of one quadrature point to the totals, contracted as in
         `kernel._contracted`.
+
+        Parameters
+        ----------
+        phase : _PhaseLayout
+        pieces : pointer
+            Pieces of the point.
+        geometry : pointer
+            Shape gradients of the point.
+        half : pointer
+            Work space of 27 vectors.
+        totals : pointer
+            Totals of all phases; added to.
         """
         b = self.builder
         for k, how in enumerate(phase.contractions):
@@ -538,7 +598,20 @@ class _KernelEmitter:
     def _add_node_block(
         self, half: Value, gradient: list, a: Value, node: Value, outputs: Value
     ) -> None:
-        """Add the rows of node a to the columns of a node, below the diagonal."""
+        """Emit the addition of the rows of node `a` to the columns of `node` of a lower triangle;
+        if both are the same, only entries on and below the diagonal.
+
+        Parameters
+        ----------
+        half : pointer
+            Piece (9, 3) contracted with the gradient of `node`.
+        gradient : list of 3 vectors
+            Shape gradient of node `a`.
+        a, node : integers
+            Indices of the nodes, a ≥ node.
+        outputs : pointer
+            Lower triangle, column after column.
+        """
         b = self.builder
         for column, row, value in self._at_node(half, 3, gradient):
             if a is node and row < column:
@@ -559,7 +632,9 @@ class _KernelEmitter:
     def _couple(
         self, coupling: ca.Function, totals: Value, combined: Value
     ) -> None:
-        """Add the coupling of the node vectors to the outputs, see `kernel`."""
+        """Emit the addition of the coupling of the node vectors to the outputs in `totals`, see
+        `kernel`; `combined` is work space for the products with D.
+        """
         b = self.builder
         for k, columns in enumerate(self._coefficients(coupling, totals)):
             how = self.last.contractions[k]
@@ -594,8 +669,9 @@ class _KernelEmitter:
     def _coefficients(
         self, coupling: ca.Function, totals: Value
     ) -> list[dict[int, list]]:
-        """Return for each output, column by column, offsets of node vectors and their
-        coefficients.
+        """Emit the evaluation of the coupling, and return for each output, by the index of the
+        column, a list of pairs: offset of a node vector in `totals`, and its coefficient. Zero
+        coefficients are left out.
         """
         outputs = [coupling.sparsity_out(k) for k in range(coupling.n_out())]
         entries = [
@@ -604,6 +680,7 @@ class _KernelEmitter:
         columns: list[dict[int, list]] = [{} for _ in outputs]
 
         def read(_: int, entry: int) -> Value:
+            """Load an entry of the vector of all uncontracted sums."""
             return self._load(totals, I64(self.sums[entry]))
 
         for k, entry, value in emit_function(
@@ -620,7 +697,18 @@ class _KernelEmitter:
         out: Value,
         put: Callable[..., None],
     ) -> None:
-        """Write combinations of node vectors to the columns of a matrix."""
+        """Emit combinations of node vectors as columns of a matrix (3·nodes, any).
+
+        Parameters
+        ----------
+        columns : dict of int to list
+            For each column the offsets of node vectors in `totals`, and their coefficients.
+        totals : pointer
+        out : pointer
+            Matrix, column after column.
+        put : callable
+            `_store` to overwrite or `_accumulate` to add.
+        """
         for column, factors in columns.items():
             column_base = self._offset_pointer(out, column * self.size)
             with for_range(
@@ -657,7 +745,21 @@ class _KernelEmitter:
     def _at_node(
         self, stress: Value, columns: int, gradient: list
     ) -> Iterator[tuple]:
-        """Yield column, row and value of (9, k) times the shape gradient of one node."""
+        """Emit the product of a piece with the shape gradient of one node.
+
+        Parameters
+        ----------
+        stress : pointer
+            Piece (9, columns), conjugate to F, column after column.
+        columns : int
+        gradient : list of 3 vectors
+
+        Yields
+        ------
+        column, row : int
+            Index of the column of the piece, and of the axis.
+        value : vector
+        """
         for column in range(columns):
             for row in range(3):
                 terms = [
@@ -676,7 +778,7 @@ class _KernelEmitter:
                 )
 
     def _gradient(self, geometry: Value, node: Value) -> list:
-        """Return the shape gradient of a node."""
+        """Load the shape gradient of a node, a list of 3 vectors, from the geometry of a point."""
         first = self.builder.mul(node, I64(3))
         return [
             self._load(geometry, self.builder.add(first, I64(axis)))
@@ -684,11 +786,13 @@ class _KernelEmitter:
         ]
 
     def _offset_pointer(self, base: Value, entry: int) -> Value:
-        """Return the pointer to the vector entry with a given offset."""
+        """Return the pointer to the vector with the constant index `entry` of a buffer at
+        `base`.
+        """
         return self.builder.gep(base, [I64(entry * self.lanes)])
 
     def _accumulate(self, value: Value, base: Value, entry: Value) -> None:
-        """Add a value to a vector entry of a buffer."""
+        """Add a vector to that at the index `entry` of a buffer that begins at `base`."""
         self._store(
             self.builder.fadd(self._load(base, entry), value), base, entry
         )

@@ -55,7 +55,8 @@ class SkylineFactorisation:
     size : int
         Number n of rows.
     rows, columns : (e,) int
-        Row and column of the entries of one triangle, with the diagonal.
+        Row and column of the entries of one triangle, with the diagonal; each entry may be given in
+        either triangle.
     source : (e,) int
         Positions of the entries in given values.
 
@@ -63,6 +64,11 @@ class SkylineFactorisation:
     ----------
     shape : (n, width)
         Shape of a side.
+
+    Raises
+    ------
+    RuntimeError
+        If LLVM cannot compile the code.
     """
 
     def __init__(
@@ -118,16 +124,18 @@ class SkylineFactorisation:
     def factorise(
         self, room: FactorMemory, symmetric: Array, skew: Array
     ) -> tuple[Array, Array]:
-        """Compute L and U without their unit diagonals in the given memory.
+        """Compute L and U without their unit diagonals in the given memory; only L for a symmetric
+        matrix.
 
-        For a symmetric matrix only L.
+        Zero pivots are not detected: they give infinite or NaN results.
 
         Parameters
         ----------
         room : FactorMemory
-            Memory; overwritten.
+            Memory with one side for a symmetric matrix, else two; overwritten.
         symmetric, skew : array
-            Values of the symmetric and skew parts of the matrix; `skew` is empty if there is none.
+            Values of the symmetric and skew parts of the matrix, in which `source` are positions;
+            `skew` is empty if there is none.
 
         Returns
         -------
@@ -158,7 +166,9 @@ class SkylineFactorisation:
     def solve(
         self, first: Array, pivots: Array, second: Array, right: Array
     ) -> Array:
-        """Return the solutions of L D Uᵀ x = b for the rows b of `right`, (columns, n).
+        """Return the solutions of L D Uᵀ x = b for the rows b of `right`, (columns, n), in new memory.
+
+        Exchange `first` and `second` to solve with the transposed matrix.
 
         Parameters
         ----------
@@ -167,7 +177,7 @@ class SkylineFactorisation:
         pivots : (n,)
             Diagonal D.
         right : (columns, n)
-            Right-hand sides.
+            Right-hand sides; not modified.
         """
         size, width = self.shape
         rows = np.empty((len(right), size + width))
@@ -202,7 +212,9 @@ def _addresses(*arrays: NDArray[Any]) -> list[int]:
 
 
 def _compile(name: str, sides: int) -> CompiledFunction:
-    """Return one of the compiled functions "fill", "factorise" and "solve"."""
+    """Return one of the compiled functions "fill", "factorise" and "solve", for a symmetric matrix
+    (1 of `sides`) or any other (2).
+    """
     emit: Callable[[_SkylineEmitter], ir.Module] = getattr(
         _SkylineEmitter, name
     )
@@ -238,7 +250,9 @@ class _SkylineEmitter:
         self.module = ir.Module()
 
     def _begin(self, name: str) -> Sequence[Value]:
-        """Begin a function, and return its arguments."""
+        """Begin a function with the arguments that `ARGUMENTS` states, and return them; `b` becomes
+        its builder.
+        """
         integers, maps, arrays = ARGUMENTS[name]
         kinds = (
             [I64] * integers + [I64.as_pointer()] * maps + [DOUBLES] * arrays
@@ -296,7 +310,9 @@ class _SkylineEmitter:
         return self.module
 
     def _eliminate(self, pivots: Sequence[Value]) -> None:
-        """Eliminate consecutive pivots from all rows within their reach."""
+        """Emit the elimination of consecutive pivots from all rows within their reach, which are
+        read and written once for all of these pivots.
+        """
         b = self.b
         last = b.load(b.gep(self.reach, [pivots[-1]]))
         for p, pivot in enumerate(pivots):
@@ -310,8 +326,9 @@ class _SkylineEmitter:
             self._subtract(pivots, row, last=last)
 
     def _scale(self, pivot: Value, last: Value) -> None:
-        """Divide the entries below and right of a pivot by the pivot, and set the others to
-        zero.
+        """Emit the division of the entries beyond a pivot, up to the position `last`, by the pivot,
+        which is stored in D; the pivot itself and entries before it in its vector become zero. With
+        two sides, add |L_ik D_k U_ik| to the growth of each row i.
         """
         b = self.b
         diagonal = b.load(self._entry(self.sides[0], pivot, place=pivot))
@@ -340,8 +357,8 @@ class _SkylineEmitter:
     def _subtract(
         self, pivots: Sequence[Value], row: Value, last: Value
     ) -> None:
-        """Subtract the contribution of pivots from a row of either side, up to the position
-        `last`.
+        """Emit the subtraction of the contribution of pivots from a row of each side, up to the
+        position `last`.
         """
         b = self.b
         scales = []

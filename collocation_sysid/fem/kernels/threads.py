@@ -39,8 +39,15 @@ def available_threads() -> int:
 
 @cache
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
-    # Keyed by process: a forked child must not wait for its parent's threads.
-    """Return the pool of threads of this process; a forked child must not wait for its parent's."""
+    """Return the pool of threads of this process; a forked child must not wait for its parent's.
+
+    Parameters
+    ----------
+    process : int
+        Identifier of the process, the key of the cache.
+    threads : int
+        Number of threads.
+    """
     return ThreadPoolExecutor(threads)
 
 
@@ -50,13 +57,13 @@ def run_in_slices(
     """Call ``run(start, stop)`` on consecutive slices of ``range(count)``, one per thread, and wait
     for all.
 
-    On a thread of `map_experiments`, or with one thread, it is called once for the complete range.
-    An exception of ``run`` is passed on.
+    On a thread of `map_experiments`, or with one thread, it is called once for the complete range,
+    also if `count` is 0. An exception of ``run`` is passed on.
 
     Raises
     ------
     KeyboardInterrupt
-        On a thread of `map_experiments`, if another experiment was interrupted.
+        On a thread of `map_experiments`, if another experiment failed or was interrupted.
     """
     if (stop := getattr(_alone, "stop", None)) is not None and stop.is_set():
         raise KeyboardInterrupt
@@ -77,10 +84,11 @@ def map_experiments(
 ) -> list[R]:
     """Return ``run(item)`` of every item, in their order.
 
-    Each item runs on one thread, see `concurrent_count`.
+    Each item runs on one thread, see `concurrent_count`; context variables are those of the caller.
 
     Much of the work of an experiment is too short to release and acquire the interpreter lock: more
-    experiments than cores at a time fill the gaps.
+    experiments than cores at a time fill the gaps. An exception of ``run`` is passed on; items that
+    are running are then interrupted at their next `run_in_slices`.
     """
     count = concurrent_count(len(items), threads)
     if count == 1:
@@ -89,6 +97,7 @@ def map_experiments(
     stop = threading.Event()
 
     def passed(item: T) -> R:
+        """Run one item on this thread, which can be stopped by `stop`."""
         _alone.stop = stop
         return run_single_threaded(run, item)
 
@@ -110,14 +119,16 @@ def map_experiments(
 
 
 def run_single_threaded(run: Callable[..., R], *arguments: Any) -> R:
-    """Return ``run(*arguments)``, and start no further threads from this thread from now on."""
+    """Return ``run(*arguments)``, and start no further threads from this thread from now on, also
+    after the call.
+    """
     _alone.in_experiment = True
     return run(*arguments)
 
 
 def concurrent_count(items: int, threads: int) -> int:
     """Return how many of this many items `map_experiments` runs at the same time: one with one
-    thread or within an experiment, else at most two per thread.
+    thread or within an experiment, else at most two for each of the `threads`, and at least one.
     """
     if threads == 1 or getattr(_alone, "in_experiment", False):
         return 1

@@ -35,7 +35,7 @@ class Constant:
     name : str
         Name with unit.
     symbol : str
-        Symbol for tables and plots; the name without its unit by default.
+        Symbol for tables and plots; "" if there is none.
     meaning : str
         Short description.
     bounds : (lower, upper)
@@ -48,9 +48,9 @@ class Constant:
         Value in a soft foam or rubber, used without a guess; None if there is none. Moduli follow
         the stiffness instead, see `usual_value`.
     below : float
-        Upper limit, exclusive.
+        Upper limit of admissible values, exclusive.
     at_least : float
-        Smallest admissible value of a linear constant.
+        Smallest admissible value of a linear constant; not used for a logarithmic one.
     """
 
     name: str
@@ -65,7 +65,9 @@ class Constant:
 
     @property
     def lower_limit(self) -> float:
-        """Smallest admissible value of the constant."""
+        """Lower limit of admissible values: 0, exclusive, for a logarithmic constant, else
+        `at_least`.
+        """
         return 0.0 if self.scale == "log" else self.at_least
 
 
@@ -277,20 +279,20 @@ KNOWN: Mapping[str, Constant] = {
 
 
 def without_region(name: str) -> str:
-    """Return the name of a constant without its region."""
+    """Return the name of a constant without its region or branch: what follows the last dot."""
     return name.rpartition(".")[2]
 
 
 def unit_of(name: str) -> str:
-    """Return the unit with which a name ends, or "" if it has none."""
+    """Return the unit with which a name ends, as printed ("kg/m³"), or "" if it has none."""
     return next(
         (unit for ending, unit in _UNITS.items() if name.endswith(ending)), ""
     )
 
 
 def symbol_of(name: str) -> str:
-    """Return the symbol of a constant, followed by a blank and its region if it has one; for an
-    unknown constant the name without its unit.
+    """Return the symbol of a constant, followed by a blank and the prefix (region or branch) of its
+    name if it has one: "μ core"; for an unknown constant the name without its unit.
     """
     region, _, name_in_region = name.rpartition(".")
     symbol = (
@@ -302,12 +304,16 @@ def symbol_of(name: str) -> str:
 
 
 def symbol_with_unit(name: str) -> str:
-    """Return symbol and unit of a constant, as in the heading of a table row."""
+    """Return symbol and unit of a constant, as in the heading of a table row: "μ core Pa"."""
     return f"{symbol_of(name)} {unit_of(name)}".strip()
 
 
 def constant_named(name: str) -> Constant:
-    """Return the known constant of this name, or one with default properties if it is unknown."""
+    """Return the known constant of this name, or one with default properties if it is unknown.
+
+    The region of the name is ignored, and the result has the name without it. Names that end with
+    ``_friction`` are coefficients of friction, ``field_1``, ``field_2``, … coefficients of fields.
+    """
     bare_name = without_region(name)
     if bare_name not in KNOWN and bare_name.endswith(f"_{FRICTION.name}"):
         return replace(
@@ -326,13 +332,15 @@ def field_coefficient(number: int) -> Constant:
 
 
 def is_field_coefficient(name: str) -> bool:
-    """Return whether a constant is the coefficient of a shape of a field."""
+    """Return whether a constant is the coefficient of a shape of a field: ``field_`` and a number,
+    with or without a region.
+    """
     word, _, number = without_region(name).rpartition("_")
     return word == MODE.name and number.isdigit()
 
 
 def is_modulus(name: str) -> bool:
-    """Return whether a constant scales with the stiffness of its material."""
+    """Return whether a constant scales with the stiffness of its material: its unit is Pa."""
     return unit_of(name) == "Pa"
 
 
@@ -351,11 +359,13 @@ def usual_value(
 ) -> float | None:
     """Return a plausible value of a constant in a material of given stiffness; None if unknown.
 
-    A modulus that is not known by name gets the size of the shear modulus.
+    A modulus that is not known by name gets the shear modulus. Other constants have their `usual`
+    value, whatever the stiffness.
 
     Parameters
     ----------
     name : str
+        Name with or without a region.
     young_pa, poisson : float
         Young's modulus and Poisson's ratio of the material.
     """
@@ -379,7 +389,7 @@ def usual_value(
 
 
 def without_unit(name: str) -> str:
-    """Return a name without the unit with which it ends."""
+    """Return a name without the unit with which it ends; the name itself if it ends with none."""
     return next(
         (name.removesuffix(e) for e in _UNITS if name.endswith(e)), name
     )

@@ -6,7 +6,9 @@ import casadi as ca
 
 
 def isochoric_invariants(F: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return Ī₁ = J^(−2/3) I₁ and Ī₂ = J^(−4/3) I₂ of a deformation gradient (3, 3)."""
+    """Return Ī₁ = J^(−2/3) I₁ and Ī₂ = J^(−4/3) I₂ of a deformation gradient (3, 3), J > 0; NaN
+    otherwise.
+    """
     C = F.T @ F
     first = ca.trace(C)
     second = 0.5 * (first**2 - ca.sumsqr(C))

@@ -27,7 +27,9 @@ EXAMINED = tuple(
 
 
 def is_examined(material: Material) -> bool:
-    """Return whether the criterion applies to a material: isotropic, and for large strains."""
+    """Return whether the criterion applies to a material: the built-in ones except linear elasticity.
+    Energies of users could be anisotropic.
+    """
     return material in EXAMINED
 
 
@@ -66,13 +68,22 @@ def principal_stretches(body: Body, positions: Array, theta: Array) -> Array:
     """Return the principal stretches at which the material is evaluated (T, E, q, 3), ascending.
 
     They are relative to the stress-free shape, with the averaged dilatation of elements that
-    average it.
+    average it. Stretches are square roots of the eigenvalues of FᵀF, so that they do not show an
+    inversion, except with averaged dilatation: there they are negative if det F has another sign
+    than its mean.
 
     Parameters
     ----------
     body : Body
     positions : (T, 3n)
+        Node positions [m].
     theta : (k,)
+        Constants of the body.
+
+    Raises
+    ------
+    RestShapeError
+        If there is no stress-free shape at θ.
     """
     geometry = body.stress_free_geometry(theta)
     cells, points = geometry.shape[:2]

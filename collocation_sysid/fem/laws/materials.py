@@ -80,7 +80,8 @@ class Material:
         Raises
         ------
         InputError
-            If the function has no constants, or the undeformed material has energy or stress.
+            If the function has no constants, cannot be evaluated, or the undeformed material has
+            energy or stress; if a definition is of no argument.
         """
         name = name or getattr(energy, "__name__", "energy").replace("_", "-")
         definitions = {constant.name: constant for constant in constants}
@@ -97,19 +98,22 @@ class Material:
         material = cls(
             name,
             energy,
-            tuple(definitions.get(a) or constant_named(a) for a in arguments),
+            constants=tuple(
+                definitions.get(a) or constant_named(a) for a in arguments
+            ),
         )
         material._check_at_rest()
         return material
 
     def psi(self, F: ca.SX, values: ca.SX) -> ca.SX:
-        """Return the energy density as an expression, from the constants as a vector in their
-        order.
+        """Return the energy density (1, 1) [J/m³] as an expression, from F (3, 3) and the constants
+        (c,) in their order.
         """
         return ca.SX(self.energy(F, **self._named(values)))
 
     def chain_rule(self, F: ca.SX, values: ca.SX) -> ChainRule:
-        """Return the chain rule for derivatives of `psi_in`.
+        """Return the chain rule for derivatives of `psi_in`; without functions for all materials
+        but those in powers of the stretches.
 
         Parameters
         ----------
@@ -123,8 +127,8 @@ class Material:
         return ChainRule((self.energy.symbolic(F, values),))
 
     def psi_in(self, rule: ChainRule, F: ca.SX, values: ca.SX) -> ca.SX:
-        """Return the energy density as the symbol of a rule from `chain_rule`, if it has one, else
-        as an expression in F (3, 3) and the constants (c,).
+        """Return the energy density as the symbol of a rule from `chain_rule` for the same F (3, 3)
+        and constants (c,), if it has one, else as an expression in them.
         """
         return (
             rule.functions[0].symbol()
@@ -149,7 +153,9 @@ class Material:
         )
 
     def _check_at_rest(self) -> None:
-        """Raise an `InputError` unless energy and stress vanish at F = I."""
+        """Raise an `InputError` if the energy cannot be evaluated, or unless energy and stress
+        vanish at F = I, for constants within their bounds, up to rounding.
+        """
         F = ca.SX.sym("F", 9)
         values = ca.SX.sym("values", len(self.constants))
         try:
@@ -215,8 +221,8 @@ def lame_constants(
 
 
 def neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
-    """Neo-Hookean energy ψ = ½ λ (ln J)² − μ ln J + ½ μ (tr C − 3) (Bonet & Wood 2008, eq.
-    6.27).
+    """Return the neo-Hookean energy ψ = ½ λ (ln J)² − μ ln J + ½ μ (tr C − 3) at F (3, 3) (Bonet &
+    Wood 2008, eq. 6.27); NaN for J < 0.
     """
     log_j = ca.log(ca.det(F))
     return (
@@ -227,7 +233,8 @@ def neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
 
 
 def stable_neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
-    """Stable neo-Hookean energy ψ = ½ μ (tr C − 3) − μ (J − 1) + ½ (λ + μ)(J − 1)².
+    """Return the stable neo-Hookean energy ψ = ½ μ (tr C − 3) − μ (J − 1) + ½ (λ + μ)(J − 1)² at F (3,
+    3).
 
     It is finite for inverted elements, too (Smith, de Goes & Kim 2018, eq. 13, with λ + μ in place
     of λ, so that the small-strain limit is linear elasticity with (λ, μ)).
@@ -241,16 +248,17 @@ def stable_neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
 
 
 def st_venant_kirchhoff(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
-    """St. Venant–Kirchhoff energy ψ = ½ λ (tr E)² + μ E:E with the Green strain E = ½ (C − I).
+    """Return the St. Venant–Kirchhoff energy ψ = ½ λ (tr E)² + μ E:E at F (3, 3), with the Green
+    strain E = ½ (C − I).
 
-    It softens in compression.
+    It softens in compression, and is finite for inverted elements.
     """
     strain = 0.5 * (F.T @ F - ca.SX.eye(3))
     return 0.5 * lambda_pa * ca.trace(strain) ** 2 + mu_pa * ca.sumsqr(strain)
 
 
 def linear_elastic(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
-    """Linear elastic energy ψ = ½ λ (tr ε)² + μ ε:ε with ε = sym F − I.
+    """Return the linear elastic energy ψ = ½ λ (tr ε)² + μ ε:ε at F (3, 3), with ε = sym F − I.
 
     For small rotations only, because it resists rotation.
     """
@@ -261,7 +269,8 @@ def linear_elastic(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
 def mooney_rivlin(
     F: ca.SX, c10_pa: ca.SX, c01_pa: ca.SX, kappa_pa: ca.SX
 ) -> ca.SX:
-    """Mooney–Rivlin energy ψ = C₁₀ (Ī₁ − 3) + C₀₁ (Ī₂ − 3) + U, with μ = 2 (C₁₀ + C₀₁).
+    """Return the Mooney–Rivlin energy ψ = C₁₀ (Ī₁ − 3) + C₀₁ (Ī₂ − 3) + U at F (3, 3), with U = ½ κ
+    (J − 1)²; the shear modulus is μ = 2 (C₁₀ + C₀₁).
 
     See Bonet & Wood 2008, sec. 6.5.
     """
@@ -274,7 +283,9 @@ def mooney_rivlin(
 def yeoh(
     F: ca.SX, c10_pa: ca.SX, c20_pa: ca.SX, c30_pa: ca.SX, kappa_pa: ca.SX
 ) -> ca.SX:
-    """Yeoh's energy ψ = Σ_i C_i0 (Ī₁ − 3)^i + U, i = 1 … 3, with μ = 2 C₁₀ (Yeoh 1993)."""
+    """Return Yeoh's energy ψ = Σ_i C_i0 (Ī₁ − 3)^i + U, i = 1 … 3, at F (3, 3), with U = ½ κ (J −
+    1)²; the shear modulus is μ = 2 C₁₀ (Yeoh 1993).
+    """
     excess = isochoric_invariants(F)[0] - 3
     return excess * (
         c10_pa + excess * (c20_pa + excess * c30_pa)
@@ -282,9 +293,10 @@ def yeoh(
 
 
 def gent(F: ca.SX, mu_pa: ca.SX, gent_limit: ca.SX, kappa_pa: ca.SX) -> ca.SX:
-    """Gent's energy ψ = −½ μ J_m ln(1 − (Ī₁ − 3)/J_m) + U.
+    """Return Gent's energy ψ = −½ μ J_m ln(1 − (Ī₁ − 3)/J_m) + U at F (3, 3), with J_m =
+    `gent_limit` and U = ½ κ (J − 1)².
 
-    Ī₁ < 3 + J_m for every stretch (Gent 1996).
+    Ī₁ < 3 + J_m for every stretch (Gent 1996); energy and derivatives are NaN beyond.
     """
     remaining = 1 - (isochoric_invariants(F)[0] - 3) / gent_limit
     # The square root makes the derivatives NaN beyond the limit, too; otherwise a solver that
@@ -297,7 +309,8 @@ def gent(F: ca.SX, mu_pa: ca.SX, gent_limit: ca.SX, kappa_pa: ca.SX) -> ca.SX:
 def arruda_boyce(
     F: ca.SX, mu_pa: ca.SX, chain_stretch: ca.SX, kappa_pa: ca.SX
 ) -> ca.SX:
-    """Arruda–Boyce energy ψ = C Σ_i α_i λ_m^(2−2i) (Ī₁^i − 3^i) + U.
+    """Return the Arruda–Boyce energy ψ = C Σ_i α_i λ_m^(2−2i) (Ī₁^i − 3^i) + U at F (3, 3), with λ_m =
+    `chain_stretch` and U = ½ κ (J − 1)².
 
     Five terms of the inverse Langevin function; C is such that μ is the shear modulus at small
     strain (Arruda & Boyce 1993, eq. 22).
@@ -354,7 +367,7 @@ MATERIALS |= {
 
 def as_material(material: str | Energy | Material) -> Material:
     """Return a material from its name in `MATERIALS`, from an energy function, or the given
-    material.
+    material itself.
 
     Raises
     ------
@@ -424,13 +437,21 @@ class DampingLaw:
 def kelvin_voigt(
     psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Kelvin–Voigt damping P_v = F S_v with S_v = 2η C⁻¹ Ė C⁻¹ + ζ (C⁻¹:Ė) C⁻¹.
+    """Return the stress P_v (9,) of Kelvin–Voigt damping and ∂P_v/∂F (9, 9).
 
-    Return P_v and ∂P_v/∂F.
+    P_v = F S_v with S_v = 2η C⁻¹ Ė C⁻¹ + ζ (C⁻¹:Ė) C⁻¹ and the viscosities η = γ_r μ and ζ = γ_r λ.
+    This is the Kirchhoff stress 2η d + ζ (tr d) 1 of the rate of deformation d, the symmetric part
+    of L = Ḟ F⁻¹; its dissipation 2η d:d + ζ (tr d)² is positive for any F.
 
-    The viscosities are η = γ_r μ and ζ = γ_r λ. This is the Kirchhoff stress 2η d + ζ (tr d) 1 of
-    the rate of deformation d, the symmetric part of L = Ḟ F⁻¹; its dissipation 2η d:d + ζ (tr d)²
-    is positive for any F.
+    Parameters
+    ----------
+    psi : SX
+        Energy density as an expression in `F`; its small-strain λ and μ are used, and for a linear
+        material, whose stiffness does not depend on F, P_v is γ_r times the rate of its stress.
+    F, rate : (9,) SX
+        Symbols of the deformation gradient and its rate Ḟ, stacked column after column.
+    gamma_r_s : SX
+        γ_r [s].
     """
     stiffness, _ = ca.hessian(psi, F)
     # A linear material does not distinguish the deformed from the undeformed shape.
@@ -453,13 +474,12 @@ def kelvin_voigt(
 def material_form(
     psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Damping in material form, P_v = F S_v with S_v = γ_r (λ tr(Ė) I + 2μ Ė).
+    """Return the stress P_v (9,) of damping in material form and ∂P_v/∂F (9, 9).
 
-    Return P_v and ∂P_v/∂F.
-
-    Ė is the rate of the Green strain. S_v : Ė = γ_r (λ (tr Ė)² + 2μ Ė:Ė) is positive for any F;
-    half of it is the potential D of the stress, P_v = ∂D/∂Ḟ. For a St. Venant–Kirchhoff material
-    S_v is γ_r times the rate of the elastic second Piola–Kirchhoff stress.
+    P_v = F S_v with S_v = γ_r (λ tr(Ė) I + 2μ Ė) and the rate Ė of the Green strain. S_v : Ė = γ_r
+    (λ (tr Ė)² + 2μ Ė:Ė) is positive for any F; half of it is the potential D of the stress, P_v =
+    ∂D/∂Ḟ. For a St. Venant–Kirchhoff material S_v is γ_r times the rate of the elastic second
+    Piola–Kirchhoff stress. See `kelvin_voigt` for the arguments and for linear materials.
     """
     stiffness, _ = ca.hessian(psi, F)
     if not ca.depends_on(
@@ -478,7 +498,17 @@ def material_form(
 
 
 def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
-    """Rayleigh damping as the potential γ_r ∂ψ/∂F:Ḟ, which gives the damping force −γ_r K(x) v."""
+    """Return Rayleigh damping as the potential γ_r ∂ψ/∂F:Ḟ, which gives the damping force −γ_r K(x) v.
+
+    Parameters
+    ----------
+    psi : SX
+        Energy density as an expression in `F`.
+    F, rate : SX
+        Symbols on which `psi` depends, and their rates.
+    gamma_r_s : SX
+        γ_r [s].
+    """
     return gamma_r_s * ca.jtimes(psi, F, rate)
 
 

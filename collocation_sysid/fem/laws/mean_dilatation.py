@@ -83,7 +83,7 @@ def averaging_kernel(
     coupled = slopes
     if order > 1:
         previous_phases.append(
-            point.make_phase("slopes", shape.with_stretches(slopes), sums)
+            point.make_phase("slopes", shape.with_stretches(slopes), sums=sums)
         )
         sums = ca.vertcat(sums, *(chain.slopes for chain in chains.values()))
         coupled = {
@@ -92,7 +92,7 @@ def averaging_kernel(
             for key, p in chain.second_derivative_pieces().items()
         }
     last = point.make_phase(
-        name, shape.with_stretches(output_pieces | coupled), sums
+        name, shape.with_stretches(output_pieces | coupled), sums=sums
     )
     return ElementKernel(
         last.pieces,
@@ -136,8 +136,8 @@ class _VolumeSums:
         return cls(
             point,
             ca.SX.sym("volume"),
-            ca.SX.sym("volumes", len(point.stretches)),
-            volumes,
+            volumes=ca.SX.sym("volumes", len(point.stretches)),
+            own_volumes=volumes,
         )
 
     @property

@@ -39,11 +39,11 @@ class MemoryInput:
     Attributes
     ----------
     overstress : (T, width)
-        Sum H of the internal variables [Pa].
+        Sum H of the internal variables [Pa], in the order of `MemoryLayout`.
     stiffening : (T, parts)
-        Stiffening s of each part.
+        Stiffening s of each part; zero for parts without memory.
     stiffening_derivatives : (T, k)
-        Derivative of the part's s by each entry of θ.
+        Derivative by each entry of θ of the s of the part to which the entry belongs.
     stiffening_second_derivatives : (T, k, k)
         Second derivatives of s; those by constants of different parts are zero.
     stress_weights : (T, width), optional
@@ -135,12 +135,13 @@ class MemoryLayout:
         return self.starts[-1]
 
     def part_columns(self, number: int) -> NDArray[np.int64]:
-        """Return the columns (E, q, 6) of the points of a part.
+        """Return the columns (E, q, 6) in the row of the points of a part: the six entries of a
+        point are not neighbours, but E·q columns apart.
 
         Parameters
         ----------
         number : int
-            Index of the part.
+            Index of the part, which has memory.
         """
         cells = len(self.parts[number].cells)
         indices = np.arange(cells * self.points_per_element).reshape(
@@ -175,8 +176,8 @@ class MemoryLayout:
         return branches
 
     def to_branches(self, values: Array) -> Array:
-        """Return values (…, all branches) from values (…, width) for each point: those of a part
-        are repeated for each of its branches.
+        """Return values (…, all branches) from values (…, width) for each point: those of a part are
+        repeated for each of its branches. A view with a single branch; there must be at least one.
         """
         parts = [values[..., branch.points] for branch in self.branches]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
@@ -199,7 +200,7 @@ class MemoryLayout:
     def repeat_over_points(self, values: Array) -> Array:
         """Return values (…, all branches) from one value for each branch (branches, …).
 
-        With a single branch the result has one column and is broadcast.
+        With a single branch the result has one column, (…, 1), which broadcasts.
         """
         if len(self.branches) == 1:
             return values[0][..., None]
@@ -210,7 +211,9 @@ class MemoryLayout:
         return np.moveaxis(np.repeat(values, sizes, axis=0), 0, -1)
 
     def sum_over_points(self, values: Array) -> Array:
-        """Return the sums (branches, …) over all values (…, all branches) of each branch."""
+        """Return the sums (branches, …) over all entries of values (…, all branches) of each
+        branch.
+        """
         return np.stack(
             [
                 values[..., branch.columns].sum(axis=-1)
@@ -219,7 +222,9 @@ class MemoryLayout:
         )
 
     def relaxed(self, states: int) -> MemoryInput:
-        """Return the contribution of a memory that has relaxed, at a number of states: all zero."""
+        """Return the contribution of a memory that has relaxed, at a number of states: all zero,
+        without stress weights.
+        """
         count = self.constant_count
         sizes = (self.width,), (len(self.parts),), (count,), (count, count)
         return MemoryInput(*(np.zeros((states, *size)) for size in sizes))

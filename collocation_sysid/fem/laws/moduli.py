@@ -42,10 +42,14 @@ class ConstantSource:
     def evaluate(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return every constant by its name without region.
 
+        If elastic parameters replace constants, the result also contains λ, μ and κ, whether the
+        material has them or not. A density given by `MASS` is the value of the mass; the caller
+        converts it.
+
         Parameters
         ----------
         values : mapping
-            Numbers or expressions by the names of the parameters.
+            Numbers or expressions by the names of the parameters; further ones are ignored.
         """
         by_constant = {
             own_values: values[name] for own_values, name in self.names.items()
@@ -99,13 +103,14 @@ def find_source(
     others : iterable of Constant
         Constants of the region beside those of its material.
     known : sequence of str
-        Names of the given parameters.
+        Names of the given parameters; those that the region does not use are ignored.
 
     Raises
     ------
     InputError
-        If a constant is missing or given twice, or if the elastic parameters do not determine
-        exactly one of the choices of the material.
+        If a constant is missing, if the density is given by itself and by the mass, or if the
+        elastic parameters do not determine exactly one of the choices of the material. Elastic
+        parameters with the prefix of the region must all be used; those without it need not.
     """
 
     def name_of(own: str) -> str | None:
@@ -161,7 +166,9 @@ def find_source(
 
 
 def _elastic_choices(owns: Sequence[str]) -> tuple[tuple[str, ...], ...]:
-    """Return the sets of elastic names by which a material with these constants can be given."""
+    """Return the sets of elastic names by which a material with these constants can be given: four
+    pairs if it has a constant μ, one of κ, λ, ν if it has κ or λ alone; empty without κ and λ.
+    """
     volumetric = {"lambda_pa", "kappa_pa"} & set(owns)
     if not volumetric:
         return ()
@@ -169,7 +176,9 @@ def _elastic_choices(owns: Sequence[str]) -> tuple[tuple[str, ...], ...]:
 
 
 def elastic_names(material: Material) -> tuple[str, ...]:
-    """Return the names of elastic parameters that can replace a material's constants."""
+    """Return the names of elastic parameters that can state or replace a material's constants, without
+    repetitions; empty for a material without λ and κ.
+    """
     owns = [c.name for c in material.constants]
     return tuple(
         dict.fromkeys(
@@ -195,7 +204,9 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def engineering_constants(lambda_pa: Any, mu_pa: Any) -> tuple[Any, Any]:
-    """Return Young's modulus and Poisson's ratio (E, ν) from (λ, μ), as numbers or expressions."""
+    """Return Young's modulus E [Pa] and Poisson's ratio ν from (λ, μ) [Pa], as numbers or
+    expressions.
+    """
     return (
         mu_pa * (3 * lambda_pa + 2 * mu_pa) / (lambda_pa + mu_pa),
         lambda_pa / (2 * (lambda_pa + mu_pa)),

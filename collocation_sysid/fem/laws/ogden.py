@@ -137,12 +137,16 @@ def hyperfoam(terms: int) -> PowerLawEnergy:
 
 
 def is_power_law(material: str) -> bool:
-    """Return whether the material of this name is Ogden's or a compressible foam."""
+    """Return whether a material of this name is Ogden's or a compressible foam: "ogden-…" or
+    "hyperfoam-…".
+    """
     return material.startswith(("ogden-", "hyperfoam-"))
 
 
 def term_numbers(names: Iterable[str]) -> range:
-    """Return the numbers of the terms of a law, from 1, from the names of its constants."""
+    """Return the numbers 1, 2, … of the terms of a law with these constants, one for each
+    ``alpha_``.
+    """
     return range(1, 1 + sum(name.startswith("alpha_") for name in names))
 
 

@@ -45,13 +45,15 @@ def _stress_by_theta(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _stress_derivative(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return ∂S/∂x v, from dS = F⁻¹ (dP − dF S)."""
+    """Return the entries (6,) of dS along velocities v, the second field of a point: dS = F⁻¹ (dP − dF
+    S).
+    """
     F = point.gradients["x"]
     piola = first_piola(point, law)
     rate = point.gradients["v"]
     inverse = ca.inv_minor(point.material_gradient)
     stress = inverse @ ca.reshape(piola, 3, 3)
-    piola_rate = point.directional_derivative(piola, F, rate)
+    piola_rate = point.directional_derivative(piola, F, direction=rate)
     change = ca.reshape(piola_rate, 3, 3) - ca.reshape(rate, 3, 3) @ stress
     return six_entries(inverse @ change)
 
@@ -65,12 +67,14 @@ def _stress_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _memory_force(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return f_H, with H as data of the points."""
+    """Return f_H of a point (9,), conjugate to F: −∂/∂F ½ V H : FᵀF, with H as data of the
+    point.
+    """
     return -ca.gradient(memory_energy(point), point.gradients["x"])
 
 
 def _memory_force_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return (∂f_H/∂H)ᵀ v, with velocities v."""
+    """Return (∂f_H/∂H)ᵀ v (6,) of a point, for velocities v as its second field."""
     power = ca.jtimes(
         -memory_energy(point), point.gradients["x"], point.gradients["v"]
     )
@@ -78,12 +82,12 @@ def _memory_force_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _stress_jacobian(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return (∂S/∂x)ᵀ, column after column."""
+    """Return (∂S/∂F)ᵀ (9, 6) of a point, to be contracted to nodes."""
     return point.jacobian(second_piola(point, law), point.gradients["x"]).T
 
 
 def _memory_force_jacobian(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return ∂f_H/∂H, column after column."""
+    """Return ∂f_H/∂H (9, 6) of a point, to be contracted to nodes."""
     return ca.jacobian(_memory_force(point, law), point.internal_variables)
 
 
@@ -119,7 +123,8 @@ def stress_kernel(name: str, element: Element, law: PointLaw) -> ElementKernel:
 
 @dataclass(frozen=True, eq=False)
 class JacobianEntries:
-    """Row and column of each entry of `stress_jacobian` and `memory_force_jacobian`.
+    """Point value and dof of each entry of `stress_jacobian` and `memory_force_jacobian`; entries of
+    the same place add up.
 
     Attributes
     ----------
@@ -136,11 +141,18 @@ class JacobianEntries:
 class StressEvaluator:
     """Stresses of a body with memory, and their derivatives and transposed derivatives.
 
-    Kernels are compiled when they are first needed.
+    Stresses are those of the long-term energy, without overstress and damping. Entries of parts
+    without memory do not occur. Kernels are compiled when they are first needed.
 
     Parameters
     ----------
     body : Discretisation
+        Body of which at least one part has a memory.
+
+    Attributes
+    ----------
+    width : int
+        Length of a row of values at points, see `MemoryLayout`.
     """
 
     def __init__(self, body: Discretisation) -> None:
@@ -203,21 +215,26 @@ class StressEvaluator:
     def stress_jvp(
         self, x: Array, direction: Array, theta: Array, out: Array | None = None
     ) -> Array:
-        """Return ∂S/∂x along a direction (T, 3n) as (T, width), added to `out` in place if it is
-        given.
+        """Return ∂S/∂x along a direction (T, 3n) as (T, width), at positions x (T, 3n) and θ (k,).
+
+        With `out` (T, width) the result is added to it in place, and `out` is returned.
         """
         return self._evaluate_at_points(
             "stress_along", [x, direction], theta=theta, out=out
         )
 
     def stress_vjp(self, x: Array, weights: Array, theta: Array) -> Array:
-        """Return (∂S/∂x)ᵀ weights (T, 3n), for weights (T, width)."""
+        """Return (∂S/∂x)ᵀ weights (T, 3n), for weights (T, width) of the entries of S, at positions x
+        (T, 3n) and θ (k,).
+        """
         return self._evaluate_at_nodes(
             "pulled", [x], theta=theta, point_data=weights
         )
 
     def memory_force(self, x: Array, overstress: Array, theta: Array) -> Array:
-        """Return f_H (T, 3n) [N], which is linear in H (`overstress`, (T, width))."""
+        """Return f_H (T, 3n) [N] at positions x (T, 3n): linear in H (`overstress`, (T, width)
+        [Pa]).
+        """
         return self._evaluate_at_nodes(
             "carried_force", [x], theta=theta, point_data=overstress
         )
@@ -225,7 +242,9 @@ class StressEvaluator:
     def memory_force_vjp(
         self, x: Array, direction: Array, theta: Array
     ) -> Array:
-        """Return (∂f_H/∂H)ᵀ direction (T, width), for a direction (T, 3n)."""
+        """Return (∂f_H/∂H)ᵀ direction (T, width), for a direction (T, 3n) in the space of forces, at
+        positions x (T, 3n).
+        """
         return self._evaluate_at_points("against", [x, direction], theta=theta)
 
     @cached_property
@@ -247,12 +266,16 @@ class StressEvaluator:
         return JacobianEntries(np.concatenate(points), np.concatenate(dofs))
 
     def stress_jacobian(self, x: Array, theta: Array) -> Array:
-        """Return the entries (T, K) of ∂S/∂x."""
-        return self._slopes("stress_slope", x, theta)
+        """Return the entries (T, K) of ∂S/∂x at positions x (T, 3n) and θ (k,), at
+        `jacobian_entries`.
+        """
+        return self._slopes("stress_slope", x, theta=theta)
 
     def memory_force_jacobian(self, x: Array, theta: Array) -> Array:
-        """Return the entries (T, K) of ∂f_H/∂H, which is linear in x."""
-        return self._slopes("force_slope", x, theta)
+        """Return the entries (T, K) of ∂f_H/∂H at positions x (T, 3n) and θ (k,), in which it is
+        linear in x, at `jacobian_entries`.
+        """
+        return self._slopes("force_slope", x, theta=theta)
 
     def _slopes(self, name: str, x: Array, theta: Array) -> Array:
         """Return the entries (T, K) of a derivative, given by the name of its kernel, at
@@ -352,7 +375,8 @@ class StressEvaluator:
         add: bool,
         point_data: Array | None = None,
     ) -> None:
-        """Evaluate a kernel for one part.
+        """Evaluate a kernel for one part; its evaluator is built at the first use. Up to
+        `SINGLE_THREAD_STATES` states run on one thread.
 
         Parameters
         ----------
@@ -363,11 +387,12 @@ class StressEvaluator:
         fields : list of (T, 3n)
             Node fields.
         theta : (k,)
+            Constants of the complete body.
         out : array
             Result; overwritten, or added to if `add`.
         add : bool
         point_data : (T, width), optional
-            Data of the points: H or weights.
+            Data of the points: H or weights; None for kernels that read none.
         """
         body = self.body
         key = (name, number)
@@ -381,7 +406,9 @@ class StressEvaluator:
             theta[first : first + body.parts[number].law_constant_count],
             dtype=float,
         )
-        part_point_data = body.point_data(number, theta, point_data)
+        part_point_data = body.point_data(
+            number, theta, internal_variables=point_data
+        )
         threads = body.threads if len(out) > SINGLE_THREAD_STATES else 1
         self._evaluators[key](
             [np.ascontiguousarray(field) for field in fields],

@@ -40,7 +40,7 @@ from .surface import tetrahedralize_surface
 
 
 class NodeSelection(Protocol):
-    """Selection of nodes, see `selection_from_section`."""
+    """Selection of nodes, such as those of `selection`."""
 
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
         """Return the indices of the selected nodes, sorted."""
@@ -64,11 +64,13 @@ class TetMesh:
     tetrahedra : (E, 4) integer array
         Nodes of each element, counted from 0.
     point_arrays : mapping of name to (n, ...) array, optional
-        Values per node, such as the 0/1 masks of `Named` selections.
+        Values per node, such as the 0/1 masks of `Named` selections; rows of dropped nodes are
+        dropped.
     cell_arrays : mapping of name to (E, ...) array, optional
         Values per element.
     face_sets : mapping of name to (k, 3) integer array, optional
-        Corners of triangles, such as those of a cavity's wall.
+        Corners of triangles, such as those of a cavity's wall; counted like `tetrahedra`, stored
+        with the indices after dropping, where −1 stands for a dropped node.
     is_generated : bool, default False
         Whether the mesh was made of stated lengths, as those of `structured` are, not of a scan.
 
@@ -116,7 +118,8 @@ class TetMesh:
         element_arrays = checked_arrays(
             cell_arrays or {}, len(elements), kind="cell", of="elements"
         )
-        points, elements, used, notes = clean_mesh(raw_points, elements)
+        cleaned = clean_mesh(raw_points, elements)
+        used = cleaned.used
         new_index = np.full(len(raw_points), -1)
         new_index[used] = np.arange(len(used))
         faces = {
@@ -124,8 +127,8 @@ class TetMesh:
             for name, f in (face_sets or {}).items()
         }
         self._set(
-            points_m=_read_only(points),
-            tetrahedra=_read_only(elements),
+            points_m=_read_only(cleaned.points_m),
+            tetrahedra=_read_only(cleaned.tetrahedra),
             point_arrays={
                 name: _read_only(values[used])
                 for name, values in arrays.items()
@@ -139,7 +142,7 @@ class TetMesh:
             },
             file_index=_read_only(used),
             file_node_count=len(raw_points),
-            notes=notes,
+            notes=cleaned.notes,
             is_generated=is_generated,
         )
 
@@ -177,14 +180,18 @@ class TetMesh:
             If the file cannot be read, contains no tetrahedra, has sides curved by more than 5 % of
             their length, or its mesh is invalid.
         """
-        points_m, tetrahedra, point_arrays, cell_arrays, faces, notes = (
-            read_tetrahedra(path, length_unit)
-        )
+        content = read_tetrahedra(path, length_unit)
         try:
-            mesh = cls(points_m, tetrahedra, point_arrays, cell_arrays, faces)
+            mesh = cls(
+                content.points_m,
+                content.tetrahedra,
+                point_arrays=content.point_arrays,
+                cell_arrays=content.cell_arrays,
+                face_sets=content.face_sets,
+            )
         except InputError as error:
             raise error.located(path) from None
-        mesh._set(notes=(*notes, *mesh.notes))
+        mesh._set(notes=(*content.notes, *mesh.notes))
         return mesh
 
     @classmethod
@@ -233,7 +240,18 @@ class TetMesh:
             raise error.located(path) from error.__cause__
 
     def write(self, path: str | Path) -> None:
-        """Write the mesh, in metres, to any format that meshio knows by the file's extension."""
+        """Write the mesh, in metres, to any format that meshio knows by the file's extension.
+
+        Point and cell arrays are written (booleans as integers), face sets are not. A file that
+        exists is replaced.
+
+        Raises
+        ------
+        InputError
+            If the format is unknown or cannot hold the mesh.
+        OSError
+            If the file cannot be created.
+        """
         write_tetrahedra(
             path,
             self.points_m,
@@ -246,6 +264,11 @@ class TetMesh:
         """Return the nodes of a `selection.Selection`, as sorted int64 indices.
 
         For nodes on edges, which quadratic elements have, see `Body.select`.
+
+        Raises
+        ------
+        InputError
+            If no node is selected, or the mesh does not have what the selection names.
         """
         return selection.resolve(ElementNodes.corners(self))
 
@@ -287,13 +310,16 @@ class TetMesh:
 
     @cached_property
     def edges(self) -> np.ndarray:
-        """Pairs of nodes that share an element, (m, 2) int64, each once, sorted."""
+        """Pairs of nodes that share an element, (m, 2) int64, each once, the lower index first,
+        sorted.
+        """
         return _read_only(unique_edges(self.tetrahedra))
 
     def mid_node_indices(self, pairs: np.ndarray) -> np.ndarray:
-        """Return the indices (…) of the mid nodes between pairs (…, 2) of corners.
+        """Return the indices (…) of the mid nodes between pairs (…, 2) of corners, in either order.
 
-        Mid nodes follow the corners, in the order of `edges`.
+        Mid nodes follow the corners, in the order of `edges`. Pairs must be edges of the mesh; this
+        is not checked.
         """
         count = len(self.points_m)
         codes = np.sort(pairs, axis=-1) @ [count, 1]
@@ -301,7 +327,7 @@ class TetMesh:
 
     @cached_property
     def sha256(self) -> str:
-        """Hash of the points and tetrahedra, as 64 hexadecimal digits."""
+        """Hash of the points and tetrahedra alone, in their order, as 64 hexadecimal digits."""
         digest = hashlib.sha256(
             f"{self.points_m.shape} {self.tetrahedra.shape}".encode()
         )
@@ -338,7 +364,9 @@ def boundary_of(tetrahedra: Index) -> tuple[Index, Index]:
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:
-    """Return a contiguous array that cannot be modified; the array itself if it is contiguous."""
+    """Return a contiguous array that cannot be modified; an argument that is contiguous is itself made
+    read-only and returned.
+    """
     array = np.ascontiguousarray(array)
     array.flags.writeable = False
     return array
@@ -371,8 +399,8 @@ class ElementNodes:
         return cls(
             mesh,
             mesh.points_m,
-            mesh.tetrahedra,
-            np.empty((0, 2), dtype=np.int64),
+            cells=mesh.tetrahedra,
+            ends=np.empty((0, 2), dtype=np.int64),
         )
 
     @classmethod
@@ -385,18 +413,21 @@ class ElementNodes:
         )
         middles = mesh.mid_node_indices(mesh.tetrahedra[:, element.edges])
         return cls(
-            mesh, points, np.hstack([mesh.tetrahedra, middles]), mesh.edges
+            mesh,
+            points,
+            cells=np.hstack([mesh.tetrahedra, middles]),
+            ends=mesh.edges,
         )
 
     def with_mid_nodes(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Extend a mask of mesh nodes to mid nodes, which are selected if both ends of the edge
-        are.
+        """Extend a mask of mesh nodes (corners,) to all nodes (n,): a mid node is selected if both
+        ends of its edge are.
         """
         return np.concatenate([chosen, chosen[self.ends].all(axis=1)])
 
     def nodes_of_faces(self, triangles: Index) -> Index:
-        """Return the nodes (F, 3) or (F, 6) of triangles of corners, then those on the edges ab,
-        bc, ca.
+        """Return the nodes of triangles of corners (F, 3): the corners and, for quadratic elements,
+        the mid nodes of the edges ab, bc, ca, (F, 6).
         """
         if not len(self.ends):
             return triangles

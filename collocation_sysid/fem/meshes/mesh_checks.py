@@ -55,9 +55,13 @@ def checked_points(points_m: ArrayLike) -> np.ndarray:
 
 
 def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
-    """Return an int64 copy of (E, 4) node indices, or raise an `InputError`.
+    """Return an int64 copy of (E, 4) node indices.
 
-    E must be positive and all indices below `node_count`.
+    Raises
+    ------
+    InputError
+        If the array has another shape, no rows, no integers, or indices outside 0 … `node_count` −
+        1.
     """
     try:
         array = np.array(tetrahedra)
@@ -78,7 +82,13 @@ def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
 
 
 def checked_faces(faces: ArrayLike, node_count: int) -> np.ndarray:
-    """Return an int64 copy of (k, 3) node indices below `node_count`, or raise an `InputError`."""
+    """Return an int64 copy of (k, 3) node indices.
+
+    Raises
+    ------
+    InputError
+        If the array has another shape, no integers, or indices outside 0 … `node_count` − 1.
+    """
     array = np.array(faces)
     if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "iu":
         raise InputError(
@@ -89,7 +99,9 @@ def checked_faces(faces: ArrayLike, node_count: int) -> np.ndarray:
 
 
 def require_known_nodes(cells: np.ndarray, node_count: int) -> None:
-    """Raise an `InputError` if cells (E, k) have node indices outside 0 … `node_count` − 1."""
+    """Raise an `InputError` if cells (E, k) have node indices outside 0 … `node_count` − 1; the
+    message says if they seem to count from 1.
+    """
     bad = np.flatnonzero(((cells < 0) | (cells >= node_count)).any(axis=1))
     if len(bad):
         hint = (
@@ -128,21 +140,39 @@ def checked_arrays(
     return checked
 
 
-def clean_mesh(
-    points_m: np.ndarray, tetrahedra: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Drop nodes that are no element's corner and reverse negatively oriented elements.
+@dataclass(frozen=True, eq=False)
+class CleanedMesh:
+    """Mesh without unused nodes, all of whose elements have positive volumes.
 
-    Orders are kept.
-
-    Returns
-    -------
-    points_m : (n', 3) array
-    tetrahedra : (E, 4) array
+    Attributes
+    ----------
+    points_m : (n', 3)
+        Node positions [m].
+    tetrahedra : (E, 4) int64
+        Nodes of each element, counted in `points_m`.
     used : (n',) int64
-        Previous index of each node, increasing.
+        Index of each node before others were dropped, increasing.
     notes : tuple of str
         Sentences about what was cleaned and what looks suspicious.
+    """
+
+    points_m: np.ndarray
+    tetrahedra: np.ndarray
+    used: np.ndarray
+    notes: tuple[str, ...]
+
+
+def clean_mesh(points_m: np.ndarray, tetrahedra: np.ndarray) -> CleanedMesh:
+    """Drop nodes that are no element's corner and reverse negatively oriented elements.
+
+    Orders are kept; the arguments are not changed.
+
+    Parameters
+    ----------
+    points_m : (n, 3)
+        Node positions [m].
+    tetrahedra : (E, 4) int
+        Nodes of each element, in the range of `points_m`.
 
     Raises
     ------
@@ -169,19 +199,15 @@ def clean_mesh(
             f"{len(reversed_elements)} of {len(oriented)} elements had a negative volume and were "
             "re-oriented."
         )
-    return (
-        used_points,
-        oriented,
-        used,
-        (*notes, *_note_parts(used_points, oriented)),
-    )
+    notes += _note_parts(used_points, oriented)
+    return CleanedMesh(used_points, oriented, used=used, notes=tuple(notes))
 
 
 def orient_elements(
     points_m: np.ndarray, tetrahedra: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a copy of the tetrahedra (E, 4) in which all volumes are positive, and the indices of
-    those whose last two nodes were exchanged for it.
+    """Return a copy of the tetrahedra (E, 4) in which no volume is negative, and the indices of those
+    whose last two nodes were exchanged for it.
     """
     reversed_elements = np.flatnonzero(signed_volumes(points_m, tetrahedra) < 0)
     oriented = tetrahedra.copy()
@@ -190,7 +216,7 @@ def orient_elements(
 
 
 def signed_volumes(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Return the volume of each tetrahedron (E,) [m³].
+    """Return the volume of each tetrahedron (E,) [m³], from points (n, 3) [m] and nodes (E, 4).
 
     Positive if x₁−x₀, x₂−x₀, x₃−x₀ is right-handed.
     """
@@ -200,7 +226,9 @@ def signed_volumes(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 
 def unique_edges(tetrahedra: np.ndarray) -> np.ndarray:
-    """Return the pairs of nodes that share an element, (m, 2), each once, sorted."""
+    """Return the pairs of nodes that share an element, (m, 2), each once, the lower index first,
+    sorted.
+    """
     return np.unique(
         np.sort(tetrahedra[:, EDGES].reshape(-1, 2), axis=1), axis=0
     )
@@ -243,7 +271,9 @@ def edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 
 def _require_finite(points: np.ndarray, used: np.ndarray) -> None:
-    """Raise an `InputError` if a used node has coordinates that are not finite."""
+    """Raise an `InputError` if a used node has coordinates that are not finite; `used` are the
+    indices of the nodes that an element has.
+    """
     bad = used[~np.isfinite(points[used]).all(axis=1)]
     if len(bad):
         raise InputError(
@@ -270,7 +300,9 @@ def _require_no_duplicates(tetrahedra: np.ndarray) -> None:
 
 
 def _require_not_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
-    """Raise an `InputError` if an element has almost no volume."""
+    """Raise an `InputError` if an element has almost no volume, of either sign: at most
+    `DEGENERATE_RATIO` of its mean edge length cubed.
+    """
     volumes = np.abs(signed_volumes(points, tetrahedra))
     cubes = edge_lengths(points, tetrahedra).mean(axis=1) ** 3
     bad = np.flatnonzero(volumes <= DEGENERATE_RATIO * cubes)

@@ -10,6 +10,7 @@ import io
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,16 +47,16 @@ def length_in_metres(length_unit: str) -> float:
 Arrays = dict[str, np.ndarray]
 
 
-def read_tetrahedra(
-    path: str | Path, length_unit: str = "m"
-) -> tuple[np.ndarray, np.ndarray, Arrays, Arrays, Arrays, tuple[str, ...]]:
-    """Read the tetrahedra of a file, quadratic ones by their corners; other cells are omitted.
+@dataclass(frozen=True, eq=False)
+class TetrahedraContent:
+    """Tetrahedra of a mesh file, with the data on them.
 
-    Returns
-    -------
+    Attributes
+    ----------
     points_m : (n, 3) float64
+        All points of the file [m], also those that no tetrahedron has.
     tetrahedra : (E, 4)
-        Node indices; E > 0.
+        Node indices, E > 0, in the order of the file.
     point_arrays : dict of name to (n, ...) array
         Point data of the file, and as booleans its point sets and the nodes of its cell sets and
         physical groups, whatever the dimension of their cells.
@@ -66,20 +67,42 @@ def read_tetrahedra(
         on them and 0 on others.
     notes : tuple of str
         Sentences about omitted cells and straightened sides, if any.
+    """
+
+    points_m: np.ndarray
+    tetrahedra: np.ndarray
+    point_arrays: Arrays
+    cell_arrays: Arrays
+    face_sets: Arrays
+    notes: tuple[str, ...]
+
+
+def read_tetrahedra(
+    path: str | Path, length_unit: str = "m"
+) -> TetrahedraContent:
+    """Read the tetrahedra of a file, quadratic ones by their corners; other cells are omitted.
+
+    The mesh is not checked beyond its sides, see `mesh_checks`.
+
+    Parameters
+    ----------
+    path : str or Path
+        File whose extension states the format.
+    length_unit : {"m", "cm", "mm", "um", "in"}
+        Unit of the coordinates in the file.
 
     Raises
     ------
     InputError
-        If the file cannot be read, contains no tetrahedra, or their sides are strongly curved.
+        If the unit is unknown, the file cannot be read, contains no tetrahedra, or their sides are
+        strongly curved.
     """
     metres = length_in_metres(length_unit)
     with _read_with_meshio(path) as data:
         return _tetrahedra(data, metres)
 
 
-def _tetrahedra(
-    data: MeshContent, metres: float
-) -> tuple[np.ndarray, np.ndarray, Arrays, Arrays, Arrays, tuple[str, ...]]:
+def _tetrahedra(data: MeshContent, metres: float) -> TetrahedraContent:
     """Return the same as `read_tetrahedra` from the data of meshio.
 
     Parameters
@@ -115,13 +138,14 @@ def _tetrahedra(
     nodes = {
         name: _nodes_of(data, per_block) for name, per_block in groups.items()
     }
-    return (
+    cell_arrays = {**groups, **data.cell_data}
+    return TetrahedraContent(
         points_m,
         np.concatenate([block.data[:, :4] for block in blocks]),
-        {**nodes, **_point_sets(data), **data.point_data},
-        _of_tetrahedra(data, {**groups, **data.cell_data}),
-        _triangle_sets(data, {**groups, **data.cell_data}),
-        notes,
+        point_arrays={**nodes, **_point_sets(data), **data.point_data},
+        cell_arrays=_of_tetrahedra(data, cell_arrays),
+        face_sets=_triangle_sets(data, cell_arrays),
+        notes=notes,
     )
 
 
@@ -130,12 +154,20 @@ def read_triangles(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Read the vertices (p, 3) in metres and triangles (F, 3) of a surface file.
 
-    Quadrilaterals and polygons are split into triangles.
+    Quadrilaterals and polygons are split into triangles, as fans about their first corner; other
+    cells are ignored. The surface is not checked.
+
+    Parameters
+    ----------
+    path : str or Path
+        File whose extension states the format.
+    length_unit : {"m", "cm", "mm", "um", "in"}
+        Unit of the coordinates in the file.
 
     Raises
     ------
     InputError
-        If the file cannot be read or contains no triangles.
+        If the unit is unknown, the file cannot be read or contains no triangles.
     """
     metres = length_in_metres(length_unit)
     with _read_with_meshio(path) as data:
@@ -183,7 +215,9 @@ def write_tetrahedra(
     Raises
     ------
     InputError
-        If the file cannot be written.
+        If the format is unknown or cannot hold the mesh.
+    OSError
+        If the file cannot be created.
     """
     import meshio  # slow to import
 
@@ -341,13 +375,17 @@ def _physical_groups(data: MeshContent) -> dict[str, list[np.ndarray]]:
 
 
 def _group_name(tag: int, dimension: int, ambiguous: bool) -> str:
-    """Return the name of a physical group without a name."""
+    """Return the name of a physical group without a name: "physical_3", or "physical_3_surface" if
+    groups of other dimensions have the same tag (`ambiguous`).
+    """
     kind = ("points", "lines", "surface", "volume")[dimension]
     return f"physical_{tag}_{kind}" if ambiguous else f"physical_{tag}"
 
 
 def _nodes_of(data: MeshContent, masks: list[np.ndarray]) -> np.ndarray:
-    """Return the mask of the nodes of cells that are selected block by block."""
+    """Return the mask (n,) of the nodes of cells that are selected by one mask for each block of the
+    file.
+    """
     chosen = np.zeros(len(data.points), dtype=bool)
     for block, mask in zip(data.cells, masks, strict=True):
         chosen[np.asarray(block.data)[mask].ravel()] = True

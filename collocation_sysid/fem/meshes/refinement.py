@@ -35,8 +35,9 @@ def split_in_eight(mesh: TetMesh) -> TetMesh:
 
     The octahedron in the middle is cut along its shortest diagonal, so that elements do not
     deteriorate (Zhang 1995). The nodes of the mesh come first, then the middle of each of
-    `TetMesh.edges`; the eight parts of an element follow one another. Masks of nodes are true in
-    the middle of an edge if they are at both ends; other arrays of nodes are omitted.
+    `TetMesh.edges`; the eight parts of element i are 8 i … 8 i + 7. Masks of nodes are true in
+    the middle of an edge if they are at both ends; other arrays of nodes are omitted. Arrays of
+    cells are repeated, and face sets split.
     """
     finer = ElementNodes.for_element(mesh, ELEMENTS["tet10"])
     ends = mesh.edges
@@ -92,9 +93,11 @@ def split_faces_in_four(faces: Index, mesh: TetMesh) -> Index:
 
 
 def refine_body(body: Body) -> Body:
-    """Return the body on a mesh with half the element size.
+    """Return the body on a mesh with half the element size, see `split_in_eight`.
 
-    Its regions consist of the split cells.
+    Materials, stated and free densities, fields (not computed again), custom forces, the rest shape
+    and `has_declared_mass` are those of `body`; the total mass is the same. Frames of obstacles are
+    not copied.
     """
     cells = [8 * part.cells[:, None] + np.arange(8) for part in body.parts]
     regions = [
@@ -130,6 +133,7 @@ def refine_body(body: Body) -> Body:
         evaluator=body.evaluator,
         threads=body.threads,
     )
+    finer.has_declared_mass = body.has_declared_mass
     finer = finer.with_free_densities(
         [part.name for part in body.parts if part.has_free_density]
     )
@@ -194,18 +198,23 @@ def _refined_force(
 def refine_nodes(
     nodes: Index, selection: Selection | None, body: Body, finer: Body
 ) -> Index:
-    """Return the nodes of the refined body that correspond to nodes of the original one.
+    """Return the nodes of the refined body that correspond to nodes of the original one, sorted.
 
     Boxes and balls select anew. Otherwise the middle of an edge is selected if both ends are.
 
     Parameters
     ----------
     nodes : (k,) int
-        Nodes of the original body.
+        Nodes of the original body, mid nodes included; not read for a box or ball.
     selection : Selection or None
         Selection of these nodes, if there is one.
     body, finer : Body
         Original and refined body.
+
+    Raises
+    ------
+    InputError
+        If a box or ball selects no node of the refined body.
     """
     if isinstance(selection, (Box, Ball)):
         return finer.select(selection)

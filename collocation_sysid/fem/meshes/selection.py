@@ -46,13 +46,25 @@ class _PositionSelection:
         )
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
-        """Return the indices of the selected cells, sorted."""
+        """Return the indices of the cells whose centres are inside, sorted int64.
+
+        Raises
+        ------
+        InputError
+            If no cell is selected.
+        """
         return _indices_or_error(
             self._contains(mesh.centres_m), mesh, what=str(self), of=OF_CELLS
         )
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
-        """Return the selected rows of `mesh.surface`, sorted."""
+        """Return the rows of `mesh.surface` whose three corners are inside, sorted int64.
+
+        Raises
+        ------
+        InputError
+            If no face is selected.
+        """
         return _select_faces(
             self._contains(mesh.points_m), mesh, what=str(self)
         )
@@ -62,7 +74,7 @@ class _PositionSelection:
         raise NotImplementedError
 
     def _nearest_hint(self, points_m: np.ndarray) -> str:
-        """Return a hint for the message if no point is inside."""
+        """Return text that is appended to the message if no point is inside; "" by default."""
         return ""
 
 
@@ -73,7 +85,12 @@ class Box(_PositionSelection):
     Parameters
     ----------
     low_m, high_m : three numbers
-        Lowest and highest coordinates in metres.
+        Lowest and highest coordinates in metres; stored as tuples of floats.
+
+    Raises
+    ------
+    InputError
+        If a corner is not three numbers, or the low corner is above the high one along an axis.
     """
 
     low_m: Sequence[float]
@@ -108,14 +125,19 @@ class Box(_PositionSelection):
 
 @dataclass(frozen=True)
 class Ball(_PositionSelection):
-    """Selection of a ball.
+    """Selection of a ball, including its surface.
 
     Parameters
     ----------
     center_m : three numbers
-        Centre in metres.
+        Centre in metres; stored as a tuple of floats.
     radius_m : float
         Largest distance from the centre in metres.
+
+    Raises
+    ------
+    InputError
+        If the centre is not three numbers, or the radius not a positive number.
     """
 
     center_m: Sequence[float]
@@ -161,6 +183,11 @@ class Face(_PositionSelection):
         "side_y": those with its lowest x or y, as in a plane of symmetry, that are neither on the
         top nor on the bottom, so that grasps of a side and of an end can be combined. As a
         selection of faces a side includes its edges.
+
+    Raises
+    ------
+    InputError
+        For another name.
     """
 
     name: FaceName
@@ -224,6 +251,13 @@ class Indices:
     Parameters
     ----------
     indices : sequence of int
+        In any order, with repetitions; stored as a tuple. Their range is checked when they are
+        resolved.
+
+    Raises
+    ------
+    InputError
+        If they are not a list of integers.
     """
 
     indices: Sequence[int]
@@ -498,7 +532,9 @@ def _describe_bounds(bounds_m: np.ndarray) -> str:
 
 
 def _tolerance_m(points_m: np.ndarray) -> float:
-    """Return the tolerance of positions for rounding [m]."""
+    """Return the tolerance of positions for rounding [m]: a fraction of the diagonal of the points
+    (n, 3).
+    """
     return ROUND_OFF * float(np.linalg.norm(np.ptp(points_m, axis=0)))
 
 
@@ -510,7 +546,7 @@ def _is_number(value: object) -> bool:
 
 
 def _vector(values: Iterable[float], what: str) -> tuple[float, float, float]:
-    """Return three numbers as a tuple of floats.
+    """Return three numbers as a tuple of floats: a position (x, y, z).
 
     Raises
     ------

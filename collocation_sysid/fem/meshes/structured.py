@@ -22,8 +22,8 @@ _MOST_ELEMENTS = 1_000_000
 
 
 def box_of_edge(size_m: ArrayLike, edge_length_m: float) -> TetMesh:
-    """Mesh a box of size (3,) [m] with a corner at the origin, with a whole number of cells along
-    each axis whose edges are about `edge_length_m` long.
+    """Mesh a box of size (3,) [m] with its lowest corner at the origin and a whole number of cells
+    along each axis, whose edges are about `edge_length_m` long; see `box_mesh`.
 
     Raises
     ------
@@ -41,7 +41,8 @@ def cylinder_of_edge(
     edge_length_m: float,
     quarter: bool = False,
 ) -> TetMesh:
-    """Mesh an upright cylinder of exact volume, with edges of about this length.
+    """Mesh an upright cylinder with edges of about this length: axis z, base at z = 0, volume exactly
+    that of the round cylinder, so that the nodes of the rim are slightly outside the radius.
 
     Parameters
     ----------
@@ -52,7 +53,7 @@ def cylinder_of_edge(
     Raises
     ------
     InputError
-        If this takes more than a million elements.
+        If a length is not positive, or if this takes more than a million elements.
     """
     rings, layers = _divisions(
         np.array([diameter_m / 2, height_m]), edge_length_m
@@ -88,12 +89,13 @@ def cylinder_of_edge(
 def count_box_elements(
     size_m: ArrayLike, edge_length_m: float
 ) -> tuple[int, int]:
-    """Return the numbers of nodes and elements of `box_of_edge` without creating the mesh.
+    """Return the numbers of nodes and elements, in this order, of `box_of_edge` without creating the
+    mesh; sizes are not checked.
 
     Raises
     ------
     InputError
-        For more than a million elements.
+        For an edge length that is not positive, or more than a million elements.
     """
     divisions = _divisions(np.asarray(size_m, dtype=float), edge_length_m)
     elements = float(6 * np.prod(divisions))
@@ -107,12 +109,13 @@ def count_cylinder_elements(
     edge_length_m: float,
     quarter: bool = False,
 ) -> tuple[int, int]:
-    """Return the approximate numbers of nodes and elements of `cylinder_of_edge`, without the mesh.
+    """Return the numbers of nodes and elements, in this order, of `cylinder_of_edge` without creating
+    the mesh; that of a quarter's nodes is approximate. Diameter and height are not checked.
 
     Raises
     ------
     InputError
-        For more than a million elements.
+        For an edge length that is not positive, or more than a million elements.
     """
     rings, layers = _divisions(
         np.array([diameter_m / 2, height_m]), edge_length_m
@@ -125,7 +128,20 @@ def count_cylinder_elements(
 
 
 def _divisions(size_m: np.ndarray, edge_length_m: float) -> np.ndarray:
-    """Return the numbers of elements along lengths, rounded, at least 1."""
+    """Return the numbers of elements along lengths, as floats: rounded to the nearest whole number,
+    at least 1.
+
+    Raises
+    ------
+    InputError
+        If the edge length is not positive.
+    """
+    if not edge_length_m > 0:
+        raise InputError(
+            f"found {edge_length_m!r}; expected a positive length in metres",
+            None,
+            where="edge_length_m",
+        )
     return np.maximum(np.round(size_m / edge_length_m), 1)
 
 
@@ -216,9 +232,9 @@ def cylinder_mesh(
     rings, layers : int
         Elements along the radius and along the height.
     sectors : int
-        Nodes of the innermost ring. With a multiple of four no element crosses the planes x = 0 and
-        y = 0. With six, a mesh has (1 + 3 rings (rings + 1)) (layers + 1) nodes and 18 rings²
-        layers elements.
+        Nodes of the innermost ring, 3 or more (not checked). With a multiple of four no element
+        crosses the planes x = 0 and y = 0. With six, a mesh has (1 + 3 rings (rings + 1)) (layers +
+        1) nodes and 18 rings² layers elements.
 
     Returns
     -------
@@ -228,7 +244,7 @@ def cylinder_mesh(
     Raises
     ------
     InputError
-        For lengths or numbers that are not positive.
+        For lengths, rings or layers that are not positive.
     """
     for name, value in (("radius_m", radius_m), ("height_m", height_m)):
         if not 0 < value < np.inf:
@@ -265,7 +281,9 @@ def cylinder_mesh(
 
 
 def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (·, 2) and triangles (sectors · rings², 3) of the unit disc."""
+    """Return nodes (1 + sectors · rings (rings + 1)/2, 2) and triangles (sectors · rings², 3) of the
+    unit disc: its centre first, then ring by ring.
+    """
     counts = [sectors * k for k in range(1, rings + 1)]
     angles = [2 * np.pi * np.arange(count) / count for count in counts]
     circles = [
@@ -274,7 +292,9 @@ def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
     ]
 
     def node(ring: int, sector: int, step: int) -> int:
-        """Return the index of a node of a ring; of the centre for ring 0."""
+        """Return the index of a node: number `step` of a sector of a ring, counting from 0 and on
+        into the next sector; of the centre for ring 0.
+        """
         if not ring:
             return 0
         before = 1 + sectors * ring * (ring - 1) // 2

@@ -92,19 +92,24 @@ def tetrahedralize_surface(
     if not cached.exists():
         with replaced_file(cached) as draft:
             # A mesh that is refused must not be kept.
-            nodes, tetrahedra, *_ = clean_mesh(
+            cleaned = clean_mesh(
                 *_run_ftetwild(points, faces, edge_length_m=edge_length_m)
             )
-            write_tetrahedra(draft, nodes, tetrahedra=tetrahedra)
-    nodes, tetrahedra, *_ = read_tetrahedra(cached)
-    return nodes, tetrahedra
+            write_tetrahedra(
+                draft, cleaned.points_m, tetrahedra=cleaned.tetrahedra
+            )
+    content = read_tetrahedra(cached)
+    return content.points_m, content.tetrahedra
 
 
 def merge_coincident(
     points: np.ndarray, triangles: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices and triangles with vertices merged that coincide in single precision (10⁻⁶ of
-    the diagonal), and without the triangles that become degenerate.
+    """Return vertices (p', 3) and triangles (F', 3) with vertices merged that coincide in single
+    precision (10⁻⁶ of the diagonal), and without the triangles that become degenerate.
+
+    Vertices that are linked by a chain of such pairs become one, at the first of them. Unused
+    vertices stay.
     """
     tolerance = 1e-6 * np.linalg.norm(np.ptp(points, axis=0))
     pairs = KDTree(points).query_pairs(tolerance, output_type="ndarray")
@@ -150,7 +155,9 @@ def _checked_surface(
 
 
 def _require_closed(triangles: np.ndarray) -> None:
-    """Raise an `InputError` unless every edge belongs to exactly two triangles."""
+    """Raise an `InputError` unless every edge belongs to exactly two triangles (F, 3), or if there is
+    no triangle.
+    """
     edges = np.sort(
         triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1
     )
@@ -168,8 +175,8 @@ def _require_closed(triangles: np.ndarray) -> None:
 def _require_suitable_edge_length(
     points: np.ndarray, triangles: np.ndarray, edge_length_m: float
 ) -> None:
-    """Raise an `InputError` if the edge length is not positive, too large or too small for the
-    body.
+    """Raise an `InputError` if the edge length is not positive and finite, over half the diagonal
+    of the surface, or so small that more than `MOST_ELEMENTS` tetrahedra would result.
     """
     if not 0 < edge_length_m < np.inf:
         raise InputError(
