@@ -26,7 +26,14 @@ S = TypeVar("S", PolylineLength, EnclosedVolume)
 
 @dataclass(frozen=True, eq=False)
 class BodyMeasure(Generic[S]):
-    """A scalar S of the shape of a given body: the length of a tendon, or a volume."""
+    """A scalar S of the shape of a given body: the length of a tendon, or a volume.
+
+    Attributes
+    ----------
+    body : Body
+    measure : PolylineLength or EnclosedVolume
+        The scalar S of that body.
+    """
 
     body: Body
     measure: S
@@ -95,21 +102,23 @@ class Actuator(ABC, Generic[S]):
     def with_calibration(
         self, factor: float, offset: float, log_lag_ratio: float
     ) -> Self:
-        """Return the actuator with another calibration; without a lag, `log_lag_ratio` has no
-        effect.
+        """Return a copy of the actuator with another factor and offset; `log_lag_ratio` has no
+        effect on an actuator without a lag.
         """
         return replace(self, factor=factor, **{self.offset_field: offset})
 
     def input_data(self, t_s: Array) -> Array:
         """Return the data (d, T) of which `calibrated_amplitude` is a function at the times `t_s`
-        (T,).
+        (T,): here the stated tension or pressure, d = 1.
         """
         return self.declared_values.values_at(t_s)[None]
 
     def calibrated_amplitude(
         self, data: ca.SX, factor: Any, offset: Any, log_lag_ratio: Any
     ) -> ca.SX:
-        """Return the amplitude c for a calibration, as an expression of `input_data` (d,)."""
+        """Return the amplitude c for a calibration, as an expression of `input_data` (d,) at one
+        time; without a lag `log_lag_ratio` is ignored.
+        """
         return self.energy_amplitude(data, factor, offset)
 
     @abstractmethod
@@ -121,7 +130,9 @@ class Actuator(ABC, Generic[S]):
         """
 
     def energy_amplitude_at(self, t_s: Array) -> Array:
-        """Return the amplitude c at the times `t_s` (T,), as (T,)."""
+        """Return the amplitude c at the times `t_s` (T,), as (T,), with the actuator's own
+        calibration.
+        """
         factor, offset, _ = self.calibration
         return self.energy_amplitude(
             self.declared_values.values_at(t_s), factor, offset

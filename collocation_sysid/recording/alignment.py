@@ -77,18 +77,20 @@ def align(
     resample_hz : float, optional
         Rate of the new grid, which starts at the first sample that is kept.
     every : int
-        Use every n-th sample of the markers.
+        Use every n-th of the marker samples that are kept, from the first on, before any
+        resampling; 1 for all.
     grasp_intervals_s : sequence of (float, float), optional
         First and last time at which each grasp holds; its poses need not cover other times. The
         whole recording by default.
     static : bool
-        Whether the grid is the markers' own time, however it is spaced, and one sample is enough.
+        Whether the grid is the markers' own time, however it is spaced, and one sample is enough;
+        `resample_hz` is then ignored.
 
     Raises
     ------
     InputError
-        If the window is empty, the markers' time is uneven, or poses and markers share fewer than
-        three samples.
+        If the window is empty, the markers' time is uneven, the rate is not positive or leaves one
+        sample, or a cut to the time of the poses leaves fewer than three samples.
     """
     table = table if window_s is None else _cut_to_window(table, window_s)
     grasp_intervals_s = grasp_intervals_s or [(-np.inf, np.inf)] * len(poses)
@@ -132,7 +134,8 @@ def _cut_to_poses(
     grasp_intervals_s: Sequence[tuple[float, float]],
     fewest: int,
 ) -> tuple[MarkerTable, list[str]]:
-    """Return the markers at times for which every active grasp has a pose, and notes on the cuts.
+    """Return the markers at times for which every active grasp has a pose, and notes on the cuts:
+    an empty list, and the same table, if nothing is cut.
 
     Parameters
     ----------
@@ -147,7 +150,7 @@ def _cut_to_poses(
     Raises
     ------
     InputError
-        If fewer samples remain.
+        If fewer samples remain after a cut; without a cut their number is not checked.
     """
     t_s = table.t_s
     is_inside = np.ones(len(t_s), dtype=bool)
@@ -241,7 +244,10 @@ def _even_grid(t_s: Array, rate_hz: float) -> Array:
 
 def _interpolate_markers(table: MarkerTable, grid: Array) -> Array:
     """Return marker positions (G, M, 3) [m] at the times `grid` (G,), linear between samples; NaN
-    beside a missing sample or within a gap of the times.
+    beside a missing sample or within a gap of the times, over `_GAP_STEPS` median intervals.
+
+    At a time within `_SAME_TIME_STEPS` of a sample it is that sample, whatever its neighbour. The
+    table must have at least two samples.
     """
     t_s = table.t_s
     x = table.positions_m
@@ -317,7 +323,8 @@ def _tolerance_s(poses: PoseSequence, t_s: Array) -> float:
 
 def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
     """Return the predicate of a note on poses that were interpolated to the times `grid` (G,), and
-    on gaps of the poses; the caller adds the subject.
+    on gaps of the poses within the grid (over `_GAP_STEPS` median intervals); the caller adds the
+    subject.
     """
     how = (
         "held"
@@ -344,7 +351,8 @@ def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
 
 def _jump_notes(poses: PoseSequence, grid: Array) -> list[str]:
     """Return the predicate of a note on jumps of smoothly interpolated poses between the first and
-    last time of `grid` (G,), as a list; empty if there are none.
+    last time of `grid` (G,), as a list of one; empty if there are none or the interpolation is not
+    smooth.
     """
     if poses.interpolation != "smooth":
         return []
@@ -365,5 +373,5 @@ def _rate_hz(t_s: Array) -> float:
 
 
 def _span_text(t_s: Array) -> str:
-    """First and last of some times as text."""
+    """First and last of times (T,) as text, "from 0 s to 1.5 s"."""
     return f"from {t_s[0]:.9g} s to {t_s[-1]:.9g} s"

@@ -51,8 +51,8 @@ def read_only_floats(
 def float_converter(
     shape: tuple[int | None, ...], name: str, finite: bool = True
 ) -> Callable[[ArrayLike], Array]:
-    """Return a function that copies values to a read-only array; arguments and errors are those of
-    `read_only_floats`.
+    """Return a function that copies values to a read-only array; the arguments are those of
+    `read_only_floats`, whose errors the returned function raises.
     """
     return lambda values: read_only_floats(
         values, shape, name=name, finite=finite
@@ -71,7 +71,7 @@ def read_only_tracks(
     ----------
     values : array_like
     shape : tuple of int or None
-        Expected shape; None allows any length.
+        Expected shape, of three axes; None allows any length.
     name : str
         Name of the positions, for messages.
 
@@ -91,12 +91,13 @@ def read_only_nodes(
     values: ArrayLike, shape: tuple[int | None, ...], name: str
 ) -> Index:
     """Return a read-only int64 copy of node indices, whose shape must match `shape` (None: any
-    length).
+    length). Order and repeats are kept, and an empty array of any type is accepted.
 
     Raises
     ------
     InputError
-        If the values are not whole numbers from 0 upwards, or the shape differs.
+        If the values are not whole numbers (of an integer type) from 0 upwards, or the shape
+        differs.
     """
     indices = np.asarray(values)
     if indices.size and not np.issubdtype(indices.dtype, np.integer):

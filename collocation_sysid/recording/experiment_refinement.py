@@ -15,15 +15,23 @@ if TYPE_CHECKING:
 
 
 def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
-    """Return the experiment on a finer body.
+    """Return the experiment on a finer body, a refinement of its own.
 
-    Selections of nodes are evaluated on the finer mesh. Markers are material points: their places
-    on the undeformed body stay, whether they are nodes, inside elements or beyond the surface.
+    Selections of nodes are evaluated on the finer mesh, and node numbers without a selection
+    refined. Markers are material points: their places on the undeformed body stay, whether they are
+    nodes, inside elements or beyond the surface. A given start state is interpolated.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    finer : Body
+        Refined body of the same shape.
     """
     body = experiment.body
     markers = experiment.markers
 
     def refined_load(load):
+        """Return a grasp, point mass or force with its nodes on the finer body."""
         return replace(
             load,
             nodes=refine_nodes(

@@ -53,6 +53,9 @@ class Placement:
     node_count: int
 
     def __post_init__(self) -> None:
+        """Store read-only copies, in place; an `InputError` if shapes disagree or a node is not
+        below `node_count`.
+        """
         nodes = read_only_nodes(
             self.nodes, (None, None), name="nodes of the placement"
         )
@@ -77,7 +80,7 @@ def place_markers(
     max_distance_m: float | None = None,
     names: Sequence[str] | None = None,
 ) -> Placement:
-    """Find each marker's place on the body.
+    """Return each marker's place on the body.
 
     Parameters
     ----------
@@ -92,14 +95,16 @@ def place_markers(
         nearest to it. "auto": the nearest node if within 5 % of the mean edge length, else
         embedded.
     max_distance_m : float, optional
-        Largest distance between marker and body; by default the mean edge length.
+        Largest distance between marker and body, or, of a marker on a node, between marker and
+        node; by default the mean edge length.
     names : sequence of str, optional
-        Marker names for messages; indices by default.
+        Marker names for messages; indices from 0 by default.
 
     Raises
     ------
     InputError
-        If a marker has no position or is too far from the body.
+        If a marker has a position that is not finite or is too far from the body, the rule is
+        unknown, or names and positions differ in number.
     """
     points = read_only_floats(
         points_m, (None, 3), name="marker positions", finite=False
@@ -163,6 +168,17 @@ class LocatedBody:
     nodes_m : (n, 3) array
         Node positions.
     body : Body
+
+    Attributes
+    ----------
+    mean_edge_m : float
+        Mean length of the edges of the mesh.
+    origin : (E, 3) array
+        First corner of each element.
+    inverse : (E, 3, 3) array
+        Inverse of the matrix whose rows are the edges from that corner to the other three.
+    triangles : (F, 3, 3) array
+        Corners of the surface.
     """
 
     def __init__(self, nodes_m: Array, body: Body) -> None:
@@ -200,7 +216,10 @@ class LocatedBody:
 
     def nearest_cell(self, point: Array) -> tuple[int, float]:
         """Return the index of the element that contains a point (3,), or is nearest to it, and its
-        distance from the body [m], 0 inside.
+        distance from the surface [m], 0 inside. Elements are taken with straight edges.
+
+        If several elements share the nearest edge or corner, it is the one in which the least
+        barycentric coordinate of the point is largest.
         """
         depth = self.barycentric(point, slice(None)).min(axis=1)
         cell = int(np.argmax(depth))
@@ -218,7 +237,7 @@ class LocatedBody:
 
     def weights_at_nearest_point(self, point: Array) -> tuple[Index, Array]:
         """Return nodes (npe,) and weights (npe,) of the point of the body that is nearest to a
-        point (3,).
+        point (3,): the point itself if it is inside.
         """
         nodes, weights, distance = self.weights_at_point(point)
         if distance == 0.0:
@@ -258,10 +277,12 @@ class LocatedBody:
         return np.concatenate([-rest.sum(axis=1, keepdims=True), rest], axis=1)
 
     def _shape_functions_at(self, point: Array, cell: int) -> Array:
-        """Return the shape functions (npe,) of an element at a point (3,).
+        """Return the shape functions (npe,) of an element, by its index, at a point (3,), which may
+        be outside the element.
 
         Barycentric coordinates of the corners are exact for straight edges. In a quadratic element
-        with curved edges they are corrected iteratively until the element maps them to the point.
+        with curved edges they are corrected iteratively until the element maps them to the point;
+        the best iterate is returned, without a check.
         """
         one = np.array([cell])
         local = self.barycentric(point, one)
@@ -282,6 +303,8 @@ class LocatedBody:
 def nearest_points_of_triangles(point: Array, triangles: Array) -> Array:
     """Return the point (F, 3) of each triangle (F, 3, 3) that is nearest to one point (3,), or to
     the point (F, 3) of that triangle.
+
+    For a degenerate triangle with three distinct corners it lies on a side.
     """
     point = point[..., None, :]
     ends = np.roll(triangles, -1, axis=1)

@@ -78,6 +78,7 @@ class PoseSequence:
     interpolation: Interpolation = key(Interpolation, default="smooth")
 
     def __post_init__(self) -> None:
+        """Check the poses, see `first_pose_fault`, and normalise the quaternions, in place."""
         t_s = self.t_s
         m = len(self.t_s)
         if not m:
@@ -99,7 +100,9 @@ class PoseSequence:
 
     @classmethod
     def fixed(cls, t0_s: float = 0.0) -> PoseSequence:
-        """Return the identity pose for all time: grasped nodes stay where they are undeformed."""
+        """Return the identity pose for all time, as a single sample at `t0_s`: grasped nodes stay
+        where they are undeformed.
+        """
         return cls(
             np.array([t0_s]), np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]])
         )
@@ -161,7 +164,9 @@ class PoseSequence:
         )
 
     def with_shift(self, shift_m: ArrayLike) -> PoseSequence:
-        """Return the poses with a constant (3,) [m] added to their positions."""
+        """Return the poses with a constant (3,) [m], in the world's frame, added to each of their
+        positions.
+        """
         return replace(self, positions_m=self.positions_m + np.asarray(shift_m))
 
     def at(self, t_s: ArrayLike) -> tuple[Array, Array]:
@@ -226,7 +231,9 @@ class PoseSequence:
         return rotations, self.positions_m[k] + fraction * step_m
 
     def moved_positions(self, points_m: ArrayLike, t_s: ArrayLike) -> Array:
-        """Return positions (T, k, 3) [m] of undeformed points (k, 3) at the times `t_s` (T,)."""
+        """Return positions R X + p (T, k, 3) [m] of undeformed points X (k, 3) at the times `t_s`
+        (T,); errors as of `at`.
+        """
         rotations, translations = self.at(t_s)
         points = np.asarray(points_m, dtype=np.float64)
         return (
@@ -236,8 +243,8 @@ class PoseSequence:
 
     @cached_property
     def jumps_s(self) -> Array:
-        """Times (j,) of the samples after which the position or the rotation jumps [s]; empty
-        without jumps.
+        """Times (j,) of the samples after which the position or a component of the quaternion jumps
+        [s], see `jump_intervals`; empty without jumps.
         """
         of_position = jump_intervals(self.t_s, self.positions_m)
         of_rotation = jump_intervals(self.t_s, self.quaternions_xyzw)
@@ -267,7 +274,9 @@ class PoseSequence:
         return (self._rotations[:-1].inv() * self._rotations[1:]).as_rotvec()
 
     def _require_times_covered(self, times: Array) -> None:
-        """Raise an `InputError` if a time is over half a sample outside the sequence."""
+        """Raise an `InputError` if a time is over half a sample interval outside the sequence, or
+        NaN; the sequence must have at least two samples.
+        """
         first_step, last_step = np.diff(self.t_s)[[0, -1]]
         earliest = self.t_s[0] - max(0.5 * first_step, TIME_TOLERANCE_S)
         latest = self.t_s[-1] + max(0.5 * last_step, TIME_TOLERANCE_S)
@@ -283,10 +292,11 @@ class PoseSequence:
 def first_pose_fault(
     t_s: Array, positions_m: Array, quaternions_xyzw: Array
 ) -> tuple[int, str] | None:
-    """Return the index of the first unusable pose and what is wrong with it; None if all are fine.
+    """Return the index, from 0, of the first unusable pose and what is wrong with it; None if all
+    are fine.
 
     Values that are not finite are reported first, then times that do not increase, then quaternions
-    that are not of unit norm.
+    whose norm differs from 1 by more than `QUATERNION_NORM_TOLERANCE`.
     """
     finite = np.isfinite(
         np.column_stack([t_s, positions_m, quaternions_xyzw])
@@ -310,10 +320,12 @@ def first_pose_fault(
 
 
 def first_matrix_fault(t_s: Array, matrices: Array) -> tuple[int, str] | None:
-    """Return the index of the first of (m, 4, 4) matrices that is no rigid motion, and the reason.
+    """Return the index, from 0, of the first of (m, 4, 4) matrices that is no rigid motion, and the
+    reason; None if all are rigid motions.
 
-    None if all are rigid motions. This check is needed as SciPy silently orthonormalises any
-    matrix.
+    A rigid motion has finite values, the last row 0, 0, 0, 1 and a rotation: orthonormal with
+    positive determinant. The times `t_s` (m,) appear in the reason. This check is needed as SciPy
+    silently orthonormalises any matrix.
     """
     rotations = matrices[:, :3, :3]
     with np.errstate(invalid="ignore"):
@@ -363,11 +375,12 @@ def _unit_and_continuous(quaternions: Array) -> Array:
 
 
 def jump_intervals(t_s: Array, values: Array) -> Index:
-    """Return the indices of the intervals in which values (m, k) jump; interval i begins at sample
-    i.
+    """Return the indices of the intervals in which values (m, k) at times `t_s` (m,) jump; interval
+    i is from sample i to i + 1.
 
-    A jump is a change that is more than 10 times as fast as those just before and just after, and
-    not small compared with the range of the values. The first and the last interval are not tested.
+    A jump is a change that is more than 10 times as fast as the faster one of the intervals just
+    before and just after, and larger than a thousandth of the range of the values. The first and
+    the last interval are not tested.
     """
     change = np.linalg.norm(np.diff(values, axis=0), axis=1)
     rate = change / np.diff(t_s)
@@ -379,10 +392,11 @@ def jump_intervals(t_s: Array, values: Array) -> Index:
 
 
 def smooth_spline(t_s: Array, values: Array) -> PPoly:
-    """Return the cubic spline through values (m, k), m > 1, with two continuous derivatives.
+    """Return the cubic spline through values (m, k), m > 1, at times `t_s` (m,), with two
+    continuous derivatives ("not-a-knot" ends).
 
-    Across a jump the spline is linear, with separate splines on either side, as one spline would
-    overshoot near the jump. Three samples make a parabola and two a line.
+    Across a jump, see `jump_intervals`, the spline is linear, with separate splines on either side,
+    as one spline would overshoot near the jump. Three samples make a parabola and two a line.
     """
     broken = jump_intervals(t_s, values)
     coefficients = np.zeros((4, len(t_s) - 1, values.shape[1]))
@@ -413,15 +427,16 @@ def require_determined_motion(
     t_s : (T,) array
         Times of the recording's samples.
     interval_s : (float, float)
-        First and last time at which the grasp holds.
+        First and last time at which the grasp holds; may be infinite.
     file : str or Path
         File of the poses, for messages.
 
     Raises
     ------
     InputError
-        For a single pose, for poses that are missing for more than a sample at either end, and for
-        a smooth motion that is sampled below 1 Hz.
+        For a single pose; for a smooth motion that is sampled below 1 Hz; and for poses that are
+        missing for more than a sample at either end. The last is not reported if the poses cover
+        fewer than three samples, as they may be of another recording.
     """
     first_s = max(t_s[0], interval_s[0])
     last_s = min(t_s[-1], interval_s[1])

@@ -78,7 +78,13 @@ class SpecimenLayout:
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """Quantities that the table of this kind of test may have."""
+        """Quantities that the table of this kind of test may have.
+
+        All have strain, stress, displacement and force, and all but simple shear stretch;
+        "volumetric" tests have volume ratio, stretch, strain, pressure and stress only. The second
+        axis of "biaxial" and "planar" tests and a lateral stretch or strain are added where the
+        test has them, true stress if `stress` is "true".
+        """
         stresses = (
             (STRESS,) if self.stress == "engineering" else (STRESS, TRUE_STRESS)
         )
@@ -105,8 +111,9 @@ class SpecimenTable:
     t_s : (T,) array
         Times; the number of the row in seconds if the table has none.
     strain, stress_pa : (T,) array
+        Strain without NaN; stress NaN where the cell is blank.
     second_strain, second_stress_pa, lateral_stretch : (T,) array or None
-        None if the table has no such column.
+        None if the table has no such column; stress and stretch NaN where the cell is blank.
     is_incompressible : bool
         Whether true stresses were converted as those of an incompressible specimen.
     is_displacement : bool
@@ -123,7 +130,9 @@ class SpecimenTable:
     is_displacement: bool
 
     def rows(self, chosen: Index) -> dict[str, Array | None]:
-        """Return the arrays at chosen rows, by their indices, as arguments of `Specimen`."""
+        """Return the arrays at the rows `chosen`, indices from 0, by the names of the arguments of
+        `Specimen`; None for quantities without a column.
+        """
         arrays = {
             "t_s": self.t_s,
             "strain": self.strain,
@@ -140,13 +149,21 @@ class SpecimenTable:
 
 @names_file_in_errors
 def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
-    """Read the table of a material test.
+    """Read the table of a material test, and convert it to engineering stresses, positive in
+    tension.
+
+    Parameters
+    ----------
+    path : str or Path
+    layout : SpecimenLayout
+        Meaning of the columns.
 
     Raises
     ------
     InputError
-        If a column is missing, repeated or in an unknown unit, a cell is not a number, time does
-        not increase, or length or area of the specimen are needed; the line is named.
+        If a column is missing, repeated or in an unknown unit, a cell is not a number, a strain is
+        blank or not possible, time does not increase, or length or area of the specimen are needed;
+        file and line are named.
     """
     if layout.test == "simple-shear" and "stretch" in layout.columns:
         raise InputError(
@@ -193,12 +210,20 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
 def _one_of(
     table: QuantityTable, quantities: tuple[Quantity, ...], what: str
 ) -> Quantity:
-    """Return the only quantity of several that a table has.
+    """Return the only one of several quantities that a table has.
+
+    Parameters
+    ----------
+    table : QuantityTable
+    quantities : tuple of Quantity
+        Alternatives.
+    what : str
+        Common name of the alternatives, for the message.
 
     Raises
     ------
     InputError
-        If it has none or more than one.
+        If the table has none or more than one.
     """
     there = [
         quantity for quantity in quantities if quantity.key in table.values
@@ -225,7 +250,17 @@ def _complete(table: QuantityTable, quantity: Quantity) -> Array:
 
 
 def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
-    """Return the strain (T,) of the test."""
+    """Return the strain (T,) of the test, as `Specimen` defines it.
+
+    `strain_sign` applies to strains and displacements, not to stretches and volume ratios. A strain
+    of a volumetric test is that of the volume, J − 1.
+
+    Raises
+    ------
+    InputError
+        If not exactly one kind of deformation is there, a cell is blank, a displacement has no
+        `length_m`, or a size is not positive (not tested in simple shear).
+    """
     known = (STRETCH, STRAIN, DISPLACEMENT, VOLUME_RATIO)
     possible = tuple(
         quantity for quantity in known if quantity in layout.quantities
@@ -259,7 +294,9 @@ def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
 def _require_positive(
     table: QuantityTable, quantity: Quantity, ratio: Array
 ) -> None:
-    """Raise an `InputError` if a ratio (T,) of deformed to undeformed size is not positive."""
+    """Raise an `InputError` if a ratio (T,) of deformed to undeformed size is not positive
+    everywhere; it names the first such row and the likely cause for `quantity`.
+    """
     if (ratio > 0).all():
         return
     row = int(np.argmax(ratio <= 0))
@@ -278,7 +315,14 @@ def _require_positive(
 def _second_strain(
     table: QuantityTable, layout: SpecimenLayout
 ) -> Array | None:
-    """Return the strain (T,) along the second axis; None unless the test is biaxial."""
+    """Return the strain (T,) along the second axis; None unless the test is biaxial.
+
+    Raises
+    ------
+    InputError
+        If there is not exactly one of second stretch and second strain, a cell is blank, or a
+        stretch is not positive.
+    """
     if layout.test != "biaxial":
         return None
     quantity = _one_of(
@@ -299,7 +343,9 @@ def _second_strain(
 def _lateral_stretch(
     table: QuantityTable, layout: SpecimenLayout
 ) -> Array | None:
-    """Return the lateral stretch (T,); None if the table has none."""
+    """Return the lateral stretch (T,), from the stretch or else from 1 plus the signed strain, NaN
+    where blank; None if the table has neither.
+    """
     if LATERAL_STRETCH.key in table.values:
         return table.values[LATERAL_STRETCH.key]
     if LATERAL_STRAIN.key in table.values:
@@ -308,7 +354,17 @@ def _lateral_stretch(
 
 
 def _stress_pa(table: QuantityTable, layout: SpecimenLayout) -> Array:
-    """Return the stress (T,) as the table has it, positive in tension [Pa]."""
+    """Return the stress (T,) as the table has it, positive in tension [Pa]: engineering or true, a
+    force over `area_m2`, or minus the pressure; NaN where blank.
+
+    `stress_sign` applies to all but pressures.
+
+    Raises
+    ------
+    InputError
+        If not exactly one kind of load is there, or a force has no area or is stated as true
+        stress.
+    """
     known = (STRESS, TRUE_STRESS, FORCE, PRESSURE)
     possible = tuple(
         quantity for quantity in known if quantity in layout.quantities
@@ -336,8 +392,11 @@ def _area_ratios(
     second_strain: Array | None,
     lateral: Array | None,
 ) -> tuple[Array, Array]:
-    """Return the deformed over the undeformed area (T,) of the faces of the first and of the
-    second stress.
+    """Return the deformed over the undeformed area (T,) of the faces of the first and of the second
+    stress.
+
+    Both are 1 in "confined", "simple-shear" and "volumetric" tests. Otherwise they follow from the
+    stretches, with the lateral stretch of an incompressible specimen where `lateral` is None.
     """
     stretch = 1 + strain
     if layout.test in ("confined", "simple-shear", "volumetric"):
@@ -355,8 +414,8 @@ def _area_ratios(
 
 
 def specimen_strains(experiment: Experiment) -> tuple[Array, Array]:
-    """Return the first and the second strain (T,) of the experiment of a specimen; the second is
-    zero unless the test is biaxial.
+    """Return the first and the second strain (T,) of the experiment of a specimen, from the poses
+    of its grasps; the second is zero unless the test is biaxial.
     """
     deformation = experiment.specimen
     assert deformation is not None
@@ -376,14 +435,19 @@ def specimen_columns(
 ) -> dict[str, Array]:
     """Return the columns (T,) of the table of a specimen by name, as `read_specimen` reads them.
 
+    Deformations are written as stretches, those of simple shear as strains and of volumetric tests
+    as volume ratios with pressures; stresses are true or engineering as `layout.stress` states, and
+    signs as `layout` states.
+
     Parameters
     ----------
     experiment : Experiment
         Experiment of a specimen.
     values : mapping of str to (T,) array
-        Values of its sensors by name.
+        Values of its sensors by name, at the sample times; a stress or stretch that is not there
+        has no column.
     layout : SpecimenLayout
-        Meaning of the columns, with the names that the user gives them.
+        Meaning of the columns; the names of the columns are the standard ones of the quantities.
     """
     strain, second_strain = specimen_strains(experiment)
     lateral = values.get(LATERAL_NAME)

@@ -68,6 +68,14 @@ class Tendon(Actuator[PolylineLength]):
     offset_field: ClassVar[str] = "loss_n"
 
     def __post_init__(self) -> None:
+        """Check points and tension, and store the tension as `declared_values`, in place.
+
+        Raises
+        ------
+        InputError
+            If there are fewer than two points, two successive points coincide, or a tension is
+            negative.
+        """
         points = self.points_m
         name = self.name
         if len(points) < 2:

@@ -340,7 +340,7 @@ def read_custom_sensor(
 def is_within_experiment(
     sample_times_s: Array, t_s: Array, name: str, is_static: bool
 ) -> NDArray[np.bool_]:
-    """Return which samples lie within an experiment's times, as (S,) bool.
+    """Return which samples lie within an experiment's times, as (S,) bool; its ends are included.
 
     Parameters
     ----------

@@ -101,12 +101,14 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
 
 
 def _header_counts(content: bytes) -> tuple[int, int | None]:
-    """Return the numbers of points and frames in the header; None frames if the counter overflowed.
+    """Return the numbers of points and frames in the header; None for the frames if their counter
+    overflowed.
 
     Raises
     ------
     InputError
-        If the file is shorter than these numbers require: ezc3d would silently return the rest.
+        If the header is incomplete or states no points or frames, or the file is shorter than these
+        numbers require: ezc3d would silently return the rest.
     """
     start = _BLOCK * (content[0] - 1)
     if len(content) < max(start + 4, _BLOCK):

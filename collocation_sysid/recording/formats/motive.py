@@ -109,13 +109,20 @@ def _column_headings(
 def _marker_columns(
     heads: Sequence[tuple[str, str, str, str]], line: int
 ) -> dict[str, _MarkerColumns]:
-    """Return the columns of every marker by its name; measured columns have priority over fitted
-    ones.
+    """Return the columns of every marker by its name, in the order of the columns; measured columns
+    have priority over fitted ones.
+
+    Parameters
+    ----------
+    heads : sequence of (str, str, str, str)
+        Type, name, quantity and axis of every column.
+    line : int
+        Line of the axes, for messages.
 
     Raises
     ------
     InputError
-        If two markers have one name, or a marker lacks an axis.
+        If two markers of one type have one name, or a marker lacks an axis.
     """
     by_kind: dict[tuple[str, str], dict[str, int]] = {}
     for column, (kind, name, quantity, axis) in enumerate(heads):

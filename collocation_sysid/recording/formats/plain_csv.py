@@ -19,7 +19,15 @@ from .units import METRES_PER_UNIT
 
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
-    """Read a plain CSV file, wide or long; `choose` picks the markers."""
+    """Read a plain CSV file, wide or long (with a column "marker"); `choose` returns the indices of
+    the markers to read from their labels.
+
+    Raises
+    ------
+    InputError
+        If columns are missing or unknown, a cell is neither blank nor a number, or time does not
+        increase.
+    """
     table = read_table(text)
     return (_read_long if "marker" in table.columns else _read_wide)(
         table, choose
@@ -45,7 +53,7 @@ def _read_wide(table: TextTable, choose: LabelChooser) -> RawTracks:
 
 
 def _wide_labels(table: TextTable) -> list[str]:
-    """Names of the markers in the file, in the order of their first columns.
+    """Return the names of the markers in the file, in the order of their first columns.
 
     Raises
     ------
