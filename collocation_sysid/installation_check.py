@@ -258,7 +258,7 @@ def check_installation() -> InstallationReport:
 
 
 def required_packages() -> Iterator[Dependency]:
-    """Yield the required packages in the order of the alphabet.
+    """Yield the required packages of this platform in the order of the alphabet.
 
     Without the library that compares versions, only that library is yielded, as unsuitable.
     """
@@ -271,7 +271,7 @@ def required_packages() -> Iterator[Dependency]:
 
 
 def optional_packages() -> Iterator[Extra]:
-    """Yield the extras in the order of the alphabet, without those for development.
+    """Yield the extras in the order of the alphabet, without `DEVELOPMENT_EXTRAS`.
 
     Nothing is yielded without the library that compares versions.
     """
@@ -287,7 +287,9 @@ def optional_packages() -> Iterator[Extra]:
 
 
 def _requirements(extra: str) -> Iterator[Requirement]:
-    """Yield the requirements of an extra on this platform, or of the package itself for ""."""
+    """Yield the requirements of an extra on this platform, without those of the package itself; or
+    those of the package itself for "".
+    """
     from packaging.requirements import Requirement
 
     for text in metadata.requires(PACKAGE) or []:
@@ -345,10 +347,12 @@ def available_solvers() -> Solvers | None:
 
 
 def _working_linear_solvers(names: Sequence[str]) -> Iterator[str]:
-    """Yield the linear solvers with which IPOPT solves a small problem.
+    """Yield those of the named linear solvers with which IPOPT solves a small problem, in the given
+    order.
 
     The problem is solved in other processes, because IPOPT crashes with some libraries that are
-    missing. After a crash a new process continues with the next solver.
+    missing. After a crash a new process continues with the next solver; after a timeout of
+    `SOLVER_TIME_S` the remaining solvers are not tried.
     """
     remaining = list(names)
     while remaining:
@@ -379,7 +383,7 @@ def _working_linear_solvers(names: Sequence[str]) -> Iterator[str]:
 def kernel_state() -> Kernels | None:
     """Return the compiler and the cache of kernels; None if they cannot be imported.
 
-    The folder is created if necessary.
+    The folder of the cache is created if necessary.
     """
     try:
         import llvmlite
@@ -405,7 +409,9 @@ def kernel_state() -> Kernels | None:
 
 
 def thread_state() -> Threads:
-    """Return the number of threads and what determines it."""
+    """Return the number of threads and what determines it; 1 if the environment variable is not a
+    whole number.
+    """
     from .common.machine import machine_memory_mb
 
     variable = "COLLOCATION_SYSID_THREADS"
@@ -430,7 +436,9 @@ def thread_state() -> Threads:
 
 
 def _self_test_unless_missing(dependencies: Sequence[Dependency]) -> SelfTest:
-    """Return the outcome of the self test; it fails without an attempt if packages are missing."""
+    """Return the outcome of the self test, which fails without an attempt if packages are missing;
+    any exception of the test is its outcome, not raised.
+    """
     missing = [each.name for each in dependencies if each.installed is None]
     if missing:
         return SelfTest(

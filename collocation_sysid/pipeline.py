@@ -86,8 +86,8 @@ class Run(SolvedProblem):
         return build_result(self)
 
     def table(self) -> str:
-        """Return parameters, combined intervals, their sources and the verdict, as printed in the
-        terminal.
+        """Return parameters, combined intervals, their sources and the verdict as text, as printed
+        in the terminal.
         """
         from .result.run_sections import (
             estimate_sections,
@@ -172,9 +172,10 @@ class Run(SolvedProblem):
     def save(
         self, folder: str | Path, frames: bool = True, pictures: bool = True
     ) -> Path:
-        """Write the run folder, completely or not at all, and return it.
+        """Write the run folder, completely or not at all, and return its path.
 
-        The pictures are drawn after the folder is in its place.
+        An earlier run in the folder is replaced. The pictures are drawn after the folder is in its
+        place.
 
         Parameters
         ----------
@@ -208,8 +209,8 @@ def run(
 ) -> Run:
     """Solve a problem, simulate every experiment with the answer, and estimate uncertainties.
 
-    Once there is an answer, Ctrl-C only ends the steps that follow: `Run.missing` states which
-    results are missing.
+    Once there is an answer, Ctrl-C only ends the steps that follow: `Run.omitted_checks` states
+    which results are missing.
 
     Parameters
     ----------
@@ -217,9 +218,11 @@ def run(
     method, watch, start, scheduler
         See `solve`.
     log : callable, optional
-        Called with a text at the beginning of each step.
+        Called with a text at the beginning of each step after the solve.
     seek_causes : bool
-        Whether to test hypotheses about the cause of a misfit, see `find_misspecifications`.
+        Whether to test hypotheses about the cause of a misfit, see `find_misspecifications`;
+        without them there are no solves with finer discretisations either, even if the problem
+        requests these.
     probe : bool
         Whether to refit subsets of the data and to relax each assumption, see `deep_probes`.
 
@@ -231,7 +234,7 @@ def run(
     Raises
     ------
     InputError
-        If `solve` raises it.
+        If `solve` raises it, or a stated uncertainty or requested profile is not possible.
     """
     say = log or (lambda _: None)
     began_s = time.perf_counter()
@@ -239,7 +242,9 @@ def run(
     searched_s = time.perf_counter()
 
     def timed(answer: Run) -> Run:
-        """Return the answer with the time until now; a search with finer steps is no check."""
+        """Return the answer with the times of search and checks until now; a search with finer
+        steps counts as search.
+        """
         finer_s = answer.solution.timing.total - solution.timing.total
         checks_s = time.perf_counter() - searched_s - finer_s
         return replace(
@@ -319,7 +324,14 @@ def _checked(
     """Return a solution with forward simulations, uncertainties and step error, and the linearised
     fit.
 
-    The fit is None if the solution did not converge or cannot be linearised.
+    The fit is None if the solution did not converge or cannot be linearised; the run then has
+    forward simulations only, and in the latter case a note. A problem without free parameters has a
+    fit and diagnoses of the residuals, but no uncertainties.
+
+    Raises
+    ------
+    InputError
+        If the stated uncertainties do not fit the problem; the error names its file.
     """
     say("checking the result by a forward simulation")
     rollouts = simulate_experiments(problem, solution)
@@ -375,7 +387,7 @@ def _changes(answer: Run, say: Log) -> ResidualChanges:
 
 
 def _row_count(solution: Solution) -> int:
-    """Return the number of time steps in one sweep over all experiments."""
+    """Return the number of time steps in one sweep over all fitted experiments."""
     return sum(
         s.grid_times - s.dynamics.first_row
         for s in solution.collocation.transcriptions
@@ -388,7 +400,19 @@ def _sources(
     known: Uncertainty,
     changes: ResidualChanges,
 ) -> VarianceSources:
-    """Return the systematic contributions to the uncertainty, without effects stated as exact."""
+    """Return the systematic contributions to the uncertainty, without effects stated as exact (a
+    deviation of None).
+
+    Parameters
+    ----------
+    answer : Run
+    fit : LinearisedFit
+        Fit at the solution.
+    known : Uncertainty
+        Statistical uncertainty.
+    changes : ResidualChanges
+        Changes of the residuals by all effects.
+    """
     solution = answer.solution
     deviations = answer.problem.uncertainty.assumptions.deviations
     parameters = solution.collocation.parameters
@@ -433,7 +457,14 @@ def _probes(
 
 
 def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
-    """Return the profile likelihoods that the problem requests."""
+    """Return the profile likelihoods that the problem requests, in that order; the run must have
+    uncertainties.
+
+    Raises
+    ------
+    InputError
+        For a name without a profile; the error names the problem file.
+    """
     profiles = []
     assert answer.uncertainty is not None
     for name in answer.problem.uncertainty.profile:
@@ -460,20 +491,39 @@ def _fine_enough(
     say: Log,
     scheduler: str | None,
 ) -> tuple[Run, LinearisedFit | None]:
-    """Return the run solved again with as many substeps as its uncertainties require.
+    """Return the run solved again with as many substeps as its uncertainties require, or `coarse`
+    itself if it has enough, or no step error.
 
     The answer may already have several substeps, if it was started from such a run. A parameter
     that ended at a bound has no standard error, and coarse steps may have driven it there: it
-    starts
-    from its guess again. If every parameter ended at a bound, the largest number of substeps is
-    used.
+    starts from its guess again. If every parameter ended at a bound, the largest number of substeps
+    is used.
+
+    Parameters
+    ----------
+    coarse : Run
+    fit : LinearisedFit or None
+        Fit of that run.
+    solver : Method
+        Method of the second solve.
+    watch : callable or None
+        Called with each entry of its history.
+    say : callable
+        Called with a text before it.
+    scheduler : str or None
+        Address of a Dask scheduler; None to solve in this process.
 
     Returns
     -------
     Run
-        `coarse` with a note if the refined problem was not solved.
+        `coarse` with a note if the solve with finer steps failed or did not converge.
     LinearisedFit or None
         The fit of the returned run.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If the second solve was interrupted.
     """
     if coarse.refinement is None or fit is None:
         return coarse, fit

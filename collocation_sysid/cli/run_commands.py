@@ -134,7 +134,14 @@ def export(options: ExportCommand) -> None:
 def _export_body(
     options: ExportCommand, destination: ExportDestination
 ) -> None:
-    """Write the body of a run for a simulator, and print what the simulator cannot express."""
+    """Write the body of a run for a simulator, and print warnings, what the simulator cannot
+    express, the comparison if the export is verified, and the destination; or all of this as JSON.
+
+    Raises
+    ------
+    InputError
+        If run, experiment or destination are not usable.
+    """
     from ..extras.export import (
         TARGETS,
         IdentifiedBody,
@@ -180,7 +187,8 @@ def _export_body(
 def _export_recording(
     options: ExportCommand, destination: ExportDestination
 ) -> None:
-    """Write the recording of a run for the Rerun viewer, and print what is missing in it.
+    """Write the recording of a run for the Rerun viewer, and print what is missing in it and the
+    file; or both as JSON.
 
     Raises
     ------

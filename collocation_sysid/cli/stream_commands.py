@@ -46,7 +46,13 @@ class LiveEstimationOptions(Options):
     allow_code: AllowCode = False
 
     def make_estimator(self, recording: Path) -> LiveEstimator:
-        """Return the estimator for a problem file or a run folder, with these options."""
+        """Return the estimator for a problem file or a run folder, with these options.
+
+        Raises
+        ------
+        InputError
+            If the problem is not usable, or not for a live estimate.
+        """
         budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
         problem = read_problem(recording, self.set_ or (), self.allow_code)
         return LiveEstimator(problem, LiveOptions(budget_s, self.window_s))

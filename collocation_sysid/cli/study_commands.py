@@ -245,7 +245,7 @@ def sweep(options: SweepCommand) -> None:
 
 
 def _single_method(text: str | None) -> str | None:
-    """Return the method named by --method, or None if the option is not used.
+    """Return the method named by --method, or None if the option is not used (`text` is None).
 
     Raises
     ------

@@ -50,6 +50,9 @@ def require_frictionless(obstacles: Iterable[Obstacle]) -> None:
 def solve_complementarity(first: Solution, solve: Solve) -> Solution:
     """Return the solution with contact as complementarity.
 
+    Pressure times gap takes the values `RELAXED` κδ² in turn; each solve starts from the previous
+    solution.
+
     Parameters
     ----------
     first : Solution
@@ -60,7 +63,9 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
     Returns
     -------
     Solution
-        Last solution; an earlier one if its solve did not converge.
+        Solution of the last solve, with the history and the times of all; the sequence ends with
+        the first solve that does not converge. It has no `initial_multipliers`, and a note on the
+        solves.
     """
     obstacles_by_experiment = {
         segment.experiment.name: reachable_obstacles(
@@ -108,8 +113,8 @@ def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
     Returns
     -------
     list of Obstacle
-        One per obstacle, with the faces that come within `REACH` edges of it; unchanged if none
-        does.
+        One per obstacle, with the faces that come within `REACH` of their mean edges of it; an
+        obstacle that no face comes near is unchanged.
     """
     obstacles = []
     mesh = experiment.body.mesh

@@ -338,7 +338,9 @@ class CondensedCollocation(Collocation):
         return lower[self._remaining[0]], upper[self._remaining[0]]
 
     def complete_variables(self, z: Array) -> Array:
-        """Return the variables of the complete program from z."""
+        """Return the variables of the complete program from z, with the eliminated positions at
+        their values for the φ in z.
+        """
         variables = np.empty(self.complete.variable_count)
         variables[self._remaining[0]] = z
         for each, (positions, _) in zip(
@@ -351,7 +353,8 @@ class CondensedCollocation(Collocation):
         self, z: Array, loss_weight: float, multipliers: Array
     ) -> Array:
         """Return the multipliers of all constraints of the complete program; those of eliminated
-        constraints make the Lagrangian stationary in the eliminated positions.
+        constraints make the Lagrangian stationary in the eliminated positions, also where z is no
+        optimum.
 
         Parameters
         ----------
@@ -390,7 +393,9 @@ class CondensedCollocation(Collocation):
         return self.complete.objective(self.complete_variables(z))
 
     def gradient(self, z: Array) -> Array:
-        """Return ∂objective/∂z (variables,)."""
+        """Return ∂objective/∂z (variables,) by the remaining variables, including the dependence
+        through the eliminated positions on φ.
+        """
         slope = self.complete.gradient(self.complete_variables(z))
         for each, (_, by_phi) in zip(
             self.eliminated, self._prescribed(z), strict=True
@@ -399,7 +404,7 @@ class CondensedCollocation(Collocation):
         return slope[self._remaining[0]]
 
     def constraint_values(self, z: Array) -> Array:
-        """Return the scaled constraints g (constraints,)."""
+        """Return the scaled values (constraints,) of the constraints g that remain."""
         return self.complete.constraint_values(self.complete_variables(z))[
             self._remaining[1]
         ]
@@ -537,8 +542,8 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
-        """Indices, in the values of the Hessian, of the diagonal entries of q and of the
-        positions.
+        """Indices, in the values of the Hessian, of the diagonal entries of q, and of those of the
+        positions that remain.
         """
         places = np.full(len(self.complete.hessian_structure[1]), -1)
         places[self._hessian.remaining] = self._hessian.targets[0]

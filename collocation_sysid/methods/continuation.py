@@ -67,6 +67,7 @@ class Continuation(Options):
     stage: Mapping[str, Any] | Callable[..., Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        """Raise an `InputError` for invalid shares or a stage that is no method, see `method`."""
         super().__post_init__()
         self.method  # noqa: B018 - refuses a stage that makes no sense
 
@@ -113,15 +114,17 @@ class Continuation(Options):
 
 
 def first_samples(experiment: Experiment, count: int) -> Experiment:
-    """Return the experiment with its first samples.
+    """Return the experiment with its first samples; depth cameras without a point in them are left
+    out.
 
     Parameters
     ----------
     experiment : Experiment
         Experiment.
     count : int
-        Number of samples; it is increased to three, and to the first sample with a marker or with a
-        depth image.
+        Number of samples; it is increased to three, to the first sample with a marker, and until
+        every depth camera has points and three images (one if static), but not beyond the
+        recording.
     """
     markers = experiment.markers
     stop = min(
@@ -208,7 +211,12 @@ class _ContinuationState:
         return solution.status not in (Status.INTERRUPTED, Status.REFUSED)
 
     def solution(self) -> Solution:
-        """Return the solution of the last part as a solution of the complete problem."""
+        """Return the solution of the last part as a solution of the complete problem, after at
+        least one part was solved.
+
+        If the last part is not the complete problem, missing positions are simulated or move
+        rigidly, and the solution has no multipliers of the method.
+        """
         assert self.last is not None
         assert self.known is not None
         last = self.last
@@ -258,7 +266,8 @@ def _continue_variables(
     """Return variables z from parameters p (np,) and the first rows of positions [m] of each
     experiment.
 
-    The missing rows are simulated or, if that fails, those of a rigid motion with the grasp.
+    The missing rows are simulated or, from where that fails, those of a rigid motion with the
+    grasp; surplus rows are cut.
     """
     parts = collocation.iterates_at(p, positions)
     known, _ = simulate_trajectories(

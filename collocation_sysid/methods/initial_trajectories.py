@@ -181,7 +181,7 @@ def complete_variables(
     p: Array,
     known_rows: Sequence[Array] | None = None,
 ) -> Array:
-    """Return variables z from parameters and the first rows of every trajectory.
+    """Return variables z (variables,) from parameters and the first rows of every trajectory.
 
     Missing rows are those of `rigid_trajectory`.
 
@@ -192,7 +192,7 @@ def complete_variables(
     p : (np,) array
         Shared and nuisance parameters (q, φ).
     known_rows : sequence of (k, 3n) array, optional
-        First rows of every trajectory [m]; none by default.
+        First rows of every trajectory [m]; none by default, as for None.
     """
     trajectories = []
     for part in collocation.iterates_at(
@@ -217,10 +217,11 @@ def _empty_trajectories(collocation: Collocation) -> list[Array]:
 
 
 def rigid_trajectory(transcription: Transcription, theta: Array) -> Array:
-    """Return a trajectory (N, 3n) in which the initial shape moves rigidly with the grasp [m].
+    """Return a trajectory (N, 3n) in which the initial shape moves rigidly with the grasp [m], on
+    all times of the grid.
 
-    Grasped nodes have their prescribed positions. The initial shape is the initial equilibrium at
-    constants `theta` (k,) or, if that fails, the undeformed shape.
+    Grasped nodes have their prescribed positions at the guess of φ. The initial shape is the
+    initial equilibrium at constants `theta` (k,) or, if that fails, the undeformed shape.
     """
     experiment = transcription.experiment
     t_s = transcription.dynamics.t_s

@@ -373,7 +373,13 @@ class _DampedHessian:
     """Hessian of the Lagrangian with the warm-up and proximal terms of the options.
 
     It depends on the sequence of calls: each call compares the parameters with those of the
-    previous call.
+    previous call, and adapts the damping.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Program that is passed to IPOPT.
+    options : InteriorPoint
     """
 
     def __init__(
@@ -413,8 +419,10 @@ class _DampedHessian:
             values[self._of_q] += weight * self._damping * largest
 
     def _ends_warm_up(self, p: Array) -> bool:
-        """Return whether the step to p (np,) was short, and not because of damping; p is stored and
-        the damping adapted to the length of the step.
+        """Return whether the exact Hessian may be used at p (np,): the step from the previous p is
+        shorter than `warm_up` in every parameter and the damping is negligible, or `warm_up` is 0.
+
+        p is stored, and the damping, at most 1, adapted to the length of the step of q.
         """
         steps = np.abs(p - self._last_p) / self.collocation.reach_p
         self._last_p = p

@@ -226,7 +226,8 @@ class Solution:
         first : Solution
             Solve that ended before this one began.
         why : str
-            Reason for the second solve; it is inserted between the notes of both.
+            Reason for the second solve; it is inserted between the notes of both, also if it is
+            empty.
         """
         previous_iterations = max(
             [first.iterations, *(line.number for line in first.history[-1:])]
@@ -267,7 +268,9 @@ class Solution:
 
     @property
     def q(self) -> Array:
-        """Estimated shared parameters (nq,) in the transformed coordinates of the solver."""
+        """Estimated shared parameters (nq,) in the transformed coordinates of the solver, a view of
+        `z`.
+        """
         return self.z[: self.collocation.nq]
 
     @property
@@ -482,15 +485,16 @@ def wrench_rms(
 def custom_sensor_rms(
     experiment: Experiment, predicted: Mapping[str, Array]
 ) -> dict[str, float]:
-    """Return the RMS residuals of custom sensors by name, in the unit of each sensor.
+    """Return the RMS residuals of custom sensors by name, in the unit of each sensor, over all its
+    values.
 
     Parameters
     ----------
     experiment : Experiment
         Experiment with the measured values.
     predicted : mapping of str to (S, m) array
-        Predicted values by sensor name. Samples that are NaN, predicted or measured, are ignored; a
-        sensor without any other has the value NaN.
+        Predicted values by sensor name, for each sensor of the experiment. Samples that are NaN,
+        predicted or measured, are ignored; a sensor without any other has the value NaN.
     """
     residuals = (
         (g.name, predicted[g.name] - g.measured_values)
@@ -582,7 +586,9 @@ def constraint_multipliers(
     """
 
     def of_experiment(iterate: ExperimentIterate) -> Array:
-        """Return the multipliers of one experiment's equations of motion."""
+        """Return the multipliers of one experiment's equations of motion, of its prescribed
+        displacements zero.
+        """
         segment = iterate.segment
         gradient = collocation.loss_scale * iterate.gradient()[0]
         solver = Sweep(segment, stopwatch=stopwatch)

@@ -155,7 +155,8 @@ def start_problem(
 def rescue(
     collocation: Collocation, reason: str, is_complete: bool = False
 ) -> Scan | None:
-    """Return a scan without the given guesses; None if it finds no start.
+    """Return a scan without the given guesses; None if no modulus is free on a logarithmic scale,
+    or the body cannot be simulated at any stiffness.
 
     Parameters
     ----------
@@ -442,6 +443,11 @@ def _compared_samples(transcription: Transcription) -> int:
 
 class _TrialSimulation:
     """Simulation of the first part of every recording, and its misfit.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem with units of all parameters.
 
     Attributes
     ----------

@@ -153,8 +153,8 @@ class SimulationResult:
 def trajectory_positions(
     trajectory: SweepResult | SimulationResult | Array,
 ) -> Array:
-    """Return the positions (rows, 3n) [m] of a sweep result, a simulation, or an array of
-    positions.
+    """Return the positions (rows, 3n) [m] of a sweep result (before its feasibility step) or of a
+    simulation; an array of positions is returned as it is.
     """
     return trajectory if isinstance(trajectory, np.ndarray) else trajectory.x
 

@@ -9,7 +9,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    Generic,
+    NamedTuple,
+    Self,
+    TypeVar,
+)
 
 import casadi as ca
 
@@ -22,6 +30,24 @@ if TYPE_CHECKING:
     from ..fem.body import Body
 
 S = TypeVar("S", PolylineLength, EnclosedVolume)
+
+
+class Calibration(NamedTuple):
+    """Calibration of an actuator.
+
+    Attributes
+    ----------
+    factor : float
+        Factor on the stated tension or pressure.
+    offset : float
+        Part of the tension [N] or pressure [Pa] that is lost.
+    log_lag_ratio : float
+        Logarithm of the ratio of its lag to the stated lag.
+    """
+
+    factor: float
+    offset: float
+    log_lag_ratio: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +121,15 @@ class Actuator(ABC, Generic[S]):
         return self.body_measure.measure
 
     @property
-    def calibration(self) -> tuple[float, float, float]:
-        """Factor, offset, and logarithm of the lag over the stated lag, as stated: zero."""
-        return self.factor, getattr(self, self.offset_field), 0.0
+    def calibration(self) -> Calibration:
+        """Stated calibration: factor and offset of the actuator, and zero for the logarithm of the
+        ratio of its lag to the stated one.
+        """
+        return Calibration(
+            self.factor,
+            offset=getattr(self, self.offset_field),
+            log_lag_ratio=0.0,
+        )
 
     def with_calibration(
         self, factor: float, offset: float, log_lag_ratio: float
@@ -119,7 +151,7 @@ class Actuator(ABC, Generic[S]):
         """Return the amplitude c for a calibration, as an expression of `input_data` (d,) at one
         time; without a lag `log_lag_ratio` is ignored.
         """
-        return self.energy_amplitude(data, factor, offset)
+        return self.energy_amplitude(data, factor, offset=offset)
 
     @abstractmethod
     def energy_amplitude(
@@ -133,7 +165,9 @@ class Actuator(ABC, Generic[S]):
         """Return the amplitude c at the times `t_s` (T,), as (T,), with the actuator's own
         calibration.
         """
-        factor, offset, _ = self.calibration
+        calibration = self.calibration
         return self.energy_amplitude(
-            self.declared_values.values_at(t_s), factor, offset
+            self.declared_values.values_at(t_s),
+            calibration.factor,
+            offset=calibration.offset,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -177,6 +177,24 @@ def _checked_ends(value: Any) -> Array:
     return ends
 
 
+class CylindricalCoordinates(NamedTuple):
+    """Place of a point relative to the axis of a solid of revolution.
+
+    Attributes
+    ----------
+    axial_m : SX
+        Distance along the axis from its middle [m], positive towards the second end.
+    radial_m : SX
+        Distance from the axis [m], at least 0.
+    half_length_m : float
+        Half of the length of the axis [m].
+    """
+
+    axial_m: ca.SX
+    radial_m: ca.SX
+    half_length_m: float
+
+
 @declaration
 class _AxialSolid(Solid):
     """A solid of revolution about an axis between two ends."""
@@ -195,21 +213,15 @@ class _AxialSolid(Solid):
         quarters = range(0, len(first) - 1, (len(first) - 1) // 4)
         return [first, last, *(np.array([first[k], last[k]]) for k in quarters)]
 
-    def _cylindrical_coordinates(
-        self, point: ca.SX
-    ) -> tuple[ca.SX, ca.SX, float]:
-        """Return the cylindrical coordinates of a point (3,) and half of the length of the axis
-        [m].
-
-        The coordinates are the distance along the axis from its middle, and the distance from the
-        axis.
-        """
+    def _cylindrical_coordinates(self, point: ca.SX) -> CylindricalCoordinates:
+        """Return the cylindrical coordinates of a point (3,) [m] about the axis of the solid."""
         first, last = self.ends_m
         half = float(np.linalg.norm(last - first)) / 2
         axis = ca.DM((last - first) / (2 * half))
         offset = point - ca.DM((first + last) / 2)
         axial = ca.dot(axis, offset)
-        return axial, _length(offset - axial * axis), half
+        radial = _length(offset - axial * axis)
+        return CylindricalCoordinates(axial, radial, half_length_m=half)
 
 
 @declaration
@@ -231,8 +243,11 @@ class Cylinder(_AxialSolid):
         """Return the signed distance of a point (3,) from the cylinder [m]; negative inside, where
         it is that to the nearest of the side and the ends.
         """
-        axial, radial, half = self._cylindrical_coordinates(point)
-        beyond = ca.vertcat(radial - self.radius_m, ca.fabs(axial) - half)
+        place = self._cylindrical_coordinates(point)
+        beyond = ca.vertcat(
+            place.radial_m - self.radius_m,
+            ca.fabs(place.axial_m) - place.half_length_m,
+        )
         return _corner_distance(beyond + self.rounding_m) - self.rounding_m
 
 
@@ -249,9 +264,9 @@ class Capsule(_AxialSolid):
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
         """Return the signed distance of a point (3,) from the capsule [m]; negative inside."""
-        axial, radial, half = self._cylindrical_coordinates(point)
-        beyond = ca.fmax(ca.fabs(axial) - half, 0)
-        return _length(ca.vertcat(beyond, radial)) - self.radius_m
+        place = self._cylindrical_coordinates(point)
+        beyond = ca.fmax(ca.fabs(place.axial_m) - place.half_length_m, 0)
+        return _length(ca.vertcat(beyond, place.radial_m)) - self.radius_m
 
 
 @declaration

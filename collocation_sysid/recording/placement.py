@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -147,7 +147,10 @@ def place_markers(
             nodes[k], weights[k] = shape.weights_at_node(vertex)
             distance[k] = node_distance[vertex]
         else:
-            nodes[k], weights[k], distance[k] = shape.weights_at_point(point)
+            located = shape.weights_at_point(point)
+            nodes[k] = located.nodes
+            weights[k] = located.weights
+            distance[k] = located.distance_m
         if distance[k] > limit_m:
             raise InputError(
                 f"marker '{labels[k]}' at {point_text(point)} m is "
@@ -158,6 +161,24 @@ def place_markers(
     return Placement(
         nodes, weights, distance_m=distance, node_count=len(nodes_m)
     )
+
+
+class LocatedPoint(NamedTuple):
+    """A point as a linear combination of the nodes of one element.
+
+    Attributes
+    ----------
+    nodes : (npe,) int array
+        Nodes of the element.
+    weights : (npe,) array
+        Values of their shape functions at the point, which sum to one.
+    distance_m : float
+        Distance of the point from the surface [m]; 0 inside the body.
+    """
+
+    nodes: Index
+    weights: Array
+    distance_m: float
 
 
 class LocatedBody:
@@ -201,17 +222,16 @@ class LocatedBody:
         cell = self.body.cells[np.argmax((self.body.cells == node).any(axis=1))]
         return cell, (cell == node).astype(np.float64)
 
-    def weights_at_point(self, point: Array) -> tuple[Index, Array, float]:
-        """Return nodes (npe,), weights (npe,) and the distance from the surface [m] of a point
-        (3,).
+    def weights_at_point(self, point: Array) -> LocatedPoint:
+        """Return nodes and weights of a point (3,), and its distance from the surface.
 
-        The distance is 0 inside the body.
+        A point outside the body is an extrapolation from the nearest element.
         """
         cell, distance = self.nearest_cell(point)
-        return (
+        return LocatedPoint(
             self.body.cells[cell],
             self._shape_functions_at(point, cell),
-            distance,
+            distance_m=distance,
         )
 
     def nearest_cell(self, point: Array) -> tuple[int, float]:
@@ -239,13 +259,11 @@ class LocatedBody:
         """Return nodes (npe,) and weights (npe,) of the point of the body that is nearest to a
         point (3,): the point itself if it is inside.
         """
-        nodes, weights, distance = self.weights_at_point(point)
-        if distance == 0.0:
-            return nodes, weights
-        nodes, weights, _ = self.weights_at_point(
-            self.nearest_surface_point(point)[0]
-        )
-        return nodes, weights
+        located = self.weights_at_point(point)
+        if located.distance_m > 0.0:
+            nearest_m, _ = self.nearest_surface_point(point)
+            located = self.weights_at_point(nearest_m)
+        return located.nodes, located.weights
 
     def nearest_surface_point(self, point: Array) -> tuple[Array, Array]:
         """Return the nearest point (3,) [m] of the surface of straight triangles, and two

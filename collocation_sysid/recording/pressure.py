@@ -185,11 +185,11 @@ class Pressure(Actuator[EnclosedVolume]):
         at one time; without a lag `log_lag_ratio` is ignored.
         """
         if not self.lag_s:
-            return self.energy_amplitude(data, factor, offset)
+            return self.energy_amplitude(data, factor, offset=offset)
         pressure_pa = self._lagging_pressure(
             data, self.lag_s * ca.exp(log_lag_ratio)
         )
-        return self.energy_amplitude(pressure_pa, factor, offset)
+        return self.energy_amplitude(pressure_pa, factor, offset=offset)
 
     def energy_amplitude_at(self, t_s: Array) -> Array:
         """Return minus the pressure in the body [Pa] at the times `t_s` (T,), as (T,), with the
@@ -200,7 +200,9 @@ class Pressure(Actuator[EnclosedVolume]):
         pressure_pa = (
             self._lagging_pressure(ca.DM(t_s), ca.DM(self.lag_s)).full().ravel()
         )
-        return self.energy_amplitude(pressure_pa, self.factor, self.loss_pa)
+        return self.energy_amplitude(
+            pressure_pa, self.factor, offset=self.loss_pa
+        )
 
     def _lagging_pressure(self, t_s: Any, lag_s: Any) -> Any:
         """Return the solution p [Pa] of τ dp/dt = stated pressure − p at the times `t_s`, for τ =

@@ -111,9 +111,9 @@ class Tendon(Actuator[PolylineLength]):
         """
         shape = LocatedBody(body.nodes_m, body)
         embedded = [shape.weights_at_point(point) for point in self.points_m]
-        nodes, weights, distances = (
-            np.array(part) for part in zip(*embedded, strict=True)
-        )
+        nodes = np.array([each.nodes for each in embedded])
+        weights = np.array([each.weights for each in embedded])
+        distances = np.array([each.distance_m for each in embedded])
         worst = int(distances.argmax())
         if distances[worst] > FARTHEST_POINT_EDGES * shape.mean_edge_m:
             raise InputError(

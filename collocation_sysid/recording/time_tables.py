@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -292,10 +293,28 @@ def _without_rounding(t_s: Array) -> Array:
 # Of an instrument ---------------------------------------------------------------------------------
 
 
+class CustomSensorTable(NamedTuple):
+    """Values of a custom sensor over time.
+
+    Attributes
+    ----------
+    t_s : (S,) array
+        Sample times [s].
+    values : (S, m) array
+        Values in their own units; NaN where a cell is blank.
+    columns : list of str
+        Names of the m columns of the values.
+    """
+
+    t_s: Array
+    values: Array
+    columns: list[str]
+
+
 @names_file_in_errors
 def read_custom_sensor(
     path: str | Path, columns: Sequence[str] = ()
-) -> tuple[Array, Array, list[str]]:
+) -> CustomSensorTable:
     """Read the values of a custom sensor over time.
 
     Parameters
@@ -303,14 +322,6 @@ def read_custom_sensor(
     path : str or Path
     columns : sequence of str
         Columns of the values; all besides t_s by default.
-
-    Returns
-    -------
-    t_s : (S,) array
-    values : (S, m) array
-        NaN where a cell is blank.
-    columns : list of str
-        Names of the columns of the values.
 
     Raises
     ------
@@ -334,7 +345,9 @@ def read_custom_sensor(
     values = numeric_cells(
         grid, [grid.columns.index(name) for name in names], blank_allowed=True
     )
-    return _without_rounding(t_s), np.asarray(values), names
+    return CustomSensorTable(
+        _without_rounding(t_s), np.asarray(values), columns=names
+    )
 
 
 def is_within_experiment(

@@ -122,7 +122,9 @@ class CasadiSolver(Options):
         return settings
 
     def _plugin_settings(self) -> dict[str, Any]:
-        """Return the options of the plugin that follow from those of the method."""
+        """Return the options of the plugin that follow from those of the method; each subclass
+        defines them.
+        """
         raise NotImplementedError
 
 
@@ -147,6 +149,7 @@ class SqpMethod(CasadiSolver):
     hessian: Hessian = "gauss-newton"
 
     def _plugin_settings(self) -> dict[str, Any]:
+        """Return the tolerances and the limit of iterations, with PIQP as silent QP solver."""
         return {
             "qpsol": "piqp",
             "qpsol_options": {"error_on_fail": False},
@@ -182,6 +185,7 @@ class Sleqp(CasadiSolver):
     }
 
     def _plugin_settings(self) -> dict[str, Any]:
+        """Return the tolerances and the limits of iterations and time, without printing."""
         return {
             "max_iter": self.max_iterations,
             "max_wall_time": self.max_time_s,
@@ -216,9 +220,10 @@ REFUSED: dict[str, str] = {
 
 
 def refusal_reason(name: str) -> str | None:
-    """Return the reason why a solver of CasADi is not offered.
+    """Return the reason why a solver of CasADi is not offered, with those that are.
 
-    None for names that do not begin with "casadi:" and for solvers that are offered.
+    None for names that do not begin with "casadi:" and for solvers that are offered. For an unknown
+    solver the reason contains the most similar name.
     """
     if not name.startswith(PREFIX) or name.removeprefix(PREFIX) in PLUGINS:
         return None
@@ -255,6 +260,7 @@ def _hessian_values(
     """
 
     def values(z: Array, weight: float, multipliers: Array, out: Array) -> None:
+        """Write the Hessian's values, see `HessianValues`."""
         collocation.hessian_values(
             z, weight, multipliers if hessian == "exact" else None, out
         )

@@ -125,7 +125,9 @@ class CgResult:
     iterations, evaluations : int
         Numbers of iterations, and of evaluations of the gradient.
     ending : str
-        Reason for the end.
+        Reason for the end: "converged"; "iteration-limit"; "stopped" by the callback;
+        "line-search", if no step satisfied the Wolfe conditions; or "not-finite", if the function
+        is not finite at the start.
     """
 
     x: Array
@@ -319,7 +321,15 @@ def _initial_step_after(line: _LineSearch, last: float, change: float) -> float:
 
 
 class _CountedFunction:
-    """Function with a count of the evaluations of its gradient."""
+    """Function with a count of the evaluations of its gradient.
+
+    Parameters
+    ----------
+    fun_and_grad : callable
+        Returns value and gradient (n,) at x.
+    value : callable or None
+        Returns the value alone; None to use `fun_and_grad`.
+    """
 
     def __init__(
         self,
@@ -336,7 +346,7 @@ class _CountedFunction:
         return self._fun_and_grad(x)
 
     def value(self, x: Array) -> float:
-        """Return the value at x."""
+        """Return the value at x (n,); it is counted only if the gradient is evaluated, too."""
         return self(x)[0] if self._value is None else self._value(x)
 
 
@@ -346,6 +356,11 @@ class _AverageValue:
 
     Attributes
     ----------
+    options : CgDescentOptions
+    weight : float
+        Weight of the values so far.
+    size : float
+        Average size C.
     approximate : bool
         Whether only the approximate Wolfe conditions count.
     """
@@ -361,7 +376,9 @@ class _AverageValue:
         self.size += (abs(value) - self.size) / self.weight
 
     def note_change(self, change: float) -> None:
-        """Switch to the approximate Wolfe conditions after a small change of the value."""
+        """Count only the approximate Wolfe conditions from now on if a change of the value is at
+        most `switch` times the average size.
+        """
         if change <= self.options.switch * self.size:
             self.approximate = True
 
@@ -394,7 +411,23 @@ class _TrialsExhausted(Exception):
 
 
 class _LineSearch:
-    """Line search along one direction."""
+    """Line search along one direction.
+
+    Parameters
+    ----------
+    function : _CountedFunction
+    x : (n,) array
+        Start of the line.
+    value, gradient
+        Value and gradient (n,) at x.
+    direction : (n,) array
+        Direction of the line, along which the value decreases.
+    error : float
+        Rounding error of the value; values up to it above `value` count as equal.
+    approximate : bool
+        Whether only the approximate Wolfe conditions count.
+    options : CgDescentOptions
+    """
 
     def __init__(
         self,
@@ -419,7 +452,7 @@ class _LineSearch:
         self.trials = 0
 
     def value_at(self, step: float) -> float:
-        """Return the value at a step size."""
+        """Return the value at a step size, which is no counted trial."""
         return self.function.value(self.x + step * self.direction)
 
     def search(self, step: float) -> _LineTrial | None:

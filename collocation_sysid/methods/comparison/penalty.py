@@ -144,6 +144,7 @@ class PenaltyOptions(Options):
     max_time_s: Positive = 1e6
 
     def __post_init__(self) -> None:
+        """Raise an `InputError` if an option is invalid, or the last ρ is below the first."""
         super().__post_init__()
         if self.last_rho < self.rho:
             finding = f"found {self.rho_max:g} with rho = {self.rho:g}"
@@ -184,7 +185,7 @@ class PenaltyOptions(Options):
 
     @property
     def first_gradient(self) -> float:
-        """Tolerance of the first stage."""
+        """Tolerance of the first stage: largest entry of the merit's projected gradient."""
         return self.tolerance
 
     def next_stage(
@@ -234,10 +235,10 @@ class Penalty(PenaltyOptions):
         return self.rho if self.schedule == "constant" else self.rho_max
 
     def next_stage(
-        self, stage: Stage, before: ConstraintViolation, z: Array
+        self, stage: Stage, previous_violation: ConstraintViolation, z: Array
     ) -> Stage:
-        """Return the next stage, with a larger ρ if the schedule says so; see
-        `PenaltyOptions.next_stage` for the arguments.
+        """Return the next stage, with a larger ρ if an increase is due by the schedule, or the
+        stage reached its minimum; see `PenaltyOptions.next_stage` for the arguments.
 
         Raises
         ------
@@ -247,7 +248,7 @@ class Penalty(PenaltyOptions):
         rho = stage.merit.rho
         is_increase_due = (
             self.schedule != "progress"
-            or stage.violation.relative > FALL * before.relative
+            or stage.violation.relative > FALL * previous_violation.relative
         )
         if is_increase_due and rho >= self.last_rho:
             if stage.is_minimum:
@@ -274,11 +275,11 @@ class AugmentedLagrangian(PenaltyOptions):
 
     @property
     def first_gradient(self) -> float:
-        """Tolerance of the first stage."""
+        """Tolerance of the first stage: `FIRST_GRADIENT`, or that of the last if it is larger."""
         return max(FIRST_GRADIENT, self.tolerance)
 
     def next_stage(
-        self, stage: Stage, before: ConstraintViolation, z: Array
+        self, stage: Stage, previous_violation: ConstraintViolation, z: Array
     ) -> Stage:
         """Return the next stage with updated multipliers, and a larger ρ if much violation remains;
         see `PenaltyOptions.next_stage` for the arguments.
@@ -296,7 +297,7 @@ class AugmentedLagrangian(PenaltyOptions):
         if (
             is_last
             and tolerance <= self.tolerance
-            and slack.scaled > STUCK * before.scaled
+            and slack.scaled > STUCK * previous_violation.scaled
         ):
             if stage.is_minimum:
                 raise SearchEnded(
@@ -309,7 +310,7 @@ class AugmentedLagrangian(PenaltyOptions):
                 f"The last stage ended with a gradient of {stage.gradient:.2g}, above its "
                 f"tolerance {tolerance:.2g}; another inner solver may get farther.",
             )
-        if not is_feasible and slack.scaled > FALL * before.scaled:
+        if not is_feasible and slack.scaled > FALL * previous_violation.scaled:
             rho = min(self.rho_factor * rho, self.rho_max)
         rows = stage.merit.problem.constraint_values(z)
         merit = replace(
@@ -324,8 +325,31 @@ class AugmentedLagrangian(PenaltyOptions):
 
 
 class _PenaltySolve:
-    """State of a solve in stages: last iterate, which is the best as the merit decreases,
-    and counts.
+    """State of a solve in stages: last iterate, which is the best as the merit decreases, and
+    counts.
+
+    Parameters
+    ----------
+    options : PenaltyOptions
+    recorder : Recorder
+    start : (variables,) array or None
+        Initial variables of the given problem; None for a simulation at the guess.
+
+    Attributes
+    ----------
+    variables : (variables,) array
+        Last iterate of `problem`, within its bounds.
+    stage : Stage
+        Present stage.
+    iterations : int
+        Number of inner iterations of all stages.
+    gradient : float
+        Largest entry of the projected gradient at the last iterate.
+
+    Raises
+    ------
+    InputError
+        If elements are inverted at the start.
     """
 
     def __init__(
@@ -361,7 +385,7 @@ class _PenaltySolve:
             If no further progress is possible or a limit is reached.
         """
         options = self.options
-        before = ConstraintViolation()
+        previous_violation = ConstraintViolation()
         while True:
             ended_stage = self._minimise()
             is_feasible = ended_stage.violation.relative <= options.violation
@@ -374,11 +398,15 @@ class _PenaltySolve:
                     "Converged: gradient and slack are within their tolerances."
                 )
                 return Status.CONVERGED, message
-            self.stage = options.next_stage(ended_stage, before, self.variables)
-            before = ended_stage.violation
+            self.stage = options.next_stage(
+                ended_stage, previous_violation, z=self.variables
+            )
+            previous_violation = ended_stage.violation
 
     def solution(self, status: Status, reason: str) -> Solution:
-        """Return the last iterate as a solution of the given problem."""
+        """Return the last iterate as a solution of the given problem; `reason` is the first
+        sentence of its message.
+        """
         merit = self.stage.merit
         estimate = merit.multiplier_estimate(
             self.problem.constraint_values(self.variables)

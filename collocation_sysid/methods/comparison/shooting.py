@@ -155,6 +155,12 @@ class _SimulatedPoint:
 
     Attributes
     ----------
+    p : (np,) array
+        Parameters (q, φ).
+    z : (variables,) array
+        Variables with the simulated positions.
+    objective : float
+        Loss L in the scaling of the NLP.
     residual : (m,) array
         Residuals in standard deviations; empty with adjoint gradients.
     slope : array
@@ -254,7 +260,9 @@ class _ShootingSearch:
         )
 
     def _residual_slope(self, step: Array) -> Array:
-        """Return the derivatives of the residuals after a step from the first parameters."""
+        """Return the derivatives (m, np) of the residuals after a step (np,) from the first
+        parameters, at which the simulation must succeed.
+        """
         shot = self._try(self.first + step)
         assert shot is not None  # SciPy asks where the residuals were finite
         return shot.slope
