@@ -484,15 +484,15 @@ def _identify_small_body() -> tuple[str, bool]:
     swing = Experiment(
         body,
         t_s,
-        [hand],
-        markers,
+        grasps=[hand],
+        markers=markers,
         nuisance=Nuisance.none(),
         air_density_kg_m3="none",
     )
     fixed = {"poisson": 0.3, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5}
     truth_pa = 2000.0
     tracks_m = simulate(
-        swing, {**fixed, "mu_pa": truth_pa}, "midpoint", substeps=1
+        swing, {**fixed, "mu_pa": truth_pa}, integrator="midpoint", substeps=1
     ).markers_m
     problem = Problem(
         [with_markers(swing, tracks_m)],

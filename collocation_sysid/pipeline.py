@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .common.array_types import Array
 from .common.display import plain_text
 from .common.step_counting import StepUnit, counted_phase
 from .errors import InputError, SimulationError
@@ -22,6 +23,7 @@ from .methods.initial_trajectories import simulate_trajectories
 from .methods.solution import Method, Solution, Status, Watch
 from .model.schemes import as_scheme
 from .problem import Problem
+from .program.collocation import Collocation
 from .runs.check.cost import require_memory
 from .runs.forward_simulation import simulate_experiments, step_error
 from .runs.numerical_error import refine
@@ -74,9 +76,7 @@ class Run(SolvedProblem):
     """
 
     def __str__(self) -> str:
-        from .result.run_sections import (
-            run_summary,
-        )  # how it looks is no part of a run
+        from .result.run_sections import run_summary
 
         return plain_text(run_summary(self.result))
 
@@ -89,9 +89,7 @@ class Run(SolvedProblem):
         """Return parameters, combined intervals, their sources and the verdict as text, as printed
         in the terminal.
         """
-        from .result.run_sections import (
-            estimate_sections,
-        )  # how it looks is no part of a run
+        from .result.run_sections import estimate_sections
 
         return plain_text(estimate_sections(self.result))
 
@@ -125,9 +123,7 @@ class Run(SolvedProblem):
         InputError
             For an unknown experiment or field, an invalid count, or a run without motion.
         """
-        from .result.animation import (
-            experiment_named,
-        )  # how it looks is no part of a run
+        from .result.animation import experiment_named
         from .result.pictures.shapes import field_shapes
         from .result.run_record import replays
 
@@ -163,9 +159,7 @@ class Run(SolvedProblem):
             Without ipywidgets (``pip install 'collocation-sysid[interactive]'``), for an unknown
             experiment, or if no parameter was estimated.
         """
-        from .result.parameter_sliders import (
-            ParameterSliders,
-        )  # how it looks is no part of a run
+        from .result.parameter_sliders import ParameterSliders
 
         return ParameterSliders.from_run(self, experiment).widget
 
@@ -190,9 +184,7 @@ class Run(SolvedProblem):
         InputError
             If the folder contains anything other than an earlier run.
         """
-        from .result.run_record import (
-            write_run,
-        )  # what files hold is no part of a run
+        from .result.run_record import write_run
 
         return write_run(self, folder, frames=frames, pictures=pictures)
 
@@ -238,7 +230,9 @@ def run(
     """
     say = log or (lambda _: None)
     began_s = time.perf_counter()
-    solution = solve(problem, method, watch, start, scheduler)
+    solution = solve(
+        problem, method, watch=watch, start=start, scheduler=scheduler
+    )
     searched_s = time.perf_counter()
 
     def timed(answer: Run) -> Run:
@@ -251,19 +245,8 @@ def run(
             answer, elapsed_s=Elapsed(searched_s - began_s + finer_s, checks_s)
         )
 
-    bodies = (segment.body for segment in solution.collocation.transcriptions)
-    fields = {
-        part.field_name: part.field
-        for b in bodies
-        for part in b.parts
-        if part.field
-    }
-    problem = problem.with_lengths(
-        {name: field.length_m for name, field in fields.items()}
-    )
-    phases = {n: f for n, f in fields.items() if isinstance(f, TwoPhaseModes)}
-    problem = problem.with_fields(phases) if phases else problem
-    answer = Run(problem, solution, {}, None)
+    problem = _with_estimated_fields(problem, solution)
+    answer = Run(problem, solution, rollouts={}, uncertainty=None)
     missing = "the result has no error bars and was not checked by a forward simulation"
     try:
         answer, fit = _checked(problem, answer.solution, say=say)
@@ -280,14 +263,7 @@ def run(
                 say=say,
                 scheduler=scheduler,
             )
-        substeps = answer.solution.collocation.substeps
-        refits = (
-            c.message
-            for e in problem.experiments
-            for c in rotation_step_concerns(e, substeps)
-        )
-        of_tests = one_kind_notes(problem.experiments, problem.parameters)
-        answer = replace(answer, notes=(*refits, *of_tests, *answer.notes))
+        answer = _with_problem_notes(answer)
         if answer.uncertainty is not None and fit is not None:
             profiles = _profiles(answer, fit, say=say)
             changes = _changes(answer, say)
@@ -318,6 +294,44 @@ def run(
         return timed(replace(answer, rollouts=rollouts, omitted_checks=missing))
 
 
+def _with_estimated_fields(problem: Problem, solution: Solution) -> Problem:
+    """Return the problem with the correlation lengths of its fields that the solve used, and with
+    the modes of its two-phase fields.
+    """
+    fields = {
+        part.field_name: part.field
+        for segment in solution.collocation.transcriptions
+        for part in segment.body.parts
+        if part.field
+    }
+    problem = problem.with_lengths(
+        {name: field.length_m for name, field in fields.items()}
+    )
+    two_phase_fields = {
+        name: field
+        for name, field in fields.items()
+        if isinstance(field, TwoPhaseModes)
+    }
+    if two_phase_fields:
+        return problem.with_fields(two_phase_fields)
+    return problem
+
+
+def _with_problem_notes(answer: Run) -> Run:
+    """Return the run with notes on rotations within time steps, and on material tests of a single
+    kind, before its other notes.
+    """
+    problem = answer.problem
+    substeps = answer.solution.collocation.substeps
+    rotations = (
+        concern.message
+        for experiment in problem.experiments
+        for concern in rotation_step_concerns(experiment, substeps)
+    )
+    tests = one_kind_notes(problem.experiments, problem.parameters)
+    return replace(answer, notes=(*rotations, *tests, *answer.notes))
+
+
 def _checked(
     problem: Problem, solution: Solution, say: Log
 ) -> tuple[Run, LinearisedFit | None]:
@@ -336,7 +350,7 @@ def _checked(
     say("checking the result by a forward simulation")
     rollouts = simulate_experiments(problem, solution)
     if not solution.status.converged:
-        return Run(problem, solution, rollouts, None), None
+        return Run(problem, solution, rollouts=rollouts, uncertainty=None), None
     say("computing the error bars")
     rows = _row_count(solution)
     try:
@@ -351,11 +365,17 @@ def _checked(
         return Run(
             problem,
             solution,
-            rollouts,
-            None,
+            rollouts=rollouts,
+            uncertainty=None,
             notes=(f"no error bars: {error}",),
         ), None
-    answer = Run(problem, solution, rollouts, None, diagnose_markers(fit))
+    answer = Run(
+        problem,
+        solution,
+        rollouts=rollouts,
+        uncertainty=None,
+        diagnoses=diagnose_markers(fit),
+    )
     if not solution.collocation.nq:
         return answer, fit
     parameters = solution.collocation.parameters
@@ -421,7 +441,12 @@ def _sources(
     )
     means = answer.problem.uncertainty.assumptions.means
     return VarianceSources.from_fit(
-        fit, budgeted, parameters, solution.q, known, means
+        fit,
+        budgeted,
+        parameters=parameters,
+        q=solution.q,
+        uncertainty=known,
+        means=means,
     )
 
 
@@ -551,24 +576,15 @@ def _fine_enough(
     p = np.where(fit.at_bound, again.guess_p, p)
     try:
         require_memory(problem, again, method=solver)
-        positions, failure = simulate_trajectories(again, p)
-        if failure is not None:
-            raise failure
-        with connect_executor(scheduler) as workers:
-            finer = solve_with_renewed_correspondences(
-                with_workers(solver, workers),
-                again,
-                watch=watch,
-                start=again.pack(p, positions),
-            )
-        message = finer.message
+        finer = _solve_from_parameters(
+            again, p, solver=solver, watch=watch, scheduler=scheduler
+        )
+        failure = None if finer.status.converged else finer.message
     except (InputError, SimulationError) as error:
-        finer = None
-        message = str(error)
-    if finer is not None and finer.status is Status.INTERRUPTED:
-        raise KeyboardInterrupt  # the first answer is whole
-    if finer is None or not finer.status.converged:
-        note = f"{why}; the solve with {substeps} failed: {message}"
+        finer = first
+        failure = str(error)
+    if failure is not None:
+        note = f"{why}; the solve with {substeps} failed: {failure}"
         return replace(coarse, notes=(note, *coarse.notes)), fit
     most = (
         ", the largest number that is chosen automatically"
@@ -577,3 +593,42 @@ def _fine_enough(
     )
     reason = f"{why}; therefore it was solved again with {substeps}{most}"
     return _checked(problem, finer.after(first, reason), say=say)
+
+
+def _solve_from_parameters(
+    collocation: Collocation,
+    p: Array,
+    solver: Method,
+    watch: Watch | None,
+    scheduler: str | None,
+) -> Solution:
+    """Return the solution of a problem, started from a simulation at parameters p (np,).
+
+    Parameters
+    ----------
+    collocation : Collocation
+    p : (np,) array
+        Parameters (q, φ).
+    solver, watch, scheduler
+        See `_fine_enough`.
+
+    Raises
+    ------
+    SimulationError
+        If the body cannot be simulated at p.
+    InputError
+        If the scheduler cannot be used.
+    KeyboardInterrupt
+        If the solve was interrupted.
+    """
+    positions, failure = simulate_trajectories(collocation, p)
+    if failure is not None:
+        raise failure
+    with connect_executor(scheduler) as workers:
+        solution = solve_with_renewed_correspondences(
+            with_workers(solver, workers),
+            collocation,
+            watch=watch,
+            start=collocation.pack(p, positions),
+        )
+    return solution.unless_interrupted()

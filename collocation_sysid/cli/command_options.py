@@ -281,7 +281,7 @@ class ProblemOptions:
             return Problem.read(
                 self.problem,
                 self.set_ or (),
-                self.allow_code,
+                allow_code=self.allow_code,
                 simulation=simulation,
                 say=say,
             )

@@ -116,9 +116,9 @@ def solve(options: SolveCommand) -> None:
             finished = run(
                 problem,
                 options.method,
-                progress.iteration,
-                progress.say,
-                options.start,
+                watch=progress.iteration,
+                log=progress.say,
+                start=options.start,
                 scheduler=options.scheduler,
                 probe=options.probe,
             )

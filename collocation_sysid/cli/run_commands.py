@@ -154,7 +154,7 @@ def _export_body(
     target = TARGETS[name]
     destination.require_possible()
     body = IdentifiedBody.read(
-        options.run_folder, options.experiment, options.allow_code
+        options.run_folder, options.experiment, allow_code=options.allow_code
     )
     with destination.export_folder() as folder:
         exported = write_export(body, name, folder=folder)
@@ -361,7 +361,7 @@ def view(options: ViewCommand) -> None:
     html = options.html
     field = options.field
     if html is None:
-        opened(run, field or DEFAULT_FIELD, options.experiment)
+        opened(run, field or DEFAULT_FIELD, experiment=options.experiment)
         return
     require_possible(html.parent)
     typer.echo(

@@ -54,7 +54,9 @@ class LiveEstimationOptions(Options):
             If the problem is not usable, or not for a live estimate.
         """
         budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
-        problem = read_problem(recording, self.set_ or (), self.allow_code)
+        problem = read_problem(
+            recording, self.set_ or (), allow_code=self.allow_code
+        )
         return LiveEstimator(problem, LiveOptions(budget_s, self.window_s))
 
 

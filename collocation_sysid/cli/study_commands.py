@@ -196,7 +196,9 @@ def compare_models(options: CompareModelsCommand) -> None:
         else (),
     )
     for variant in variants:  # a model that cannot be would fail every run
-        Problem.read(variant.path, variant.overrides, options.allow_code)
+        Problem.read(
+            variant.path, variant.overrides, allow_code=options.allow_code
+        )
     planned = plan_models(
         problem, variants, method=method, allow_code=options.allow_code
     )
@@ -240,7 +242,9 @@ def sweep(options: SweepCommand) -> None:
         allow_code=options.allow_code,
     )
     # A missing file would fail every run.
-    Problem.read(options.problem, planned[0].overrides, options.allow_code)
+    Problem.read(
+        options.problem, planned[0].overrides, allow_code=options.allow_code
+    )
     _run_study(SWEEP_STUDY, options, planned=planned)
 
 

@@ -214,11 +214,17 @@ class NlpFunctions:
         inputs = self._inputs if needs_multipliers else self._inputs[:2]
         kind = LagrangianGradient if outputs == ("grad_l",) else TimedFunction
         sparsities = [self._sparsity(output) for output in outputs]
-        made = kind(name, inputs, sparsities, evaluate, self.errors)
-        if isinstance(made, LagrangianGradient):
-            made.hessian_product = self._forward
-        self._functions.append(made)
-        return made
+        callback = kind(
+            name,
+            inputs,
+            outputs=sparsities,
+            evaluate=evaluate,
+            errors=self.errors,
+        )
+        if isinstance(callback, LagrangianGradient):
+            callback.hessian_product = self._forward
+        self._functions.append(callback)
+        return callback
 
     def _evaluate(self, inputs: list[Array], outputs: dict[str, Array]) -> None:
         """Write the requested outputs to `outputs`, in place.
@@ -461,4 +467,4 @@ class IterationMonitor(ca.Callback):
         )
         number = recorder.history[-1].number + 1 if recorder.history else 0
         self.lines += 1
-        recorder.add_variables(number, variables, loss)
+        recorder.add_variables(number, variables, loss=loss)

@@ -64,7 +64,7 @@ def complete_multipliers(
     """
     if not isinstance(program, CondensedCollocation):
         return multipliers
-    return program.complete_multipliers(z, 1.0, multipliers)
+    return program.complete_multipliers(z, 1.0, multipliers=multipliers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -439,8 +439,8 @@ class CondensedCollocation(Collocation):
         return CondensedPattern.from_pairs(
             (self.constraint_count, self.variable_count),
             of_free_variables,
-            pairs,
-            through,
+            pairs=pairs,
+            eliminated=through,
         )
 
     @property
@@ -514,7 +514,7 @@ class CondensedCollocation(Collocation):
             )
         size = self.variable_count
         return CondensedPattern.from_pairs(
-            (size, size), remaining, pairs, through
+            (size, size), remaining, pairs=pairs, eliminated=through
         )
 
     def _is_loss_coupling(
@@ -575,7 +575,9 @@ class CondensedCollocation(Collocation):
         values = np.empty(len(layout.structure[1])) if out is None else out
         values[:] = 0
         if multipliers is not None:
-            multipliers = self.complete_multipliers(z, loss_weight, multipliers)
+            multipliers = self.complete_multipliers(
+                z, loss_weight, multipliers=multipliers
+            )
         complete_values = self._complete_hessian(
             self.complete_variables(z), loss_weight, multipliers=multipliers
         )
@@ -631,11 +633,19 @@ class CondensedCollocation(Collocation):
             p[places[clock_places]] = samples * sample
         nearest[self.complete.phi_columns] = p[self.nq :]
         if np.array_equal(nearest, z):
-            return self.complete.hessian_values(z, loss_weight, multipliers)
-        values = self.complete.hessian_values(nearest, loss_weight, None)
+            return self.complete.hessian_values(
+                z, loss_weight, multipliers=multipliers
+            )
+        values = self.complete.hessian_values(
+            nearest, loss_weight, multipliers=None
+        )
         if multipliers is not None:
-            values += self.complete.hessian_values(z, loss_weight, multipliers)
-            values -= self.complete.hessian_values(z, loss_weight, None)
+            values += self.complete.hessian_values(
+                z, loss_weight, multipliers=multipliers
+            )
+            values -= self.complete.hessian_values(
+                z, loss_weight, multipliers=None
+            )
         return values
 
 

@@ -275,4 +275,4 @@ def _continue_variables(
         p,
         known_rows=[part.x[: part.segment.grid_times] for part in parts],
     )
-    return complete_variables(collocation, p, known)
+    return complete_variables(collocation, p, known_rows=known)

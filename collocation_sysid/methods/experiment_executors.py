@@ -96,7 +96,9 @@ class LocalExecutor:
         themselves; an exception of the function is raised.
         """
         return map_experiments(
-            lambda row: run(*row), [*zip(*columns, strict=True)], self.threads
+            lambda row: run(*row),
+            [*zip(*columns, strict=True)],
+            threads=self.threads,
         )
 
     def fetch(self, stored: Sequence[Any]) -> list[Any]:

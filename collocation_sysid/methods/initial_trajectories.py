@@ -41,9 +41,11 @@ def associated_at_guess(collocation: Collocation) -> Collocation:
         theta = segment.constants.theta(p[: segment.nq])
         try:
             first = Forces.from_experiment(
-                experiment, experiment.t_s[:1], theta
+                experiment, experiment.t_s[:1], theta=theta
             )
-            x, _ = initial_state(experiment, first, NewtonSolver(experiment))
+            x, _ = initial_state(
+                experiment, first, solver=NewtonSolver(experiment)
+            )
         except SimulationError:
             x = experiment.rigid_positions(experiment.t_s[:1]).ravel()
         positions.append(x[None])
@@ -133,7 +135,7 @@ def simulate_trajectories(
         )
 
     reached = map_experiments(
-        simulate_one, range(len(parts)), collocation.threads
+        simulate_one, range(len(parts)), threads=collocation.threads
     )
     failures = [failure for _, failure in reached if failure is not None]
     return [x for x, _ in reached], failures[0] if failures else None
@@ -226,8 +228,10 @@ def rigid_trajectory(transcription: Transcription, theta: Array) -> Array:
     experiment = transcription.experiment
     t_s = transcription.dynamics.t_s
     try:
-        first = Forces.from_experiment(experiment, t_s[:1], theta)
-        x0, _ = initial_state(experiment, first, NewtonSolver(experiment))
+        first = Forces.from_experiment(experiment, t_s[:1], theta=theta)
+        x0, _ = initial_state(
+            experiment, first, solver=NewtonSolver(experiment)
+        )
     except SimulationError:
         x0 = experiment.rigid_positions(t_s[:1]).ravel()
     rotations, translations = experiment.rigid_motion(t_s)

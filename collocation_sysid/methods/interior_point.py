@@ -190,13 +190,13 @@ class InteriorPoint(Options):
         is_hard = self.contact == "complementarity" and any(
             e.obstacles for e in experiments
         )
-        solution = self._solve(collocation, watch, start)
+        solution = self._solve(collocation, watch, start=start)
         if not is_hard or not solution.status.converged:
             return solution
         relaxed_method = replace(self, initial="simulation")
         return solve_complementarity(
             solution,
-            lambda relaxed, z: relaxed_method._solve(relaxed, watch, z),
+            lambda relaxed, z: relaxed_method._solve(relaxed, watch, start=z),
         )
 
     def _solve(
@@ -282,11 +282,11 @@ class InteriorPoint(Options):
         solution = nlpsol.solve(
             recorder,
             program,
-            start,
-            "ipopt",
-            hessian,
-            settings,
-            IPOPT_STATUS,
+            start=start,
+            plugin="ipopt",
+            hessian=hessian,
+            settings=settings,
+            statuses=IPOPT_STATUS,
             initial_multipliers=multipliers,
         )
         if "Invalid_Option" not in solution.message:
@@ -410,7 +410,7 @@ class _DampedHessian:
         is_settled = self._ends_warm_up(self.collocation.parameters_from(z))
         is_exact = self.options.hessian == "exact" and is_settled
         self.collocation.hessian_values(
-            z, weight, multipliers if is_exact else None, values
+            z, weight, multipliers=multipliers if is_exact else None, out=values
         )
         values[self._of_x] += self.options.proximal
         if not is_settled:

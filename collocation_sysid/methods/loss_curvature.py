@@ -153,7 +153,7 @@ def exact_curvature(
             for k in range(len(iterate.p))
         ]
     )
-    hessian = collocation.hessian(z, 1.0, multipliers)
+    hessian = collocation.hessian(z, 1.0, multipliers=multipliers)
     reduced = (
         directions.T @ (hessian @ directions) / (2 * collocation.loss_scale)
     )

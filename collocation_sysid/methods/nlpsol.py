@@ -139,9 +139,9 @@ def solve(
     iterations = result.iterations or max(0, monitor.lines - 1)
     if status is Status.REFUSED:
         iterations = 0
-    problem_multipliers = complete_multipliers(program, z, multipliers)[
-        : collocation.constraint_count
-    ]
+    problem_multipliers = complete_multipliers(
+        program, z, multipliers=multipliers
+    )[: collocation.constraint_count]
     problem_variables = convert_variables(z, program, target=collocation)
     status = judge(status, problem_variables, problem_multipliers)
     name = NAMES.get(plugin, plugin)

@@ -353,7 +353,10 @@ class ReducedSearch:
         tolerance = self.options.tolerance
         self.trust = min(self.options.trust, self.largest_trust)
         point = self._accept(
-            horizon, horizon.evaluate(self.p, self.trajectories, self.point)
+            horizon,
+            horizon.evaluate(
+                self.p, self.trajectories, known_iterate=self.point
+            ),
         )
         rejections = 0
         curvature = np.zeros((len(point.p), len(point.p)))
@@ -376,8 +379,8 @@ class ReducedSearch:
                     self._record(
                         point.p + step,
                         final_positions,
-                        point.predicted_loss(step),
-                        summaries,
+                        loss=point.predicted_loss(step),
+                        summaries=summaries,
                     )
                     return Status.CONVERGED
             predicted_share = 1.0 - point.predicted_loss(step) / max(
@@ -387,8 +390,10 @@ class ReducedSearch:
                 return Status.CONVERGED
             if self.sweeps >= self.options.max_iterations:
                 return Status.ITERATION_LIMIT
-            trial = self._try(horizon, point, step)
-            is_better = trial is not None and self._judge(point, step, trial)
+            trial = self._try(horizon, point, step=step)
+            is_better = trial is not None and self._judge(
+                point, step, trial=trial
+            )
             if (
                 trial is not None
                 and is_better
@@ -457,7 +462,7 @@ class ReducedSearch:
         self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
         try:
-            trial = horizon.evaluate_step(p, point, step)
+            trial = horizon.evaluate_step(p, point, step=step)
         except SimulationError:
             return None
         return trial if trial.is_finite else None
@@ -501,7 +506,7 @@ class ReducedSearch:
         The loss of the projected trajectory is then accurate to a higher order, so that trials are
         no longer compared with a loss that is too low.
         """
-        refined = self._try(horizon, point, np.zeros(len(point.p)))
+        refined = self._try(horizon, point, step=np.zeros(len(point.p)))
         if (
             refined is None
             or refined.feasibility_m > CONTRACTION * point.feasibility_m
@@ -651,7 +656,9 @@ class ReducedSearch:
             report.indefinite_steps for report in point.reports
         )
         summaries = [report.fit_summary for report in point.reports]
-        self._record(point.p, point.trajectories, point.loss, summaries)
+        self._record(
+            point.p, point.trajectories, loss=point.loss, summaries=summaries
+        )
         return point
 
     def _record(

@@ -593,12 +593,12 @@ def constraint_multipliers(
         gradient = collocation.loss_scale * iterate.gradient()[0]
         solver = Sweep(segment, stopwatch=stopwatch)
         y = segment.force_n * solver.backward(
-            iterate.x, iterate.equations, gradient
+            iterate.x, iterate.equations, gradient=gradient
         )
         return segment.select_rows(y)
 
     multipliers_by_experiment = map_experiments(
-        of_experiment, collocation.iterates(z), collocation.threads
+        of_experiment, collocation.iterates(z), threads=collocation.threads
     )
     multipliers = np.concatenate(multipliers_by_experiment)
     if any(

@@ -483,7 +483,9 @@ class _TrialSimulation:
                 segment.dynamics.t_s[:rows]
             )
             positions.append(rigid_positions.reshape(rows, -1))
-        return _misfit(self.collocation, self.collocation.guess_p, positions)
+        return _misfit(
+            self.collocation, self.collocation.guess_p, positions=positions
+        )
 
     def evaluate_guess(
         self, is_complete: bool
@@ -494,7 +496,7 @@ class _TrialSimulation:
         """
         p = self.collocation.guess_p
         positions, failure = self._simulate(
-            p, None, self.all_rows if is_complete else self.rows
+            p, None, rows=self.all_rows if is_complete else self.rows
         )
         if failure is not None:
             return np.nan, failure
@@ -514,7 +516,7 @@ class _TrialSimulation:
             Trajectories at another modulus, near which equilibria are searched; None without.
         """
         p = self._p(young_pa)
-        positions, failure = self._simulate(p, guess, self.rows)
+        positions, failure = self._simulate(p, guess, rows=self.rows)
         if failure is not None:
             self.failure = failure
             return np.nan, None
@@ -524,7 +526,7 @@ class _TrialSimulation:
         """Return whether the complete recordings can be simulated at a Young's modulus [Pa]; if
         not, the error is stored in `failure`.
         """
-        _, failure = self._simulate(self._p(young_pa), None, self.all_rows)
+        _, failure = self._simulate(self._p(young_pa), None, rows=self.all_rows)
         self.failure = failure or self.failure
         return failure is None
 
@@ -544,7 +546,7 @@ class _TrialSimulation:
     def _evaluate(self, p: Array, positions: Sequence[Array]) -> float:
         """Return the misfit of trajectories at p; NaN if it is not finite."""
         first = [x[:rows] for x, rows in zip(positions, self.rows, strict=True)]
-        misfit = _misfit(self.collocation, p, first)
+        misfit = _misfit(self.collocation, p, positions=first)
         return misfit if np.isfinite(misfit) else np.nan
 
     def _simulate(

@@ -197,7 +197,9 @@ def sweep(
     if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
         raise SimulationError(massless, float(dynamics.t_s[0]))
     tangent = solver.forward(
-        part.x, part.equations, known_sweep.tangent if known_sweep else None
+        part.x,
+        part.equations,
+        known=known_sweep.tangent if known_sweep else None,
     )
     return _sweep_result(
         part,
@@ -243,7 +245,7 @@ def sweep_after_step(
         If a time step is singular or not finite.
     """
     part = _iterate(
-        transcription, p, x=extrapolate(transcription, previous, step)
+        transcription, p, x=extrapolate(transcription, previous, step=step)
     )
     dynamics = part.equations.dynamics
     x = part.x
@@ -357,7 +359,7 @@ def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
     """
     part = _iterate(transcription, p, x=x)
     return FitSummary.from_iterate(
-        part, x, float(np.abs(part.residual_n).max())
+        part, x, violation_n=float(np.abs(part.residual_n).max())
     )
 
 
@@ -398,7 +400,7 @@ def _sweep_result(
         tangent.by_p, tangent.grasp_forces
     )
     predictions = iterate.observation.linearise(
-        iterate.x, response, tangent.step
+        iterate.x, response, step=tangent.step
     )
     matches = zip(predictions, iterate.segment.residuals, strict=True)
     residuals_and_slopes = [
@@ -427,7 +429,7 @@ def _sweep_result(
         else float(np.abs(iterate.x - previous.x).max()),
         indefinite_steps=tangent.indefinite_count,
         fit_summary=FitSummary.from_iterate(
-            iterate, iterate.x + tangent.step, tangent.violation_n
+            iterate, iterate.x + tangent.step, violation_n=tangent.violation_n
         ),
         times_s=times_s,
     )

@@ -102,7 +102,9 @@ def align(
     )
     if every > 1:
         table = MarkerTable(
-            table.t_s[::every], table.names, table.positions_m[::every]
+            table.t_s[::every],
+            table.names,
+            positions_m=table.positions_m[::every],
         )
     if static:
         t_s = grid = table.t_s
@@ -110,11 +112,11 @@ def align(
         sample_interval_s(table.t_s, "markers")
         t_s = table.t_s
         grid = evenly_spaced_s(table.t_s)
-        table = MarkerTable(grid, table.names, table.positions_m)
+        table = MarkerTable(grid, table.names, positions_m=table.positions_m)
     else:
         t_s = grid = _even_grid(table.t_s, resample_hz)
         table = MarkerTable(
-            grid, table.names, _interpolate_markers(table, grid)
+            grid, table.names, positions_m=_interpolate_markers(table, grid)
         )
     moved = []
     for k, sequence in enumerate(poses):
@@ -192,7 +194,9 @@ def _cut_to_poses(
     )
     if cut[0] > t_s[0]:
         note += f"; start now refers to the state at {cut[0]:.9g} s now"
-    return MarkerTable(cut, table.names, table.positions_m[is_inside]), [note]
+    return MarkerTable(
+        cut, table.names, positions_m=table.positions_m[is_inside]
+    ), [note]
 
 
 def _cut_to_window(
@@ -219,7 +223,9 @@ def _cut_to_window(
             f"the markers run from {table.t_s[0]:.9g} s to {table.t_s[-1]:.9g} s"
         )
     return MarkerTable(
-        table.t_s[is_inside], table.names, table.positions_m[is_inside]
+        table.t_s[is_inside],
+        table.names,
+        positions_m=table.positions_m[is_inside],
     )
 
 

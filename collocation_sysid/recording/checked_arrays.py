@@ -38,7 +38,7 @@ def read_only_floats(
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must hold numbers: {error}") from error
-    _require_shape(array.shape, shape, name)
+    _require_shape(array.shape, shape, name=name)
     if finite and not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise InputError(
@@ -104,7 +104,7 @@ def read_only_nodes(
         raise InputError(
             f"{name} must hold node numbers (integers), not {indices.dtype}"
         )
-    _require_shape(indices.shape, shape, name)
+    _require_shape(indices.shape, shape, name=name)
     nodes = indices.astype(np.int64)
     if nodes.size and nodes.min() < 0:
         raise InputError(

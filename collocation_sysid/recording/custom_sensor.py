@@ -259,7 +259,9 @@ class Gauge:
         names = POINT_INPUTS if self.grasp is None else GRASP_INPUTS
         try:
             read = self.read(
-                t_s, observables, ca.vertsplit(own) if self.unknowns else []
+                t_s,
+                observables,
+                unknowns=ca.vertsplit(own) if self.unknowns else [],
             )
         except (Exception, SystemExit) as error:
             raise InputError(

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
     """Return the experiment on a finer body, a refinement of its own.
 
-    Selections of nodes are evaluated on the finer mesh, and node numbers without a selection
-    refined. Markers are material points: their places on the undeformed body stay, whether they are
-    nodes, inside elements or beyond the surface. A given start state is interpolated.
+    Selections by boxes and balls are evaluated on the finer mesh; of other selections, and of node
+    numbers, the middle of an edge belongs to the finer nodes if both ends do. Markers are material
+    points: their places on the undeformed body stay, whether they are nodes, inside elements or
+    beyond the surface. A given start state is interpolated.
 
     Parameters
     ----------

@@ -109,7 +109,10 @@ def read_markers(
     used_names = [labels.get(label, label) for label in raw.labels]
     coordinates, notes = _mark_missing(raw, used_names)
     return MarkerTable(
-        t_s, tuple(used_names), coordinates * metres, (*raw.notes, *notes)
+        t_s,
+        tuple(used_names),
+        positions_m=coordinates * metres,
+        notes=(*raw.notes, *notes),
     )
 
 
@@ -125,7 +128,7 @@ def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
     """
     content = read_bytes(path)
     if c3d.is_c3d(content):
-        return c3d.read(path, content, choose)
+        return c3d.read(path, content, choose=choose)
     text = decode(content)
     start = text.lstrip().lstrip('"')
     known = (

@@ -216,15 +216,15 @@ class Obstacle(Grasp):
 @lru_cache(maxsize=32)
 def _contact_surface(body: Body, obstacle: Obstacle) -> ContactSurface:
     """Return the contact points between a body and an obstacle; the last 32 pairs are cached."""
-    return ContactSurface.from_body(body, obstacle.nodes, obstacle.faces)
+    return ContactSurface.from_body(body, obstacle.nodes, chosen=obstacle.faces)
 
 
 def with_obstacle_frames(
     body: Body, obstacles: Sequence[Obstacle], *, is_static: bool
 ) -> Body:
     """Return the body with four nodes for the frame of each obstacle, and the coefficients of
-    friction that are parameters among its constants; frames that a body has already are not added
-    again.
+    friction that are parameters among its constants; self if it has these already. Frames of other
+    obstacles are replaced.
 
     The Jacobian of the contact forces is declared as not symmetric if an obstacle has friction, or
     if pressures are averaged over time steps, which happens in motions without `relaxed` contact.
@@ -237,4 +237,6 @@ def with_obstacle_frames(
         each.has_friction or (each.relaxed is None and not is_static)
         for each in obstacles
     )
-    return body.with_frames(len(obstacles), unsymmetric, frictions)
+    return body.with_frames(
+        len(obstacles), has_skew_contact=unsymmetric, frictions=frictions
+    )

@@ -121,7 +121,7 @@ def _checked_sequence(
         t_s, positions_m, quaternions_xyzw=quaternions
     ):
         raise InputError(fault[1], where=row_names[fault[0]])
-    return PoseSequence(t_s, positions_m, quaternions)
+    return PoseSequence(t_s, positions_m, quaternions_xyzw=quaternions)
 
 
 # Columns ------------------------------------------------------------------------------------------

@@ -44,7 +44,9 @@ def write_markers_csv(
     InputError
         If shapes disagree or time does not increase.
     """
-    table = MarkerTable(np.asarray(t_s), tuple(names), np.asarray(positions_m))
+    table = MarkerTable(
+        np.asarray(t_s), tuple(names), positions_m=np.asarray(positions_m)
+    )
     header = [
         "t_s",
         *(f"{name}_{axis}" for name in table.names for axis in "xyz"),

@@ -69,14 +69,18 @@ class RigidFit:
                 "no frame contains three markers of the grasp that are not on one line"
             )
         known = PoseSequence(
-            times[there], self.positions_m[there], self.quaternions_xyzw[there]
+            times[there],
+            self.positions_m[there],
+            quaternions_xyzw=self.quaternions_xyzw[there],
         )
         if len(there) == 1:
             return known
         within = times[there[0] : there[-1] + 1]
         rotations, positions = known.at(within)
         return PoseSequence(
-            within, positions, Rotation.from_matrix(rotations).as_quat()
+            within,
+            positions,
+            quaternions_xyzw=Rotation.from_matrix(rotations).as_quat(),
         )
 
 
@@ -161,7 +165,9 @@ class TemplateFit(NamedTuple):
         table is unchanged.
         """
         positions_m = table.positions_m @ self.rotation.T + self.translation_m
-        return MarkerTable(table.t_s, table.names, positions_m, table.notes)
+        return MarkerTable(
+            table.t_s, table.names, positions_m=positions_m, notes=table.notes
+        )
 
 
 def align_to_template(
@@ -227,7 +233,9 @@ def align_to_template(
     )
     moved = means @ rotations[0].T + translations[0]
     return TemplateFit(
-        rotations[0], translations[0], np.linalg.norm(moved - places, axis=1)
+        rotations[0],
+        translations[0],
+        residual_m=np.linalg.norm(moved - places, axis=1),
     )
 
 

@@ -268,7 +268,7 @@ class Specimen:
         return Experiment(
             cell,
             self.t_s,
-            self._grasps(),
+            grasps=self._grasps(),
             gravity_m_s2=(0.0, 0.0, 0.0),
             name=name,
             kind="static",
@@ -300,7 +300,10 @@ class Specimen:
                 )
                 no_rotation = np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1))
                 poses = PoseSequence(
-                    self.t_s, shifts_m, no_rotation, interpolation="linear"
+                    self.t_s,
+                    shifts_m,
+                    quaternions_xyzw=no_rotation,
+                    interpolation="linear",
                 )
             axes = self.deformation.prescribed_axes(node)
             grasps.append(Grasp(np.array([node]), poses, axes=axes))
@@ -332,8 +335,8 @@ class Specimen:
                 Gauge(
                     LATERAL_NAME,
                     LateralStretch(axis),
-                    self.t_s,
-                    self.lateral_stretch,
+                    t_s=self.t_s,
+                    values=self.lateral_stretch,
                     sigma=self.lateral_sigma,
                     points_m=[point_m],
                     unit="1",
@@ -361,8 +364,8 @@ class Specimen:
         return Gauge(
             name,
             NominalStress(direction),
-            self.t_s,
-            values,
+            t_s=self.t_s,
+            values=values,
             sigma=self.sigma_pa,
             grasp=2 + normal,
             frame="world",

@@ -172,7 +172,7 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
     table = read_columns(
         path,
         layout.quantities,
-        layout.columns,
+        column_names=layout.columns,
         blank_allowed=True,
         requires_times=layout.requires_times,
     )

@@ -163,7 +163,11 @@ def read_wrench(
     """
     quantities = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
     table = read_columns(
-        path, quantities, columns, blank_allowed=True, requires_times=timed
+        path,
+        quantities,
+        column_names=columns,
+        blank_allowed=True,
+        requires_times=timed,
     )
     factor = sign * (area_m2 or 1.0) / symmetry
     return _without_rounding(table.t_s), factor * _axis_components(
@@ -217,7 +221,9 @@ def read_displacement(
         * np.nan_to_num(_axis_components(table, DISPLACEMENTS, axis=axis))
     )
     return PoseSequence(
-        table.t_s, shifts_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1))
+        table.t_s,
+        shifts_m,
+        quaternions_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1)),
     )
 
 
@@ -267,7 +273,9 @@ def _read_displacements(
     quantities = (
         (*DISPLACEMENTS, DISPLACEMENT) if length_m is None else (STRAIN,)
     )
-    return read_columns(path, quantities, columns, requires_times=timed)
+    return read_columns(
+        path, quantities, column_names=columns, requires_times=timed
+    )
 
 
 def _axis_components(

@@ -262,7 +262,10 @@ def _hessian_values(
     def values(z: Array, weight: float, multipliers: Array, out: Array) -> None:
         """Write the Hessian's values, see `HessianValues`."""
         collocation.hessian_values(
-            z, weight, multipliers if hessian == "exact" else None, out
+            z,
+            weight,
+            multipliers=multipliers if hessian == "exact" else None,
+            out=out,
         )
 
     return values

@@ -210,7 +210,7 @@ class _ScaledMerit:
         self.free = np.flatnonzero(problem.is_free)
         _, jacobian = problem.constraints_and_jacobian(z)
         loss = problem.nlp.hessian(
-            z, 1.0, np.zeros(problem.nlp.constraint_count)
+            z, 1.0, multipliers=np.zeros(problem.nlp.constraint_count)
         ).diagonal()
         diagonal = loss + merit.rho * (jacobian.power(2).sum(axis=0))
         diagonal = diagonal[self.free]
@@ -236,8 +236,7 @@ class _ScaledMerit:
         self.angle = np.arcsin(share)
         self.start = np.zeros(len(self.free))
         self.replacement_value = np.inf
-        self._last_s: Array | None = None
-        self._last_point: _MeritEvaluation | None = None
+        self._last: tuple[Array, _MeritEvaluation] | None = None
 
     def to_variables(self, s: Array) -> Array:
         """Return all variables (variables,) from s (free,); constant ones have their initial
@@ -269,12 +268,12 @@ class _ScaledMerit:
         """Return the merit function at s (free,); a call with the same s as the last one does not
         evaluate again.
         """
-        if self._last_point is None or not np.array_equal(self._last_s, s):
+        if self._last is None or not np.array_equal(self._last[0], s):
             z = self.to_variables(s)
             value, gradient = self.merit.value_and_gradient(z)
-            self._last_s = s.copy()
-            self._last_point = _MeritEvaluation(z, value, gradient=gradient)
-        return self._last_point
+            point = _MeritEvaluation(z, value, gradient=gradient)
+            self._last = s.copy(), point
+        return self._last[1]
 
     def value(self, s: Array) -> float:
         """Return the merit function m at s (free,), without its gradient; infinite if an element is

@@ -164,7 +164,7 @@ class _MeritPoint:
         The Jacobian of the point that was evaluated before is overwritten.
         """
         rows, jacobian = merit.problem.constraints_and_jacobian(z)
-        gradient = merit.gradient(z, rows, jacobian)
+        gradient = merit.gradient(z, rows, jacobian=jacobian)
         projected = merit.problem.project_gradient(z, gradient)
         return cls(
             z,
@@ -203,7 +203,7 @@ def _quadratic_model(
         else np.zeros_like(point.rows)
     )
     with merit.problem.stopwatch.evaluating():
-        hessian = merit.problem.nlp.hessian(point.z, 1.0, weights)
+        hessian = merit.problem.nlp.hessian(point.z, 1.0, multipliers=weights)
     return _QuadraticModel(
         merit.problem,
         point.z,

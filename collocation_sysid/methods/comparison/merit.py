@@ -190,7 +190,7 @@ class MeritFunction:
             return np.inf, np.full(len(z), np.nan)
         rows, jacobian = self.problem.constraints_and_jacobian(z)
         return self.value_from_constraints(z, rows), self.gradient(
-            z, rows, jacobian
+            z, rows, jacobian=jacobian
         )
 
     def gradient(self, z: Array, rows: Array, jacobian: sp.csc_array) -> Array:

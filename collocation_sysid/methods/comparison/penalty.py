@@ -370,7 +370,9 @@ class _PenaltySolve:
         self.stage = Stage(merit, options.first_gradient)
         self.iterations = 0
         self.gradient = np.inf
-        curvature = nlp.hessian(self.variables, 1.0, no_weights).diagonal()
+        curvature = nlp.hessian(
+            self.variables, 1.0, multipliers=no_weights
+        ).diagonal()
         self._curvature = float(curvature.max(initial=0.0))
         self._every = (
             EVERY_OF_FIRST_ORDER if options.inner in FIRST_ORDER else EVERY
@@ -415,10 +417,10 @@ class _PenaltySolve:
             status,
             f"{reason} Remaining violation of the equations of motion at ρ = {merit.rho:.3g}: "
             f"{self._violation()}.",
-            self.problem.to_original(self.variables),
-            self.problem.to_original_multipliers(estimate),
-            self.iterations,
-            self.problem.evaluations,
+            z=self.problem.to_original(self.variables),
+            multipliers=self.problem.to_original_multipliers(estimate),
+            iterations=self.iterations,
+            evaluations=self.problem.evaluations,
         )
 
     def _minimise(self) -> Stage:
@@ -484,7 +486,7 @@ class _PenaltySolve:
         nlp = self.problem.original
         z = self.problem.to_original(self.variables)
         self.recorder.add_variables(
-            self.iterations, z, nlp.objective(z) / nlp.loss_scale
+            self.iterations, z, loss=nlp.objective(z) / nlp.loss_scale
         )
 
     def _violation(self) -> ConstraintViolation:

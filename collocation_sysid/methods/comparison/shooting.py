@@ -97,7 +97,14 @@ class Shooting(Options):
             recorder.notes.append(
                 f"{failed}; each time the search continued with a shorter step"
             )
-        return recorder.solution(status, message, z, multipliers, shots, shots)
+        return recorder.solution(
+            status,
+            message,
+            z=z,
+            multipliers=multipliers,
+            iterations=shots,
+            evaluations=shots,
+        )
 
 
 def simulate_variables(
@@ -379,6 +386,8 @@ class _ShootingSearch:
         if self.best is None or shot.objective < self.best.objective:
             self.best = shot
             self.recorder.add_variables(
-                self.simulations, z, shot.objective / collocation.loss_scale
+                self.simulations,
+                z,
+                loss=shot.objective / collocation.loss_scale,
             )
         return shot

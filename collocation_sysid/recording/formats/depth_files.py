@@ -215,7 +215,7 @@ def _read_topic(
             for each in messages
         ]
         return DepthFileContent([], clouds, t_s=t_s)
-    images = _LazyImages(messages, count_m, path)
+    images = _LazyImages(messages, count_m, path=path)
     matrix = None
     distortion = None
     if camera is not None:

@@ -65,7 +65,9 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
         f"{name} {quantity} {axis}".strip() for _, name, quantity, axis in heads
     ]
     table = table_of_rows(titles, rows[top + 1 :])
-    header.require_count("Total Exported Frames", len(table.rows), "frames")
+    header.require_count(
+        "Total Exported Frames", len(table.rows), what="frames"
+    )
     rate_key = next((key for key in _RATES if header.number(key)), _RATES[0])
     (unit, _) = header.entries.get("Length Units", ("", 0))
     raw = tracks_of_table(

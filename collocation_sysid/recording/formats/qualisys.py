@@ -40,7 +40,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
         key: ("".join(row.cells[1:2]), row.line) for key, row in above.items()
     }
     header = Header(header_values)
-    header.require_count("NO_OF_MARKERS", len(labels), "marker names")
+    header.require_count("NO_OF_MARKERS", len(labels), what="marker names")
     frames = rows[count:]
     leading = _leading_columns(frames, 3 * len(labels))
     if frames and _has_column_names(frames[0]):

@@ -206,7 +206,7 @@ def tracks_of_frames(
         [*leading, *(f"{label} {axis}" for label in labels for axis in "XYZ")],
         frames,
     )
-    header.require_count(count_key, len(frames), "frames")
+    header.require_count(count_key, len(frames), what="frames")
     places = [
         range(k, k + 3) for k in range(len(leading), len(table.columns), 3)
     ]

@@ -48,7 +48,9 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
             "names of the markers, and X1, Y1, Z1 … below them",
             where=f"line {names.line}",
         )
-    header.require_count("NumMarkers", len(labels), "marker names", names.line)
+    header.require_count(
+        "NumMarkers", len(labels), what="marker names", line=names.line
+    )
     return tracks_of_frames(
         header,
         "NumFrames",
