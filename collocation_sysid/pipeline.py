@@ -76,6 +76,7 @@ class Run(SolvedProblem):
     """
 
     def __str__(self) -> str:
+        """Return the summary of the run as text, as printed in the terminal after a solve."""
         from .result.run_sections import run_summary
 
         return plain_text(run_summary(self.result))
@@ -395,7 +396,9 @@ def _checked(
 
 
 def _changes(answer: Run, say: Log) -> ResidualChanges:
-    """Return the changes of the residuals by the systematic effects and by the routine probes."""
+    """Return the changes of the residuals of a run by the systematic effects and by the routine
+    probes; `say` is called with a text before.
+    """
     say("computing the effects of assumptions")
     solution = answer.solution
     deviations = probed_deviations(answer.problem.uncertainty.considered)
@@ -457,7 +460,20 @@ def _probes(
     say: Log,
     deep: bool,
 ) -> tuple[Probe, ...]:
-    """Return the routine probes, or for a `deep` check those of subsets and of every assumption."""
+    """Return the routine probes, or for a `deep` check those of subsets and of every assumption,
+    with a text to `say` before.
+
+    Parameters
+    ----------
+    answer : Run
+        Run with uncertainties and systematic effects.
+    fit : LinearisedFit
+        Fit at the solution.
+    changes : ResidualChanges
+        Changes of the residuals by all effects, as of `_changes`.
+    say : callable
+    deep : bool
+    """
     solution = answer.solution
     options = answer.problem.uncertainty
     deviations = probed_deviations(options.considered)

@@ -140,7 +140,8 @@ class LazyCommands(TyperGroup):
         return get_command_from_info(info, **how)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the name and the command that the arguments begin with, and the other arguments.
+        """Return the name and the command that the arguments `args` begin with, and the other
+        arguments.
 
         Raises
         ------
@@ -162,7 +163,9 @@ class LazyCommands(TyperGroup):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a line on each command into the help, by the groups of `COMMAND_GROUPS`."""
+        """Write a line on each command into the help, by the groups of `COMMAND_GROUPS`, to
+        `formatter`; the context is not used.
+        """
         sources = _command_sources()
         for title, names in COMMAND_GROUPS.items():
             with formatter.section(title):
@@ -206,6 +209,7 @@ def _root(
         ),
     ] = False,
 ) -> None:
+    """Do nothing: the options of the program itself act by their callbacks, before any command."""
     pass
 
 

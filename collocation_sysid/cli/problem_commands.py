@@ -158,9 +158,11 @@ def solve(options: SolveCommand) -> None:
 def _draw_pictures(
     finished: Run, folder: Path, options: SolveCommand
 ) -> Result:
-    """Draw the pictures of a run, and return its result with the time that they took.
+    """Draw the pictures of a finished run into its folder, and return its result with the time that
+    they took.
 
-    After an interrupt the result without that time is returned, and a message says how to go on.
+    After an interrupt the result without that time is returned, and a message on stderr says how to
+    go on. Progress is shown as `options` states.
     """
     from ..result.solve_progress import SolveProgress
 

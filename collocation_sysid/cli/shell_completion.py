@@ -128,7 +128,17 @@ def _completed_command(
 def _options(
     command: Any, context: Any, values: Mapping[str, tuple[str, ...]]
 ) -> tuple[CompletedOption, ...]:
-    """Return the options of a command; one with a negation, such as --no-pictures, yields two."""
+    """Return the options of a command that help shows; one with a negation, such as --no-pictures,
+    yields two.
+
+    Parameters
+    ----------
+    command : Command
+    context : Context
+        Context of the group of commands.
+    values : mapping of str to tuple of str
+        Known values by name of the parameter; for others see `_values`.
+    """
     options = []
     for parameter in command.get_params(context):
         if parameter.param_type_name != "option" or parameter.hidden:
@@ -284,7 +294,7 @@ def zsh_script(
 
 
 def _described(name: str, description: str) -> str:
-    """Return an entry of a menu of zsh, quoted."""
+    """Return an entry of a menu of zsh, "name:description", quoted for the shell."""
     return shlex.quote(f"{name}:{description}")
 
 

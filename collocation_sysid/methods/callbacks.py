@@ -128,7 +128,9 @@ class LagrangianGradient(TimedFunction):
         return nfwd == 1
 
     def get_forward(self, nfwd, name, inames, onames, opts):
-        """Return the function of the directional derivative (CasADi's interface)."""
+        """Return the function of the directional derivative, `hessian_product`, with CasADi's name
+        for it (CasADi's interface); the other arguments are not used.
+        """
         inputs = [*self._inputs, *self._outputs, *self._inputs]
         self._forward = TimedFunction(
             name,
@@ -302,8 +304,8 @@ class NlpFunctions:
     def _upper_triangle(
         self, z: Array, weight: float, multipliers: Array
     ) -> Array:
-        """Return the values of the upper triangle of the Hessian at z, in the order of
-        `hessian_structure`.
+        """Return the values of the upper triangle of the Hessian of weight · f + multipliers · g at
+        z, in the order of `hessian_structure`, as a new array.
         """
         values = np.empty(len(self.collocation.hessian_structure[1]))
         self._upper_values(z, weight, multipliers, values)

@@ -97,10 +97,12 @@ class Continuation(Options):
         watch: Watch | None = None,
         start: Array | None = None,
     ) -> Solution:
-        """Solve the NLP, see `Method`; the first part starts from the first rows of `start`.
+        """Solve the NLP, see `Method`; the first part starts from the first rows of `start`, by
+        default as the method of the parts does.
 
-        Numbers and times of the history continue from part to part. The solve ends with a part that
-        was interrupted or refused; the notes contain the result of each part.
+        Numbers and times of the history, with whose entries `watch` is called, continue from part
+        to part. The solve ends with a part that was interrupted or refused; the notes contain the
+        result of each part.
         """
         climb = _ContinuationState(
             self.method, Recorder(self.name, collocation, watch=watch)

@@ -425,8 +425,8 @@ def _with_body(experiment: Experiment, body: Body) -> Experiment:
 def _restore_segment(
     experiment: Experiment, chart: MarkerAssociation, rest: dict[str, Any]
 ) -> Transcription:
-    """Return a transcription from its experiment, its association without body, and its
-    other arguments.
+    """Return a transcription from its experiment, its association `chart` without body, and its
+    other arguments by name; workers run this function.
     """
     return Transcription(
         experiment, association=_with_fields(chart, experiment.body), **rest

@@ -176,7 +176,11 @@ class InteriorPoint(Options):
         watch: Watch | None = None,
         start: Array | None = None,
     ) -> Solution:
-        """Solve the NLP, see `Method`.
+        """Solve the NLP from `start`, by default from the guess, as `initial` states; `watch` is
+        called with every entry of the history. See `Method`.
+
+        With contact as complementarity, and obstacles, further solves follow a converged one, see
+        `solve_complementarity`.
 
         Raises
         ------

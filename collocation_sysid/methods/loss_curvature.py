@@ -164,7 +164,7 @@ def _tangent_direction(
     collocation: Collocation, iterate: Iterate, k: int
 ) -> Array:
     """Return the change (variables,) of all variables per unit of the parameter with index k, along
-    the equations of motion; other parameters do not change.
+    the equations of motion linearised at `iterate`; other parameters do not change.
     """
     unit = np.eye(len(iterate.p))[k]
     position_changes = [

@@ -161,6 +161,15 @@ def _create_solver(
 ) -> ca.Function:
     """Return CasADi's solver of a program.
 
+    Parameters
+    ----------
+    plugin : str
+        CasADi's name of the solver.
+    functions : NlpFunctions
+        Functions of the program.
+    settings : dict
+        Options of the plugin, with its functions of derivatives.
+
     Raises
     ------
     InputError
@@ -329,7 +338,9 @@ def _interruptible(monitor: IterationMonitor) -> Iterator[None]:
         del handlers[signal.SIGTERM]
 
     def request(number: int, _frame: object) -> None:
-        """Request a stop, and let the next signal interrupt the process."""
+        """Request a stop by a signal, and let the next signal of this number
+        interrupt the process.
+        """
         monitor.stop = True
         signal.signal(number, signal.default_int_handler)
 

@@ -109,7 +109,7 @@ class SearchOptions(Options):
 
 
 @dataclass(frozen=True, eq=False)
-class _CameraTrial:
+class _ReassociatedTrial:
     """Trial whose depth points have been associated at its own estimates.
 
     Attributes
@@ -208,7 +208,7 @@ class ReducedSearch:
                 for part in collocation.iterates(start)
             ]
         self.point: Iterate | None = None
-        self.camera_trial: _CameraTrial | None = None
+        self.camera_trial: _ReassociatedTrial | None = None
         nodes = [segment.body.nodes_m for segment in collocation.transcriptions]
         self.edge_m = min(
             segment.length_m for segment in collocation.transcriptions
@@ -635,7 +635,7 @@ class ReducedSearch:
         after = self._reassociate(horizon, trial)
         if self.collocation is not before:
             self.reassociations -= 1  # it counts when the trial is accepted
-        self.camera_trial = _CameraTrial(
+        self.camera_trial = _ReassociatedTrial(
             trial, self.collocation, reassociated=after
         )
         measurements = self.collocation.measurement_count

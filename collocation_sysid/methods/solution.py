@@ -612,8 +612,8 @@ def constraint_multipliers(
 def _set_grasp_multipliers(
     collocation: Collocation, z: Array, multipliers: Array
 ) -> None:
-    """Set the multipliers (constraints,) of prescribed displacements to minus the remaining
-    gradient of the Lagrangian, in place.
+    """Set the multipliers (constraints,) of prescribed displacements at variables z to minus the
+    remaining gradient of the Lagrangian, in place; the others are unchanged.
 
     The constraints of prescribed displacements have unit Jacobian rows.
     """

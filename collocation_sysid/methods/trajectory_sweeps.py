@@ -299,8 +299,8 @@ def reassociate(
 def extrapolate(
     transcription: Transcription, sweep_result: SweepResult, step: Array
 ) -> Array:
-    """Return positions (rows, 3n) [m] after the feasibility step of a sweep and a step (k,) of the
-    experiment's parameters, to first order.
+    """Return positions (rows, 3n) [m] after the feasibility step of `sweep_result` and a step (k,)
+    of the experiment's parameters, to first order.
     """
     return (
         sweep_result.x

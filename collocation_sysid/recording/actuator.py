@@ -149,7 +149,8 @@ class Actuator(ABC, Generic[S]):
         self, data: ca.SX, factor: Any, offset: Any, log_lag_ratio: Any
     ) -> ca.SX:
         """Return the amplitude c for a calibration, as an expression of `input_data` (d,) at one
-        time; without a lag `log_lag_ratio` is ignored.
+        time; without a lag `log_lag_ratio` is ignored. Factor and offset are as of `Calibration`,
+        numbers or expressions.
         """
         return self.energy_amplitude(data, factor, offset=offset)
 
@@ -157,8 +158,8 @@ class Actuator(ABC, Generic[S]):
     def energy_amplitude(
         self, declared_value: Any, factor: Any, offset: Any
     ) -> Any:
-        """Return the amplitude c for a stated tension or pressure: numbers, arrays or CasADi
-        expressions.
+        """Return the amplitude c for a stated tension or pressure `declared_value`, a factor on it
+        and an offset that is lost: numbers, arrays or CasADi expressions.
         """
 
     def energy_amplitude_at(self, t_s: Array) -> Array:

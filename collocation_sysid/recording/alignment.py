@@ -202,9 +202,10 @@ def _cut_to_poses(
 def _cut_to_window(
     table: MarkerTable, window_s: tuple[float, float]
 ) -> MarkerTable:
-    """Return the samples within a window, its first and last time [s] included.
+    """Return the samples of a table within a window, its first and last time [s] included.
 
-    Times count as inside up to `STEP_TOLERANCE` median intervals beyond it.
+    Times count as inside up to `STEP_TOLERANCE` median intervals beyond it. Notes of the table are
+    left out.
 
     Raises
     ------

@@ -51,8 +51,8 @@ def read_only_floats(
 def float_converter(
     shape: tuple[int | None, ...], name: str, finite: bool = True
 ) -> Callable[[ArrayLike], Array]:
-    """Return a function that copies values to a read-only array; the arguments are those of
-    `read_only_floats`, whose errors the returned function raises.
+    """Return a function that copies values to a read-only array; shape, name and finite are
+    arguments of `read_only_floats`, whose errors the returned function raises.
     """
     return lambda values: read_only_floats(
         values, shape, name=name, finite=finite
@@ -97,7 +97,7 @@ def read_only_nodes(
     ------
     InputError
         If the values are not whole numbers (of an integer type) from 0 upwards, or the shape
-        differs.
+        differs; `name` is what the indices are, for the message.
     """
     indices = np.asarray(values)
     if indices.size and not np.issubdtype(indices.dtype, np.integer):
@@ -122,7 +122,9 @@ def point_text(point: ArrayLike) -> str:
 def _require_shape(
     shape: tuple[int, ...], expected: tuple[int | None, ...], name: str
 ) -> None:
-    """Raise an `InputError` unless `shape` matches `expected`, in which None allows any length."""
+    """Raise an `InputError` about `name` unless `shape` matches `expected`, in which None allows
+    any length.
+    """
     matches = len(shape) == len(expected) and all(
         want is None or have == want
         for have, want in zip(shape, expected, strict=True)

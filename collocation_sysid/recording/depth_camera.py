@@ -77,6 +77,9 @@ class DepthCamera:
     poses: PoseSequence | None = key(converter=_require_poses, default=None)
 
     def __post_init__(self) -> None:
+        """Check the camera, and store matrix, distortion and pose as read-only arrays, in place;
+        the pose is the identity by default.
+        """
         pose = read_only_floats(
             np.eye(4) if self.pose is None else self.pose, (4, 4), name="pose"
         )

@@ -71,8 +71,8 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
 
 
 def _interpolated(state: Array | None, body: Body, finer: Body) -> Array | None:
-    """Return nodal vectors (n, 3) of a body, interpolated to the nodes (n', 3) of the finer body by
-    the shape functions; None for None.
+    """Return nodal vectors `state` (n, 3) of a body, interpolated to the nodes (n', 3) of the finer
+    body by the shape functions; None for None.
     """
     if state is None:
         return None

@@ -90,6 +90,7 @@ class Grasp:
     wrench: Wrench | None = None
 
     def __post_init__(self) -> None:
+        """Check the grasp, see `_check_times_and_axes`."""
         self._check_times_and_axes()
 
     def _check_times_and_axes(self) -> None:

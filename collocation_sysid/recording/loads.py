@@ -248,6 +248,7 @@ class Force(Load):
     description_name: ClassVar[str] = "force"
 
     def __post_init__(self) -> None:
+        """Check window and forces, and store the forces as (1, 3) or (m, 3), in place."""
         super().__post_init__()
         course = TimeSeries(self.force_n, self.t_s, what="force_n", shape=(3,))
         vars(self).update(force_n=course.values, t_s=course.t_s)

@@ -160,6 +160,7 @@ def _label_chooser(
     def choose(
         labels: Sequence[str], excluded: Collection[str] = ()
     ) -> list[int]:
+        """Return the indices of the chosen labels, see `LabelChooser`."""
         _require_distinct(labels, "two markers are labelled")
         for label in renamed:
             _require_one_of(label, labels, what="label")
@@ -264,8 +265,9 @@ def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
 
 
 def _require_rate(t_s: Array, key: str, rate_hz: float) -> None:
-    """Raise an `InputError` if neither the mean nor the median time step agrees with a frame rate
-    within `_RATE_TOLERANCE`; fewer than two times are not checked.
+    """Raise an `InputError` if neither the mean nor the median step of times (T,) agrees with a
+    frame rate within `_RATE_TOLERANCE`; fewer than two times are not checked. `key` is where the
+    rate is stated, for the message.
 
     Lost frames change the mean step, and coarsely printed times the median: one of them must agree.
     """

@@ -144,6 +144,9 @@ class NuisanceRow:
     considered: float | None = None
 
     def __post_init__(self) -> None:
+        """Set the default label, in place: the name, with the component of marker parameters and
+        the axis of vectors.
+        """
         if not self.label:
             which = " of {which}" * (self.of == "marker")
             axis = ", {axis}" * bool(self.axes)

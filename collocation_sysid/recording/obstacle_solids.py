@@ -68,6 +68,7 @@ def _unit_vector_converter(name: str) -> Any:
     """
 
     def made(value: Any) -> Array:
+        """Return the normalised vector (3,)."""
         vector = float_converter((3,), name)(value)
         length = float(np.linalg.norm(vector))
         if not length > 0:
@@ -328,7 +329,9 @@ def orthogonal_axes(normal: Array) -> Array:
 
 
 def _circle(centre_m: Array, axis: Array, radius_m: float) -> Array:
-    """Return a closed polyline (33, 3) of the circle about a centre (3,) across an axis (3,)."""
+    """Return a closed polyline (33, 3) of the circle with the radius `radius_m` [m] about a centre
+    (3,), across an axis (3,) of any length.
+    """
     angle = np.linspace(0, 2 * np.pi, 33)
     round_m = np.stack(
         [np.cos(angle), np.sin(angle)], axis=1

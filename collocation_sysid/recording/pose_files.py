@@ -109,8 +109,8 @@ def read_poses(
 def _checked_sequence(
     t_s: Array, positions_m: Array, quaternions: Array, row_names: list[str]
 ) -> PoseSequence:
-    """Return a pose sequence from times (T,) [s], positions (T, 3) [m] and quaternions (T, 4),
-    ordered x, y, z, w.
+    """Return a smooth pose sequence from times (T,) [s], positions (T, 3) [m] and quaternions (T,
+    4), ordered x, y, z, w.
 
     Raises
     ------

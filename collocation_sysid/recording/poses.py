@@ -115,12 +115,13 @@ class PoseSequence:
         interpolation: Interpolation = "smooth",
     ) -> PoseSequence:
         """Return the poses of 4×4 matrices [[R, p], [0, 1]], (m, 4, 4) [m], at the times `t_s`
-        (m,).
+        (m,); `interpolation` as of the class.
 
         Raises
         ------
         InputError
-            If shapes disagree, or a matrix is no rigid motion; the first such matrix is named.
+            If shapes disagree, or a matrix is no rigid motion; the first such matrix is named,
+            counting from 1.
         """
         times = read_only_floats(
             t_s, (None,), name="t_s of the poses", finite=False

@@ -23,7 +23,9 @@ _DIGITS = "%.12g"
 
 
 def write_poses_csv(path: str | Path, poses: PoseSequence) -> None:
-    """Write poses as `read_poses` reads them; the file is replaced only when it is complete."""
+    """Write poses as `read_poses` reads them, without their interpolation; the file is replaced
+    only when it is complete.
+    """
     values = np.column_stack(
         [poses.t_s, poses.positions_m, poses.quaternions_xyzw]
     )

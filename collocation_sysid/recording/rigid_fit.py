@@ -241,7 +241,8 @@ def align_to_template(
 
 def least_rigid_marker(reference_m: Array, positions_m: Array) -> int:
     """Return the index, from 0, of the marker whose distances to the others differ most in sum
-    between two configurations, (B, 3) each; distances to NaN are ignored.
+    between two configurations, the places `reference_m` and `positions_m`, (B, 3) each; distances
+    to NaN are ignored.
 
     The frames of the configurations need not agree, as distances do not depend on them. A rigid fit
     would distribute one marker's motion over all of them.

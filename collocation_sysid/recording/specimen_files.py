@@ -239,7 +239,9 @@ def _one_of(
 
 
 def _complete(table: QuantityTable, quantity: Quantity) -> Array:
-    """Return the values (T,) of a column; raise `InputError` if a cell is blank."""
+    """Return the values (T,) of the column of a quantity; raise an `InputError` with the line if a
+    cell is blank.
+    """
     values = table.values[quantity.key]
     if (blank := np.isnan(values)).any():
         raise table.grid.error_at(
@@ -396,7 +398,8 @@ def _area_ratios(
     stress.
 
     Both are 1 in "confined", "simple-shear" and "volumetric" tests. Otherwise they follow from the
-    stretches, with the lateral stretch of an incompressible specimen where `lateral` is None.
+    strains (T,) and the lateral stretch (T,); where `lateral` is None, from that of an
+    incompressible specimen. `second_strain` is None unless the test is biaxial.
     """
     stretch = 1 + strain
     if layout.test in ("confined", "simple-shear", "volumetric"):

@@ -233,8 +233,10 @@ def displaced_axes(
     axis: str = "z",
     length_m: float | None = None,
 ) -> str:
-    """Return the axes along which a file has displacements, such as "z"; empty if it has none.
-    Arguments and errors are those of `read_displacement`.
+    """Return the axes along which a file has displacements, such as "z" or "xy"; empty if it has
+    none, and without regard to their values.
+
+    Arguments and errors are those of `read_displacement`; times are not required.
     """
     shifts = _axis_components(
         _read_displacements(path, columns, length_m=length_m, timed=False),
@@ -281,7 +283,8 @@ def _read_displacements(
 def _axis_components(
     table: QuantityTable, quantities: Sequence[Quantity], axis: str
 ) -> Array:
-    """Return the values (T, n) of n quantities, one for each axis; NaN where missing.
+    """Return the values (T, n) of n quantities of a table, one for each axis, in the order of
+    `quantities`; NaN where missing.
 
     A machine's quantity, whose name contains no axis, becomes the component along `axis` ("x", "y"
     or "z").

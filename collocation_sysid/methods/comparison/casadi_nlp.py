@@ -81,7 +81,8 @@ class CasadiSolver(Options):
         watch: Watch | None = None,
         start: Array | None = None,
     ) -> Solution:
-        """Solve the NLP, see `Method`.
+        """Solve the NLP from `start`, by default from a simulation at the guess; `watch` is called
+        with every entry of the history. See `Method`.
 
         Raises
         ------
@@ -239,9 +240,20 @@ def refusal_reason(name: str) -> str | None:
 def _judge(
     collocation: Collocation, status: Status, z: Array, multipliers: Array
 ) -> Status:
-    """Return the status of a solution after a check of its constraints and optimality: a converged
-    one that violates constraints is infeasible, and one that stalled is acceptable if it is nearly
-    optimal.
+    """Return the status of a solution after a check of its constraints and optimality at z.
+
+    A converged one that violates constraints by more than `FEASIBLE` is infeasible; one that
+    stalled or failed numerically is acceptable if the optimality conditions hold within
+    `ACCEPTABLE`; other statuses are returned unchanged.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Given problem.
+    status : Status
+        Status by the solver.
+    z : (variables,) array
+    multipliers : (constraints,) array
     """
     if status.converged:
         violation = np.abs(collocation.constraint_values(z)).max(initial=0.0)
@@ -260,7 +272,7 @@ def _hessian_values(
     """
 
     def values(z: Array, weight: float, multipliers: Array, out: Array) -> None:
-        """Write the Hessian's values, see `HessianValues`."""
+        """Write the Hessian's values of weight · f + multipliers · g at z to `out`, in place."""
         collocation.hessian_values(
             z,
             weight,

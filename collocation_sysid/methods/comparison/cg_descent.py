@@ -178,7 +178,9 @@ def minimise_cg_descent(
     f, g = counted(x)
 
     def result(ending: Ending, iterations: int) -> CgResult:
-        """Return the last iterate as the result."""
+        """Return the last iterate as the result, with the reason for the end and the number of
+        iterations.
+        """
         return CgResult(
             x,
             f,
@@ -582,7 +584,9 @@ class _LineSearch:
 
 
 def _secant(a: _LineTrial, b: _LineTrial) -> float:
-    """Return the zero of the linear interpolation of both slopes; NaN if they are equal."""
+    """Return the step size at which the linear interpolation of the slopes of two trials is zero;
+    NaN if the slopes are equal.
+    """
     if a.slope == b.slope:
         return np.nan
     return (a.step * b.slope - b.step * a.slope) / (b.slope - a.slope)

@@ -299,8 +299,9 @@ class _ScaledMerit:
         )
 
     def project_gradient(self, s: Array, z: Array, gradient: Array) -> Array:
-        """Return ∂m/∂z (variables,) with zeros at active bounds; derivatives by mapped variables
-        decrease towards their bounds.
+        """Return ∂m/∂z (variables,) at s (free,) and its z, from the `gradient` there, with zeros
+        at active bounds; derivatives by mapped variables are multiplied by the slope of the map, at
+        most 1, so that they decrease towards the bounds.
         """
         projected = self.merit.problem.project_gradient(z, gradient)
         projected[self.free] *= np.minimum(np.abs(self._slopes(s)), 1.0)

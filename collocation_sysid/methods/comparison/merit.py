@@ -194,8 +194,8 @@ class MeritFunction:
         )
 
     def gradient(self, z: Array, rows: Array, jacobian: sp.csc_array) -> Array:
-        """Return ∇m (variables,) from the constraints g (`rows`) and their Jacobian at z, zero for
-        constant variables.
+        """Return ∇m (variables,) at z from the constraints g (`rows`) and `jacobian`, ∂g/∂z, there;
+        zero for constant variables.
         """
         slope = self.problem.nlp.gradient(
             z

@@ -158,7 +158,8 @@ class PenaltyOptions(Options):
         watch: Watch | None = None,
         start: Array | None = None,
     ) -> Solution:
-        """Solve the NLP, see `Method`; entries of the history count inner iterations.
+        """Solve the NLP from `start`, by default from a simulation at the guess; see `Method`.
+        Entries of the history, with which `watch` is called, count inner iterations.
 
         Grasped nodes of the solution have their prescribed positions, where its violation is
         evaluated.
@@ -447,7 +448,9 @@ class _PenaltySolve:
         done = 0
 
         def report(z: Array, value: float, projected: Array) -> None:
-            """Store an iterate, add it to the history now and then, and check the limits."""
+            """Store an iterate z with its projected gradient, add it to the history now and then,
+            and check the limits; its merit `value` is not used.
+            """
             nonlocal done
             self.variables = z
             self.gradient = float(np.abs(projected).max(initial=0.0))

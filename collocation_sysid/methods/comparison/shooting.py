@@ -73,11 +73,11 @@ class Shooting(Options):
         watch: Watch | None = None,
         start: Array | None = None,
     ) -> Solution:
-        """Solve the NLP, see `Method`; entries of the history are simulations better than all
-        before.
+        """Solve the NLP, see `Method`; entries of the history, with which `watch` is called, are
+        simulations better than all before.
 
-        Only the parameters of `start` are used. If their simulation fails, the status says so and
-        the positions are those of a rigid motion with the grasp.
+        Only the parameters of `start` are used, by default the guess. If their simulation fails,
+        the status says so and the positions are those of a rigid motion with the grasp.
         """
         recorder = Recorder(
             self.name, collocation, watch=watch, max_time_s=self.max_time_s

@@ -207,6 +207,7 @@ class _Bag:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Close the bag."""
         self._reader.close()
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
@@ -254,6 +255,7 @@ class _Mcap:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Close the file."""
         self._file.close()
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
@@ -269,7 +271,7 @@ class _Json:
 
     def decoder_for(self, message_encoding: str, schema: Any) -> Any:
         """Return the function that decodes a message to objects with attributes; None for another
-        encoding than JSON.
+        encoding than "json". The schema is not used.
         """
         if message_encoding != "json":
             return None
@@ -319,7 +321,8 @@ class _Dataset:
         self.topics.pop("timestamp", None)
         return self
 
-    def __exit__(self, *_: object) -> None: ...
+    def __exit__(self, *_: object) -> None:
+        """Do nothing: no file is open."""
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Yield time [ns] and values of each frame of the episode, as objects with `name` and

@@ -96,9 +96,11 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
 def _column_headings(
     above: Sequence[Row], axes: Row
 ) -> list[tuple[str, str, str, str]]:
-    """Return type, name, quantity and axis of every column.
+    """Return type, name, quantity and axis of every column, from the rows of the header `above` and
+    the row of the axes.
 
-    Older files do not label the rows of the header; the first two are then types and names.
+    Older files do not label the rows of the header; the first two are then types and names. The
+    quantities are in the last one. Missing cells are blank.
     """
     width = len(axes.cells)
     padded = [(row.cells + [""] * width)[:width] for row in above]

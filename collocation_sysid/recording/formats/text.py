@@ -74,6 +74,7 @@ def names_file_in_errors(
 
     @wraps(read)
     def reader(path: Any, *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call the reader; its `InputError`s name `path`."""
         with located(path):
             return read(path, *args, **kwargs)
 

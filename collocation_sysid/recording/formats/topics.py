@@ -371,6 +371,8 @@ def _points_of_message(
 ) -> dict[str, tuple[float, ...]]:
     """Return positions (x, y, z) by name: of a single point, or of those items of the first list
     that have a position; empty if there are none.
+
+    A single point is named by its frame, else "point"; for items see `_item_name`.
     """
     if _is_vector(one := _nested_field(message, "point")):
         return {
@@ -405,7 +407,9 @@ def _position_of_item(item: Any) -> tuple[float, ...] | None:
 
 
 def _item_name(item: Any, index: int, *, by_namespace: bool) -> str:
-    """Return the name of an item of a list; its number, counted from 1, if it has none."""
+    """Return the name of an item of a list; its number, `index` + 1, if it has none. With
+    `by_namespace` its namespace and a slash are put before it, if it has one.
+    """
     names = (_nested_field(item, name) for name in _NAMES)
     name = str(
         next((name for name in names if name not in (None, "")), index + 1)
@@ -482,9 +486,10 @@ def _transform_frames(transform: Any) -> tuple[str, str] | None:
 def _poses_of_transforms(
     messages: Iterable[tuple[int, Any]], start_ns: int
 ) -> Edges:
-    """Return poses of child frames in their parents, by (parent, child) and time [s].
+    """Return poses of child frames in their parents, by (parent, child) and time [s], from messages
+    with their times of recording [ns]; times count from `start_ns` [ns].
 
-    Of several poses at a time the first is kept.
+    Of several poses at a time the first is kept; messages without transforms are ignored.
     """
     edges: Edges = {}
     for at_ns, message in messages:
@@ -753,8 +758,9 @@ def _has_joint(robot: Any, name: str) -> bool:
 def _require_joint_limits(
     name: str, angle: float, limits: tuple[float, float], address: TopicAddress
 ) -> None:
-    """Raise an `InputError` if a joint is beyond its limits [rad or m] by more than
-    `JOINT_LIMIT_SLACK`: the library would silently clip it.
+    """Raise an `InputError` if a joint is at an angle or displacement beyond its limits [rad or m]
+    by more than `JOINT_LIMIT_SLACK`: the library would silently clip it. The message names the
+    robot of `address`.
     """
     if (
         not limits[0] - JOINT_LIMIT_SLACK
