@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 PACKAGE = "collocation-sysid"
 # Extras for work on the package itself, and the collection of the others.
 DEVELOPMENT_EXTRAS = ("all", "dev", "docs", "test")
-# Linear solvers that IPOPT can be told to use, see the options of IPOPT.
+# Values of the option linear_solver of IPOPT.
 IPOPT_LINEAR_SOLVERS = (
     "mumps",
     "spral",
@@ -240,7 +240,11 @@ class InstallationReport:
 
 
 def check_installation() -> InstallationReport:
-    """Return the state of this installation; kernels of the self test are compiled and stored."""
+    """Return the state of this installation, with the result of a self test.
+
+    It takes seconds: kernels of the self test are compiled and stored, and other processes try the
+    linear solvers.
+    """
     dependencies = tuple(required_packages())
     self_test = _self_test_unless_missing(dependencies)
     return InstallationReport(
@@ -307,7 +311,9 @@ def _requirements(extra: str) -> Iterator[Requirement]:
 
 
 def _is_importable(module: str) -> bool:
-    """Return whether a module is found; False also for one that is blocked in `sys.modules`."""
+    """Return whether a module is found, without importing it; false also for one that is blocked in
+    `sys.modules`.
+    """
     try:
         return importlib.util.find_spec(module) is not None
     except ValueError:
@@ -459,7 +465,9 @@ def _identify_small_body() -> tuple[str, bool]:
     Returns
     -------
     message : str
+        Relative error of the modulus, or why the search did not converge.
     is_passed : bool
+        Whether it converged with an error below `SELF_TEST_TOLERANCE`.
     """
     import numpy as np
 

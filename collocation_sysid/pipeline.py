@@ -83,7 +83,7 @@ class Run(SolvedProblem):
 
     @cached_property
     def result(self) -> Result:
-        """Content of ``result.json`` as dataclasses."""
+        """Content of ``result.json`` as dataclasses, built at the first access."""
         return build_result(self)
 
     def table(self) -> str:

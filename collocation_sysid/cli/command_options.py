@@ -235,7 +235,10 @@ def _typed_fields(kind: type) -> list[tuple[str, Any, Any, tuple[Any, ...]]]:
     for name in dict.fromkeys(name for name in order if name in defaults):
         annotated = get_origin(hints[name]) is Annotated
         hint, *marks = get_args(hints[name]) if annotated else (hints[name],)
-        if get_origin(hint) in (Union, UnionType):  # of what may be None
+        if get_origin(hint) in (
+            Union,
+            UnionType,
+        ):  # for instance a type or None
             kinds = (
                 get_args(one)[0] if get_origin(one) is Annotated else one
                 for one in get_args(hint)
@@ -300,12 +303,8 @@ class RunFolderOptions:
     run_folder: Annotated[Path, typer.Argument()]
 
     def __post_init__(self) -> None:
-        """Refuse a file of a run folder in its place, and name the folder.
-
-        Raises
-        ------
-        InputError
-            If the run folder is a file.
+        """Raise an `InputError` if the run folder is a file; if it is one in a run folder, the
+        message names that folder.
         """
         require_run_folder(self.run_folder)
 
@@ -320,7 +319,9 @@ class OutputOptions(Options):
     def print_result(
         self, answer: Any, content: Shown | Iterable[Shown]
     ) -> None:
-        """Print the result as JSON if requested, or else its tables and lines `content`."""
+        """Print the result on stdout: `answer` as JSON if requested, or else its tables and lines
+        `content`.
+        """
         if self.as_json:
             typer.echo(as_json(answer))
         else:

@@ -340,7 +340,9 @@ def fish_script(
 
 
 def _fish_option(option: CompletedOption) -> str:
-    """Return the arguments of fish's `complete` for an option."""
+    """Return the arguments of fish's `complete` for an option: its names, its values (files if
+    these are not known) and its description.
+    """
     names = [
         f"-l {n[2:]}" if n.startswith("--") else f"-s {n[1:]}"
         for n in option.names

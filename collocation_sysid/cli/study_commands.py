@@ -195,7 +195,7 @@ def compare_models(options: CompareModelsCommand) -> None:
         if options.damping is not None
         else (),
     )
-    for variant in variants:  # a model that cannot be would fail every run
+    for variant in variants:  # an impossible model would fail every run
         Problem.read(
             variant.path, variant.overrides, allow_code=options.allow_code
         )

@@ -336,7 +336,7 @@ class NlpFunctions:
 
     @cached_property
     def _full(self) -> tuple[ca.Sparsity, NDArray[np.int64]]:
-        """Sparsity of the symmetric Hessian, and the index of each entry in the upper
+        """Sparsity of the symmetric Hessian, and for each of its entries the index in the upper
         triangle's values.
         """
         upper = self._sparsity("triu_hess")
@@ -347,7 +347,7 @@ class NlpFunctions:
         ) - 1
 
     def _sparsity(self, output: str) -> ca.Sparsity:
-        """Return the sparsity of an output, by name."""
+        """Return the sparsity of an output, by name; values and gradients are dense columns."""
         variables = self.collocation.variable_count
         rows = self.collocation.constraint_count
         if output == "jac_g":

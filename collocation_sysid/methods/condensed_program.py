@@ -311,7 +311,7 @@ class CondensedCollocation(Collocation):
 
     @property
     def phi_columns(self) -> slice:
-        """Slice of the nuisance parameters in z."""
+        """Slice of the nuisance parameters φ in z; none of them is eliminated."""
         first = int(self._condensed_indices[0][self.complete.phi_columns.start])
         return slice(first, first + self.nphi)
 
@@ -329,7 +329,9 @@ class CondensedCollocation(Collocation):
         return self.complete.pack(p, positions)[self._remaining[0]]
 
     def unpack(self, z: Array) -> tuple[Array, list[Array]]:
-        """Return parameters p and the positions (N, 3n) of each experiment [m]."""
+        """Return parameters p and the positions (N, 3n) of each experiment [m] from z, those of the
+        eliminated dofs included.
+        """
         return self.complete.unpack(self.complete_variables(z))
 
     def bounds(self) -> tuple[Array, Array]:
@@ -389,7 +391,7 @@ class CondensedCollocation(Collocation):
     # Values -------------------------------------------------------------------------------------
 
     def objective(self, z: Array) -> float:
-        """Return the loss L divided by the number of measurements."""
+        """Return the loss L in the scaling of the NLP at z."""
         return self.complete.objective(self.complete_variables(z))
 
     def gradient(self, z: Array) -> Array:

@@ -73,7 +73,7 @@ class Continuation(Options):
 
     @cached_property
     def method(self) -> Method:
-        """Method that solves the parts.
+        """Method that solves the parts: `stage` itself unless that is a mapping of options.
 
         Raises
         ------
@@ -145,8 +145,8 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
 
 
 def first_share(collocation: Collocation, share: float) -> Collocation:
-    """Return the problem with the first share, from 0 to 1, of every fitted experiment's samples;
-    validation recordings are left out.
+    """Return the problem with the first share, from 0 to 1, of every fitted experiment's samples,
+    at least `FEWEST` where there are as many; validation recordings are left out.
     """
     fitted = [segment.experiment for segment in collocation.transcriptions]
     shorter = [

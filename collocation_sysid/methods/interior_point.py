@@ -88,7 +88,8 @@ STEP_LIMIT = np.log(2.0)
 ROW_PIVOT = 1e-11
 # Largest product of that constant with the largest curvature of the objective.
 ROW_SLOWNESS = 1e-9
-# Of MUMPS: lower than what that diagonal gives, higher than what rounding makes of a zero.
+# Pivot tolerance of MUMPS: below the pivots that this diagonal gives, above those that rounding
+# gives in place of zero.
 PIVOT_TOLERANCE = 1e-12
 # Near the optimum variables and multipliers of bounds stay where they are, to this distance.
 WARM_PUSH = 1e-9
@@ -158,12 +159,8 @@ class InteriorPoint(Options):
     ipopt: Mapping[str, IpoptValue] = field(default_factory=dict)
 
     def require(self, experiments: Iterable[Experiment]) -> None:
-        """Check that the method can solve the experiments.
-
-        Raises
-        ------
-        InputError
-            If contact is a complementarity and an obstacle has friction; the message names both.
+        """Raise an `InputError` if contact is a complementarity and an obstacle has friction; the
+        message names experiment and obstacle.
         """
         if self.contact == "complementarity":
             for each in experiments:

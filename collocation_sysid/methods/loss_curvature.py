@@ -49,7 +49,7 @@ def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
     previous_curvature = float(step @ curvature @ step)
     if (
         previous_curvature != 0
-    ):  # a B that has become too large shrinks to what this step saw
+    ):  # scale down a B that exceeds the curvature along this step
         curvature = curvature * min(
             1.0, abs(float(step @ curvature_step) / previous_curvature)
         )
@@ -100,13 +100,8 @@ def with_curvature(
 
 
 def require_second_derivatives(collocation: Collocation) -> None:
-    """Check that the problem has exact second derivatives.
-
-    Raises
-    ------
-    InputError
-        For materials with memory, forces with internal variables, measured wrenches and custom
-        sensors of grasp forces.
+    """Raise an `InputError` if the problem has no exact second derivatives: for materials with
+    memory, forces with internal variables, measured wrenches and custom sensors of grasp forces.
     """
     if collocation.has_eliminated_histories:
         raise InputError(

@@ -274,9 +274,7 @@ def _run(
         try:
             answer = solver(**arguments)
             stats = solver.stats()
-        except (
-            RuntimeError
-        ) as error:  # of its own, or what a callback's failure makes of it
+        except RuntimeError as error:  # of the solver or a failed callback
             message = str(error).strip().splitlines()[-1].split(": ", 1)[-1]
             results.append(_NlpsolResult.failure(len(start), message))
             return

@@ -217,7 +217,7 @@ class ReducedSearch:
             float(np.ptp(points, axis=0).max()) for points in nodes
         )
 
-    # The ladder -------------------------------------------------------------------------------
+    # Horizons of increasing length ------------------------------------------------------------
 
     def run(self) -> tuple[Status, str]:
         """Solve the complete problem from the given positions or, without any, on increasing
@@ -332,7 +332,7 @@ class ReducedSearch:
             self._associate_initially(horizon, is_first=previous is None)
             self._minimise(self._horizon(rows, last=False), is_last=False)
 
-    # One rung ---------------------------------------------------------------------------------
+    # Steps on one horizon ---------------------------------------------------------------------
 
     def _minimise(self, horizon: Horizon, is_last: bool) -> Status:
         """Take Gauss–Newton steps on one horizon until convergence, and return the status.
@@ -364,7 +364,7 @@ class ReducedSearch:
         while True:
             step = self._next_step(point, curvature)
             length = self._step_length(step)
-            # A step that the trust region cuts short says nothing about the distance to go.
+            # A step that the trust region shortens contains no information on the remaining distance.
             is_full_step = length < 0.99 * self.trust
             is_short = is_full_step and length <= tolerance
             if is_short and point.feasibility_m <= FEASIBLE * self.size_m:
@@ -443,8 +443,9 @@ class ReducedSearch:
         return float(np.abs(step / self.reach).max(initial=0.0))
 
     def _next_step(self, point: Iterate, curvature: Array) -> Array:
-        """Return the step (np,) from `point` that minimises the model, with the neglected curvature
-        (np, np) added, within bounds and trust region.
+        """Return the step (np,) from `point` that minimises the quadratic model of the loss, with
+        the neglected curvature (np, np) added as far as `with_curvature` allows, within bounds and
+        trust region.
         """
         low = np.maximum(self.lower - point.p, -self.trust * self.reach)
         high = np.minimum(self.upper - point.p, self.trust * self.reach)
@@ -546,7 +547,7 @@ class ReducedSearch:
             )
         )
 
-    # Where recordings are read ----------------------------------------------------------------
+    # Association of the measurements ----------------------------------------------------------
 
     def _associate_initially(self, horizon: Horizon, is_first: bool) -> None:
         """Associate markers and cameras of unknown position with the first rows of the
@@ -592,8 +593,10 @@ class ReducedSearch:
         self.p = p
 
     def _reassociate(self, horizon: Horizon, point: Iterate) -> Iterate:
-        """Return the point with measurements associated at its estimates, and use that collocation
-        from now on; the point itself if nothing changes, or after `REREADINGS` updates.
+        """Return the point with measurements associated at its estimates, and use that collocation,
+        in place; the point itself if nothing changes, or after `REREADINGS` updates.
+
+        For the trial that `_is_better_for_cameras` has associated, that association is used.
         """
         stored = self.camera_trial
         if stored is not None and stored.trial is point:

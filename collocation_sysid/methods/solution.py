@@ -282,7 +282,7 @@ class Solution:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Physical values by parameter name."""
+        """Physical values by parameter name, fixed and tied parameters included."""
         return self.collocation.parameters.values(self.q)
 
     @cached_property
@@ -405,7 +405,9 @@ class Solution:
 
     @cached_property
     def rms_m(self) -> float:
-        """Root mean square distance of all markers from their measurements [m]."""
+        """Root mean square distance of all markers from their measurements [m];
+        0 without samples.
+        """
         return self.collocation.rms_marker_distance_m(self.z)
 
     @cached_property
@@ -441,7 +443,9 @@ class Solution:
 
     @cached_property
     def kkt_residual(self) -> float:
-        """Largest violation of the NLP's first-order optimality conditions, see `Collocation`."""
+        """Largest violation of the NLP's first-order optimality conditions at `multipliers`, see
+        `Collocation.kkt_residual`.
+        """
         return self.collocation.kkt_residual(self.z, self.multipliers)
 
     @property

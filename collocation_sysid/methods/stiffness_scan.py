@@ -146,7 +146,7 @@ def start_problem(
         reason = "at the guess, the simulation is farther from the measurements than an undeformed body"
     result = rescue(collocation, reason, is_complete=is_complete)
     if result is None:
-        return collocation, None  # the method will tell what it needs
+        return collocation, None  # the method reports what it needs
     if failure is None and misfit <= result.misfit[result.best]:
         return collocation, None
     return replace(collocation, parameters=result.parameters), result
@@ -308,7 +308,9 @@ def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
 
 
 def typical_constants(parameters: Parameters) -> dict[str, float]:
-    """Return values by parameter name: guesses, or typical ones of a soft body (`SOFT_PA`)."""
+    """Return values of all parameters by name: guesses, or typical ones of a
+    soft body (`SOFT_PA`).
+    """
     return typical_parameters(parameters, SOFT_PA).guesses
 
 
@@ -425,8 +427,8 @@ def _residuals(iterate: ExperimentIterate) -> Array:
 
 
 def _compared_samples(transcription: Transcription) -> int:
-    """Return the number of first samples of an experiment that are compared: a share of the
-    recording, and at least one sample of each measurement.
+    """Return the number of first samples of an experiment that are compared: the first of `SHARES`,
+    and at least one sample of each measurement; at most all.
     """
     t_s = transcription.experiment.t_s
     first_samples = [transcription.experiment.markers.first_visible_sample]

@@ -126,7 +126,6 @@ class SweepResult:
         """Return the memory size in bytes, from which a scheduler estimates the cost of a
         transfer.
         """
-        # So that a scheduler knows what moving it would take.
         arrays = (self.x, self.tangent.step, self.tangent.by_p, self.slope)
         return object.__sizeof__(self) + sum(each.nbytes for each in arrays)
 

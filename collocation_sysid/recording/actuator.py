@@ -89,8 +89,8 @@ class Actuator(ABC, Generic[S]):
     declared_values: TimeSeries
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
-    unit: ClassVar[str]  # of the tension or pressure
-    offset_field: ClassVar[str]  # the field of what is lost
+    unit: ClassVar[str]  # unit of the tension or pressure
+    offset_field: ClassVar[str]  # field of the lost part
 
     def on_body(self, body: Body) -> Self:
         """Return the actuator with its scalar S evaluated for a body.

@@ -163,7 +163,7 @@ def _cut_to_poses(
     ]
     for sequence, (from_s, until_s) in moving:
         slack_s = _tolerance_s(sequence, t_s)
-        # Beyond its first or last pose a grasp must not be asked for one.
+        # A grasp must not be evaluated beyond its first or last pose.
         if from_s < sequence.t_s[0] - slack_s:
             is_inside &= t_s >= sequence.t_s[0] - slack_s
         if until_s > sequence.t_s[-1] + slack_s:

@@ -413,7 +413,9 @@ class Depth:
 
     @property
     def points_m(self) -> list[Array]:
-        """Points (P, 3) of each sample in the camera's frame [m], without normals."""
+        """Points (P, 3) of each sample in the camera's frame [m], after thinning and without
+        normals; (0, 3) for a dropout.
+        """
         return [cloud[:, :3] for cloud in self.clouds]
 
     def until_time(self, end_s: float) -> Depth | None:

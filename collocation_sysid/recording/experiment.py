@@ -313,8 +313,8 @@ class Experiment:
         return is_prescribed, positions
 
     def is_prescribed(self, t_s: ArrayLike) -> NDArray[np.bool_]:
-        """Return whether each nodal coordinate is prescribed at the times `t_s` (T,), as (T, n, 3)
-        bool.
+        """Return whether a grasp prescribes each nodal coordinate at the times `t_s` (T,), as (T,
+        n, 3) bool; the nodes include those of the obstacles' frames.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         is_prescribed = np.zeros(
@@ -329,7 +329,8 @@ class Experiment:
 
     def prescribed_positions(self, t_s: ArrayLike) -> Array:
         """Return the coordinates of `prescribed_dofs` (g,) at the times `t_s` (T,), (T, g) [m]; NaN
-        at times at which a dof is free.
+        at times at which a dof is free, which are not among the samples. Errors as of
+        `prescribed_displacements`.
         """
         positions = self.prescribed_displacements(t_s)[1]
         return positions.reshape(len(positions), -1)[:, self.prescribed_dofs]
@@ -343,7 +344,9 @@ class Experiment:
         return self.body.node_mass + self.point_mass_at_nodes_kg(t_s)
 
     def point_mass_at_nodes_kg(self, t_s: ArrayLike) -> Array:
-        """Return the mass of all point masses at each node at times `t_s` (T,), as (T, n) [kg]."""
+        """Return the mass of all point masses at each node at times `t_s` (T,), as (T, n) [kg],
+        with the share that acts then, see `share`.
+        """
         n = len(self.body.nodes_m)
         times = np.atleast_1d(t_s)
         mass = np.broadcast_to(0.0, (len(times), n))
@@ -372,6 +375,9 @@ class Experiment:
     ) -> Array:
         """Return the share (T,), from 0 to 1, of a load whose time `change` ("from_s" or "until_s")
         has passed at the given times, see `share`.
+
+        In a motion it is 0 or 1 throughout unless that time is strictly within the recording;
+        static, 1 from that time on.
         """
         at_s = getattr(load, change)
         if self.is_static:
@@ -389,7 +395,7 @@ class Experiment:
 
     def declared_node_forces_n(self, t_s: ArrayLike) -> Array:
         """Return the stated forces on each node, without gravity and actuators, at times `t_s`
-        (T,), as (T, n, 3) [N].
+        (T,), as (T, n, 3) [N], with the share that acts then, see `share`.
         """
         n = len(self.body.nodes_m)
         times = np.atleast_1d(t_s)
@@ -580,16 +586,14 @@ class Experiment:
         )
 
     def _check_time(self) -> None:
-        """Check the sample times against those of all measurements.
+        """Check the sample times against each other and against those of all measurements.
 
         Raises
         ------
         InputError
             If there are fewer than three samples (static: one), times are uneven (static: not
-            ascending), differ from the markers' times, or are not covered by poses; if nothing is
-            measured; if a wrench, custom sensor or depth camera has times outside the experiment (a
-            depth camera of a static experiment: other times than its samples) or the name of
-            another; or if a custom sensor refers to no grasp.
+            ascending) or differ from the markers' times, nothing is measured, or as
+            `_check_grasp_times`, `_check_custom_sensors` and `_check_depth_cameras`.
         """
         fewest = 1 if self.is_static else 3
         if len(self.t_s) < fewest:
@@ -614,6 +618,14 @@ class Experiment:
             )
         if self.markers.sample_count == 0:
             self._require_measurements()
+        self._check_grasp_times()
+        self._check_custom_sensors()
+        self._check_depth_cameras()
+
+    def _check_grasp_times(self) -> None:
+        """Raise an `InputError` if poses do not cover the samples at which their grasp is active,
+        or a wrench has too few samples within the experiment.
+        """
         for grasp in self.grasps:
             grasp.poses.at(self.t_s[grasp.is_active(self.t_s)])
             if grasp.wrench is not None:
@@ -623,6 +635,11 @@ class Experiment:
                     name="the wrench of a grasp",
                     is_static=self.is_static,
                 )
+
+    def _check_custom_sensors(self) -> None:
+        """Raise an `InputError` if two custom sensors have the same name, one has too few samples
+        within the experiment, or one refers to no grasp.
+        """
         for gauge in self.readings:
             what = f"the reading '{gauge.name}'"
             if [other.name for other in self.readings].count(gauge.name) > 1:
@@ -643,6 +660,10 @@ class Experiment:
                     f"{len(self.grasps)}"
                 )
 
+    def _check_depth_cameras(self) -> None:
+        """Raise an `InputError` if two depth cameras have the same name, one has too few images
+        within the experiment, or one of a static experiment has an image between the samples.
+        """
         for depth in self.depths:
             what = f"the depth camera '{depth.name}'"
             if [other.name for other in self.depths].count(depth.name) > 1:

@@ -215,7 +215,7 @@ def prescribed_dofs(grasps: Sequence[Grasp]) -> Index:
     )
 
 
-# What is left free --------------------------------------------------------------------------------
+# Free rigid motions -------------------------------------------------------------------------------
 
 
 def free_rigid_motions(
@@ -252,7 +252,7 @@ def free_rigid_motions(
     free = directions[rank:]
     if not len(free):
         return []
-    # What is left without a turn, and the axes of what turns.
+    # Free motions without rotation, and the axes of the free rotations.
     shifts = _null_space(free[:, 3:].T) @ free[:, :3]
     rotations = free[:, 3:]
     return [
@@ -277,7 +277,7 @@ def _null_space(matrix: Array) -> Array:
 
 def _axis_aligned_basis(vectors: Array) -> Iterator[Array]:
     """Yield the unit vectors (3,) of an orthonormal basis of the span of vectors (k, 3), along
-    coordinate axes where possible.
+    coordinate axes where possible; nothing if all are zero.
     """
     _, values, directions = np.linalg.svd(
         vectors.reshape(-1, 3), full_matrices=False

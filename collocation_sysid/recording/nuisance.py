@@ -219,7 +219,7 @@ def _distort_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
 
 
 def _has_markers(experiment: Any) -> bool:
-    """Return whether the experiment has markers."""
+    """Return whether the experiment has a marker, also one without samples."""
     return bool(experiment.markers.names)
 
 
@@ -247,8 +247,6 @@ def _is_motion(experiment: Any) -> bool:
 
 
 def _has_observable_hand_eye(experiment: Any) -> bool:
-    # Nothing but what markers see tells how the body is off in its grasp, and a start that is
-    # given tells where it is.
     """Return whether markers determine the position of the body in its grasp (hand–eye transform).
 
     True if the body has a grasp that is not an obstacle, there are markers, and the start is an

@@ -216,8 +216,8 @@ class LocatedBody:
         self.triangles = nodes_m[body.mesh.surface]
 
     def weights_at_node(self, node: int) -> tuple[Index, Array]:
-        """Return nodes (npe,) and weights (npe,) of a marker on a node: those of the first element
-        with that node; the weight of the node is 1.
+        """Return nodes (npe,) and weights (npe,) of a marker on a node, by its index: nodes of the
+        first element that has the node, whose weight is 1 and all others 0.
         """
         cell = self.body.cells[np.argmax((self.body.cells == node).any(axis=1))]
         return cell, (cell == node).astype(np.float64)
@@ -277,8 +277,8 @@ class LocatedBody:
         )
 
     def barycentric(self, points: Array, cells: slice | Index) -> Array:
-        """Return barycentric coordinates (k, 4) of points (k, 3), or of one (3,), in the cells
-        (k,).
+        """Return barycentric coordinates (k, 4) of points (k, 3), or of one point (3,), in the
+        cells with the indices (k,), as of straight edges; negative outside a cell.
         """
         rest = np.einsum(
             "ei,eij->ej", points - self.origin[cells], self.inverse[cells]
@@ -286,8 +286,8 @@ class LocatedBody:
         return np.column_stack([1.0 - rest.sum(axis=1), rest])
 
     def barycentric_gradients(self, cells: Index) -> Array:
-        """Return the derivatives (k, 4, 3) of the barycentric coordinates by the point, in the
-        cells (k,).
+        """Return the derivatives (k, 4, 3) of the barycentric coordinates by the point [1/m], in
+        the cells with the indices (k,).
         """
         rest = np.asarray(
             np.swapaxes(self.inverse[cells], 1, 2), dtype=np.float64

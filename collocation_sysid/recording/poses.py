@@ -29,7 +29,7 @@ Poses = tuple[tuple[Array, Array], ...]
 
 # Largest deviation of a quaternion's norm from one: files print four digits or more.
 QUATERNION_NORM_TOLERANCE = 1e-3
-# A held pose starts at its sample, also where the time asked for is rounded to just before it.
+# A held pose starts at its sample, also if the time is rounded to just before it.
 _INTERVAL_SNAP_STEPS = 1e-6
 # Largest entry of RᵀR − I of a rotation: files print few digits, and mistakes are far larger.
 _ORTHONORMALITY_TOLERANCE = 1e-3
@@ -213,8 +213,8 @@ class PoseSequence:
         return self._interpolate_linearly(times)
 
     def _interpolate_linearly(self, times: Array) -> tuple[Array, Array]:
-        """Return linearly interpolated rotations (k, 3, 3) and translations (k, 3) at times
-        (k,).
+        """Return rotations (k, 3, 3) (SLERP) and translations (k, 3) at times (k,), linear between
+        samples and continued linearly beyond them; at least two samples.
         """
         k = np.clip(
             np.searchsorted(self.t_s, times, side="right") - 1,
@@ -361,8 +361,8 @@ def first_matrix_fault(t_s: Array, matrices: Array) -> tuple[int, str] | None:
 
 
 def _unit_and_continuous(quaternions: Array) -> Array:
-    """Normalise quaternions (m, 4) and choose their signs so that neighbours are in the same
-    hemisphere.
+    """Return quaternions (m, 4) that are normalised, with signs such that neighbours are in the
+    same hemisphere, as a read-only array; the first keeps its sign.
     """
     unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     aligned = np.sum(unit[1:] * unit[:-1], axis=1) >= 0.0
@@ -372,7 +372,7 @@ def _unit_and_continuous(quaternions: Array) -> Array:
     return continuous
 
 
-# Between samples ---------------------------------------------------------------------------------
+# Interpolation -----------------------------------------------------------------------------------
 
 
 def jump_intervals(t_s: Array, values: Array) -> Index:
@@ -411,7 +411,7 @@ def smooth_spline(t_s: Array, values: Array) -> PPoly:
     return PPoly(coefficients, t_s)
 
 
-# Over a recording --------------------------------------------------------------------------------
+# Checks over a recording -------------------------------------------------------------------------
 
 
 def require_determined_motion(
@@ -474,7 +474,7 @@ def _typical_step_s(
     poses: PoseSequence, first_s: float, last_s: float
 ) -> float:
     """Return the median time [s] between consecutive poses from `first_s` to `last_s` between which
-    the grasp moves; 0 if it rests.
+    the grasp moves by more than `LARGEST_REST_DIFFERENCE`; 0 if it rests.
     """
     shift_m = np.abs(np.diff(poses.positions_m, axis=0)).max(axis=1)
     turn = np.abs(np.diff(poses.quaternions_xyzw, axis=0)).max(axis=1)

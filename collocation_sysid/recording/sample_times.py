@@ -87,7 +87,9 @@ def first_unordered_time(t_s: Array) -> tuple[int, str] | None:
 
 
 def evenly_spaced_s(t_s: Array) -> Array:
-    """Return evenly spaced times with the same first and last time and number as `t_s`."""
+    """Return evenly spaced times with the same first and last time and number
+    as `t_s` (T,), T > 0.
+    """
     return np.linspace(t_s[0], t_s[-1], len(t_s))
 
 
@@ -109,7 +111,7 @@ def printed_rounding_s(t_s: Array) -> float:
 
 def unrounded_s(t_s: Array) -> Array:
     """Return evenly spaced times if rounding to the printed decimals explains all unevenness of
-    `t_s`.
+    `t_s` (T,).
 
     Other times are returned unchanged.
     """

@@ -229,10 +229,11 @@ def _one_of(
         quantity for quantity in quantities if quantity.key in table.values
     ]
     if len(there) != 1:
-        found = " and ".join(quantity.key for quantity in there) or "no column"
+        present = " and ".join(quantity.key for quantity in there)
         expected = ", ".join(quantity.column for quantity in quantities)
         raise table.grid.error_at(
-            f"the columns are {', '.join(table.grid.columns)}; found {found} of the {what}, "
+            f"the columns are {', '.join(table.grid.columns)}; found "
+            f"{present or 'no column'} of the {what}, "
             f"expected exactly one of {expected}, in these or other units"
         )
     return there[0]

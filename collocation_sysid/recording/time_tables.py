@@ -118,7 +118,7 @@ def _read_limited(
     return table.t_s, values
 
 
-# Of a grasp, as a robot or a test bench tells it --------------------------------------------------
+# Wrenches and displacements of a grasp ------------------------------------------------------------
 
 
 def read_wrench(
@@ -301,7 +301,7 @@ def _without_rounding(t_s: Array) -> Array:
     return unrounded_s(t_s) if len(t_s) > 2 else t_s
 
 
-# Of an instrument ---------------------------------------------------------------------------------
+# Custom sensors -----------------------------------------------------------------------------------
 
 
 class CustomSensorTable(NamedTuple):

@@ -196,6 +196,20 @@ def minimise_cg_descent(
     step = 0.0
     change = np.inf
     average = _AverageValue(options)
+
+    def line_along(direction: Array) -> _LineSearch:
+        """Return a line search from the last iterate along a direction (n,)."""
+        return _LineSearch(
+            counted,
+            x,
+            value=f,
+            gradient=g,
+            direction=direction,
+            error=average.error,
+            approximate=average.approximate,
+            options=options,
+        )
+
     if callback is not None and callback(
         CgState(0, x, value=f, gradient=g, direction=d, slope=0.0, step=0.0)
     ):
@@ -204,35 +218,17 @@ def minimise_cg_descent(
         if np.abs(g).max(initial=0.0) <= options.tolerance:
             return result("converged", k)
         average.add(f)
-        line = _LineSearch(
-            counted,
-            x,
-            value=f,
-            gradient=g,
-            direction=d,
-            error=average.error,
-            approximate=average.approximate,
-            options=options,
-        )
-        trial = line.search(
+        line = line_along(d)
+        first_step = (
             _initial_step(x, f, g=g)
             if k == 0
             else _initial_step_after(line, step, change=change)
         )
-        if trial is None and line.slope > -float(g @ g) * (
-            1 - 1e-12
-        ):  # once down the gradient
+        trial = line.search(first_step)
+        is_deflected = line.slope > -float(g @ g) * (1 - 1e-12)
+        if trial is None and is_deflected:
             d = -g
-            line = _LineSearch(
-                counted,
-                x,
-                value=f,
-                gradient=g,
-                direction=d,
-                error=average.error,
-                approximate=average.approximate,
-                options=options,
-            )
+            line = line_along(d)
             trial = line.search(_initial_step(x, f, g=g))
         if trial is None:
             return result("line-search", k)
@@ -291,8 +287,9 @@ def _next_direction(
 
 
 def _initial_step(x: Array, f: float, g: Array) -> float:
-    """Return the step size of the first line search at x with the value f and the gradient g, rule
-    I0.
+    """Return the step size of the first line search at x with the value f and the gradient g ≠ 0,
+    rule I0: `FIRST` times the size of x over that of g; without x, of |f| over ‖g‖²; 1 if both are
+    zero.
     """
     steepest = float(np.abs(g).max())
     if x.any():
@@ -508,7 +505,9 @@ class _LineSearch:
         return trial
 
     def _satisfies_wolfe(self, trial: _LineTrial) -> bool:
-        """Return whether a trial satisfies the Wolfe conditions T1 or T2."""
+        """Return whether a trial satisfies the Wolfe conditions: T2, the approximate ones with a
+        value up to `limit`, or, unless only these count, T1.
+        """
         decrease = self.options.decrease
         curvature = self.options.curvature
         if not trial.slope >= curvature * self.slope:

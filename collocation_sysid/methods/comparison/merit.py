@@ -113,7 +113,7 @@ class PenaltyProblem:
         slope[(z >= self.upper) & (slope < 0)] = 0
         return slope
 
-    # Answering for the collocation given ------------------------------------------------------
+    # Conversion to and from the given problem -------------------------------------------------
 
     def from_original(self, z: Array) -> Array:
         """Return the variables of `nlp` from those of the given problem."""

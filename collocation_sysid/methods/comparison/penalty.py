@@ -181,7 +181,7 @@ class PenaltyOptions(Options):
 
     @property
     def last_rho(self) -> float:
-        """Largest ρ of the solve."""
+        """Largest ρ of the solve, `rho_max`."""
         return self.rho_max
 
     @property
@@ -232,7 +232,7 @@ class Penalty(PenaltyOptions):
 
     @property
     def last_rho(self) -> float:
-        """Largest ρ of the solve."""
+        """Largest ρ of the solve: `rho` for a constant schedule, else `rho_max`."""
         return self.rho if self.schedule == "constant" else self.rho_max
 
     def next_stage(
@@ -493,8 +493,8 @@ class _PenaltySolve:
         )
 
     def _violation(self) -> ConstraintViolation:
-        """Return the violation at the last iterate, with grasped nodes at their prescribed
-        positions.
+        """Return the violation at the last iterate: residuals [N] with grasped nodes at their
+        prescribed positions, and constraints without this change.
         """
         nlp = self.problem.original
         z = self.problem.to_original(self.variables)

@@ -275,7 +275,11 @@ class _ShootingSearch:
         return shot.slope
 
     def _quasi_newton(self) -> tuple[Status, str]:
-        """Minimise by SciPy's L-BFGS-B; return the status and a sentence with SciPy's message."""
+        """Minimise by SciPy's L-BFGS-B; return the status and a sentence with SciPy's message.
+
+        Without success by SciPy's criteria the status is acceptable if the projected gradient is
+        within `LEAST_GRADIENT_TOLERANCE`, and stalled otherwise.
+        """
         result = minimize(
             self._objective,
             self.first,
@@ -304,8 +308,11 @@ class _ShootingSearch:
         return status, f"{status.sentence} (SciPy: {result.message})"
 
     def _objective(self, p: Array) -> tuple[float, Array]:
-        """Return the objective and its gradient at p; those of a steep parabola if the
-        simulation fails.
+        """Return the objective and its gradient (np,) at p.
+
+        If the simulation fails they are those of a parabola along the step from the best
+        simulation, above the best objective and with its minimum at a quarter of the step, so that
+        the line search returns there.
         """
         shot = self._try(p)
         if shot is not None:

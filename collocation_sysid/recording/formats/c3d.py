@@ -121,7 +121,8 @@ def _header_counts(content: bytes) -> tuple[int, int | None]:
     frames = last - first + 1
     (scale,) = struct.unpack_from(f"{order}f", content, 12)
     (data_block,) = struct.unpack_from(f"{order}H", content, 16)
-    # A negative scale says floats, else integers; DEC has its sign elsewhere, so take the least.
+    # A negative scale means floats, else integers; DEC stores the sign elsewhere, so the smaller
+    # size is assumed.
     width = 4 if scale < 0 and processor != _DEC else 2
     size = _BLOCK * (data_block - 1) + frames * (4 * points + analog) * width
     if len(content) < size:

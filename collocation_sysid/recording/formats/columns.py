@@ -144,7 +144,7 @@ _NAMED = re.compile(
 )
 # Strains and stresses of the deformed specimen, which neither its length nor its area multiplies.
 _DEFORMED = {"true", "wahre", "cauchy", "logarithmic"}
-# Words of a name by what they make of a quantity: it is another one with them.
+# Words in the name of a column that distinguish quantities with the same other words, by key.
 QUALIFIERS = {
     "deformed": _DEFORMED,
     "second": {"second", "zweite"},
@@ -229,7 +229,7 @@ def read_columns(
     return QuantityTable(grid, t_s, values=values)
 
 
-# Which column -------------------------------------------------------------------------------------
+# Choice of columns --------------------------------------------------------------------------------
 
 
 def _find_columns(
@@ -378,7 +378,7 @@ def _words(name: str) -> set[str]:
     return set(re.findall(r"[^\W\d_]+", name.lower()))
 
 
-# Refusals -----------------------------------------------------------------------------------------
+# Errors -------------------------------------------------------------------------------------------
 
 
 def _require_known_columns(

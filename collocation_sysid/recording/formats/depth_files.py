@@ -424,13 +424,13 @@ def _standard_error_silenced() -> Iterator[None]:
 
 
 def _read_exr(path: Path) -> Array:
-    """Read the depths (rows, columns) [m] of an OpenEXR image: the channel Z, R, Y or V, else the
-    first.
+    """Read the depths (rows, columns) of an OpenEXR image in its own unit: the channel Z, else R,
+    else Y, else V, else the first.
 
     Raises
     ------
     InputError
-        If the package OpenEXR is not installed.
+        If the package OpenEXR is not installed. Exceptions of the package are not converted.
     """
     try:
         library = import_module("OpenEXR")
@@ -476,12 +476,13 @@ def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
 
 
 def _read_pcd(path: Path) -> Array:
-    """Read the points (P, 3) or (P, 6) of a PCD file, ascii or binary.
+    """Read the points (P, 3) or (P, 6) of a PCD file, ascii or binary, in its own unit.
 
     Raises
     ------
     InputError
-        If the file has no header, is compressed, or lacks a coordinate.
+        If the file has no header, is compressed, or lacks a coordinate. Other damage raises
+        exceptions of Python and NumPy.
     """
     raw = path.read_bytes()
     head = dict[str, list[str]]()

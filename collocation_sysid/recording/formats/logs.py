@@ -192,7 +192,7 @@ class _Bag:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
 
-        # Older bags do not hold what their messages are made of.
+        # Older bags do not contain the definitions of their messages.
         store = get_typestore(Stores.ROS2_HUMBLE)
         self._reader = AnyReader([path], default_typestore=store)
 
@@ -299,7 +299,7 @@ class _Dataset:
     episode: int | None = None
     topics: dict[str, tuple[str, int]] = field(default_factory=dict)
     start_ns: int = 0
-    unit: str | None = None  # what a robot's makers chose
+    unit: str | None = None  # not prescribed by the format
     names: dict[str, list[str]] = field(default_factory=dict)
 
     def __enter__(self) -> Log:

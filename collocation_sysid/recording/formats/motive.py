@@ -32,12 +32,14 @@ class _MarkerColumns:
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
     """Read a Motive CSV file; `choose` returns the indices of the markers to read from their
-    labels.
+    labels, with those that begin with "Unlabeled" excluded. A note names each marker that was not
+    measured but fitted by Motive.
 
     Raises
     ------
     InputError
-        If the text is no such file, or a cell is not a number.
+        If the text is no such file, a cell is not a number, or the number of frames differs from
+        the header's.
     """
     rows = separated_rows(text, ",")
     first = rows[0]

@@ -37,7 +37,7 @@ def read_columns(path: Path) -> Mapping[str, Array]:
     Raises
     ------
     InputError
-        If the file is damaged. The path is not named.
+        If the file is damaged; the path is not always named.
     """
     content = path.read_bytes()
     columns = _plain_columns(content)

@@ -18,12 +18,13 @@ _KEY = re.compile(r"(?!NAN$)[A-Z][A-Z0-9_]*")
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
     """Read a Qualisys TSV file; `choose` returns the indices of the markers to read from their
-    labels.
+    labels. The result has no unit, and times only if the file has them.
 
     Raises
     ------
     InputError
-        If the text is no such file, or a cell is not a number.
+        If the text is no such file, a cell is not a number, or numbers of frames or markers differ
+        from the header's.
     """
     rows = tab_rows(text)
     count = next(

@@ -87,7 +87,7 @@ def read_bytes(path: str | Path) -> bytes:
     Raises
     ------
     InputError
-        If it cannot be read.
+        If it cannot be read; see `topic_as_csv` for topics. The path is not named.
     """
     if (address := TopicAddress.from_path(path)) is not None:
         return topic_as_csv(address)
@@ -269,7 +269,9 @@ def read_table(text: str) -> TextTable:
 
 
 def _is_unit(cell: str) -> bool:
-    """Return whether a cell may be a unit: blank, in brackets, or a known unit."""
+    """Return whether a cell may be a unit: blank, in round or square brackets, or a known unit of
+    any dimension.
+    """
     bare = cell.strip("()[]")
     bracketed = cell in (f"({bare})", f"[{bare}]")
     return (

@@ -355,7 +355,9 @@ def _message_values(message: Any, *, by_namespace: bool) -> Row:
 
 
 def _pose_of_message(message: Any) -> tuple[float, ...] | None:
-    """Return position and quaternion (x, y, z, w) of a message; None if it has no pose."""
+    """Return position (x, y, z) and quaternion (x, y, z, w) of a message, in the first fields of
+    `_POSES` that it has; None if it has no quaternion.
+    """
     for position, rotation in _POSES:
         if hasattr(turned := _nested_field(message, rotation), "w"):
             return (
@@ -439,7 +441,9 @@ def has_namespaces(messages: Iterable[Any]) -> bool:
 
 
 def _nested_field(message: Any, path: str) -> Any:
-    """Return the nested field at a dotted path; None if it does not exist."""
+    """Return the nested field at a path of names with dots between them; None
+    if it does not exist.
+    """
     for name in path.split("."):
         message = getattr(message, name, None)
     return message
@@ -469,7 +473,9 @@ def _is_transforms(message: Any) -> bool:
 
 
 def _transform_frames(transform: Any) -> tuple[str, str] | None:
-    """Return the parent and the child frame of a transform; None if the message is no transform."""
+    """Return the parent and the child frame of a transform, without a leading slash; None if the
+    message is no transform. Odometry, which has a twist, is none.
+    """
     child = _nested_field(transform, "child_frame_id")
     parent = _nested_field(transform, "parent_frame_id") or _nested_field(
         transform, "header.frame_id"

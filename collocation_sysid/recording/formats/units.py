@@ -6,8 +6,8 @@ from ...errors import InputError
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 
-# What a unit is times SI, by what is measured. Letters may be small, as in fz_kn, but where that
-# would be another unit.
+# Factors from units to SI, by dimension. A unit may be written in lower case, as in fz_kn, unless
+# that is another unit.
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "min": 60.0},
     "length": {**METRES_PER_UNIT, "µm": 1e-6, "um": 1e-6, '"': 0.0254},
