@@ -227,7 +227,7 @@ class Pressure(Actuator[EnclosedVolume]):
         self, is_prescribed: NDArray[np.bool_], prescribed_m: Array
     ) -> Pressure:
         """Return the pressure with a volume that does not depend on the motion of a held rim; self
-        if the faces are closed or on no body yet.
+        if the faces are closed.
 
         The volume of an open patch is that of the cones over its faces from an apex. The pressure
         does the work p dV if the rim is held, or slides in planes, such as planes of symmetry, that
@@ -243,7 +243,7 @@ class Pressure(Actuator[EnclosedVolume]):
         Raises
         ------
         InputError
-            If the rim moves otherwise.
+            If the rim moves otherwise, or the pressure is on no body yet.
         """
         placed = self.body_measure
         volume = self.measure

@@ -34,9 +34,11 @@ from .formats.columns import (
     VOLUME_RATIO,
     Quantity,
     QuantityTable,
+    name_and_unit,
     read_columns,
 )
 from .formats.text import names_file_in_errors
+from .formats.units import si_factor
 from .homogeneous_deformation import AXES, CELL_SIZE_M
 from .specimen import LATERAL_NAME, SECOND_STRESS_NAME, STRESS_NAME
 
@@ -439,44 +441,91 @@ def specimen_columns(
 ) -> dict[str, Array]:
     """Return the columns (T,) of the table of a specimen by name, as `read_specimen` reads them.
 
-    Deformations are written as stretches, those of simple shear as strains and of volumetric tests
-    as volume ratios with pressures; stresses are true or engineering as `layout.stress` states, and
-    signs as `layout` states.
+    The columns are those that `layout` names, in the units of their names. If it names none but the
+    time, deformations are written as stretches, those of simple shear as strains and of volumetric
+    tests as volume ratios with pressures, under standard names. Stresses are true or engineering,
+    and signs are as `layout` states.
 
     Parameters
     ----------
     experiment : Experiment
         Experiment of a specimen.
     values : mapping of str to (T,) array
-        Values of its sensors by name, at the sample times; a stress or stretch that is not there
-        has no column.
+        Values of its sensors by name, at the sample times; a quantity that does not follow from
+        them has no column.
     layout : SpecimenLayout
-        Meaning of the columns; the names of the columns are the standard ones of the quantities.
+        Meaning of the columns.
+    """
+    quantities = _specimen_quantities(experiment, values, layout=layout)
+    named = [key for key in layout.columns if key != TIME.key]
+    usual = [quantity.key for quantity in _usual_quantities(layout)]
+    columns = {}
+    for key in (TIME.key, *(named or usual)):
+        for quantity, column in quantities.items():
+            if quantity.key == key:
+                name = layout.columns.get(key, quantity.column)
+                unit = name_and_unit(name)[1] or quantity.unit
+                factor = si_factor(unit, quantity.dimension) or 1.0
+                columns[name] = column / factor
+    return columns
+
+
+def _usual_quantities(layout: SpecimenLayout) -> tuple[Quantity, ...]:
+    """Return the quantities that are written for a test if the layout names no columns."""
+    if layout.test == "volumetric":
+        return VOLUME_RATIO, PRESSURE
+    deformation = STRAIN if layout.test == "simple-shear" else STRETCH
+    return (
+        deformation,
+        SECOND_STRETCH,
+        STRESS,
+        SECOND_STRESS,
+        LATERAL_STRETCH,
+    )
+
+
+def _specimen_quantities(
+    experiment: Experiment, values: Mapping[str, Array], layout: SpecimenLayout
+) -> dict[Quantity, Array]:
+    """Return every quantity (T,) that follows from the strains of a specimen and the values of its
+    sensors, in SI units and with the signs of `layout`; arguments as of `specimen_columns`.
     """
     strain, second_strain = specimen_strains(experiment)
+    stretch = 1 + strain
     lateral = values.get(LATERAL_NAME)
     areas = _area_ratios(
         layout, strain, second_strain=second_strain, lateral=lateral
     )
     is_true = layout.stress == "true"
-    columns: dict[Quantity, Array] = {TIME: experiment.t_s}
-    if layout.test == "volumetric":
-        columns[VOLUME_RATIO] = (1 + strain) ** 3
-        columns[PRESSURE] = -values[STRESS_NAME] / (1 + strain) ** 2
-    else:
-        if layout.test == "simple-shear":
-            columns[STRAIN] = layout.strain_sign * strain
-        else:
-            columns[STRETCH] = 1 + strain
-        if layout.test == "biaxial":
-            columns[SECOND_STRETCH] = 1 + second_strain
-        for name, quantity, area in (
-            (STRESS_NAME, STRESS, areas[0]),
-            (SECOND_STRESS_NAME, SECOND_STRESS, areas[1]),
-        ):
-            if name in values:
-                stress_pa = values[name] / area if is_true else values[name]
-                columns[quantity] = layout.stress_sign * stress_pa
-        if lateral is not None:
-            columns[LATERAL_STRETCH] = lateral
-    return {quantity.column: column for quantity, column in columns.items()}
+    is_volumetric = layout.test == "volumetric"
+    stated_strain = stretch**3 - 1 if is_volumetric else strain
+    quantities = {
+        TIME: experiment.t_s,
+        STRETCH: stretch,
+        STRAIN: layout.strain_sign * stated_strain,
+        VOLUME_RATIO: stretch**3,
+    }
+    if layout.length_m is not None:
+        quantities[DISPLACEMENT] = layout.strain_sign * strain * layout.length_m
+    if layout.test == "biaxial":
+        quantities[SECOND_STRETCH] = 1 + second_strain
+        quantities[SECOND_STRAIN] = layout.strain_sign * second_strain
+    if lateral is not None:
+        quantities[LATERAL_STRETCH] = lateral
+        quantities[LATERAL_STRAIN] = layout.strain_sign * (lateral - 1)
+    if STRESS_NAME in values:
+        stress_pa = values[STRESS_NAME]
+        if is_volumetric:
+            stress_pa = stress_pa / stretch**2
+        elif is_true:
+            stress_pa = stress_pa / areas[0]
+        quantities[PRESSURE] = -stress_pa
+        quantities[STRESS] = layout.stress_sign * stress_pa
+        quantities[TRUE_STRESS] = quantities[STRESS]
+        if layout.area_m2 is not None:
+            quantities[FORCE] = quantities[STRESS] * layout.area_m2
+    if SECOND_STRESS_NAME in values:
+        second_pa = values[SECOND_STRESS_NAME]
+        second_pa = second_pa / areas[1] if is_true else second_pa
+        quantities[SECOND_STRESS] = layout.stress_sign * second_pa
+    return quantities
