@@ -498,11 +498,11 @@ def _specimen_quantities(
     )
     is_true = layout.stress == "true"
     is_volumetric = layout.test == "volumetric"
-    stated_strain = stretch**3 - 1 if is_volumetric else strain
+    table_strain = stretch**3 - 1 if is_volumetric else strain
     quantities = {
         TIME: experiment.t_s,
         STRETCH: stretch,
-        STRAIN: layout.strain_sign * stated_strain,
+        STRAIN: layout.strain_sign * table_strain,
         VOLUME_RATIO: stretch**3,
     }
     if layout.length_m is not None:

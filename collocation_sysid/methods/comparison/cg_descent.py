@@ -197,7 +197,7 @@ def minimise_cg_descent(
     change = np.inf
     average = _AverageValue(options)
 
-    def line_along(direction: Array) -> _LineSearch:
+    def line_search_in(direction: Array) -> _LineSearch:
         """Return a line search from the last iterate along a direction (n,)."""
         return _LineSearch(
             counted,
@@ -218,7 +218,7 @@ def minimise_cg_descent(
         if np.abs(g).max(initial=0.0) <= options.tolerance:
             return result("converged", k)
         average.add(f)
-        line = line_along(d)
+        line = line_search_in(d)
         first_step = (
             _initial_step(x, f, g=g)
             if k == 0
@@ -228,7 +228,7 @@ def minimise_cg_descent(
         is_deflected = line.slope > -float(g @ g) * (1 - 1e-12)
         if trial is None and is_deflected:
             d = -g
-            line = line_along(d)
+            line = line_search_in(d)
             trial = line.search(_initial_step(x, f, g=g))
         if trial is None:
             return result("line-search", k)
