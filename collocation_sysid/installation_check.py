@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 PACKAGE = "collocation-sysid"
 # Extras for work on the package itself, and the collection of the others.
 DEVELOPMENT_EXTRAS = ("all", "dev", "docs", "test")
-# Linear solvers that IPOPT can be told to use, see the options of IPOPT.
+# Values of the option linear_solver of IPOPT.
 IPOPT_LINEAR_SOLVERS = (
     "mumps",
     "spral",
@@ -240,7 +240,11 @@ class InstallationReport:
 
 
 def check_installation() -> InstallationReport:
-    """Return the state of this installation; kernels of the self test are compiled and stored."""
+    """Return the state of this installation, with the result of a self test.
+
+    It takes seconds: kernels of the self test are compiled and stored, and other processes try the
+    linear solvers.
+    """
     dependencies = tuple(required_packages())
     self_test = _self_test_unless_missing(dependencies)
     return InstallationReport(
@@ -258,7 +262,7 @@ def check_installation() -> InstallationReport:
 
 
 def required_packages() -> Iterator[Dependency]:
-    """Yield the required packages in the order of the alphabet.
+    """Yield the required packages of this platform in the order of the alphabet.
 
     Without the library that compares versions, only that library is yielded, as unsuitable.
     """
@@ -271,7 +275,7 @@ def required_packages() -> Iterator[Dependency]:
 
 
 def optional_packages() -> Iterator[Extra]:
-    """Yield the extras in the order of the alphabet, without those for development.
+    """Yield the extras in the order of the alphabet, without `DEVELOPMENT_EXTRAS`.
 
     Nothing is yielded without the library that compares versions.
     """
@@ -287,7 +291,9 @@ def optional_packages() -> Iterator[Extra]:
 
 
 def _requirements(extra: str) -> Iterator[Requirement]:
-    """Yield the requirements of an extra on this platform, or of the package itself for ""."""
+    """Yield the requirements of an extra on this platform, without those of the package itself; or
+    those of the package itself for "".
+    """
     from packaging.requirements import Requirement
 
     for text in metadata.requires(PACKAGE) or []:
@@ -305,7 +311,9 @@ def _requirements(extra: str) -> Iterator[Requirement]:
 
 
 def _is_importable(module: str) -> bool:
-    """Return whether a module is found; False also for one that is blocked in `sys.modules`."""
+    """Return whether a module is found, without importing it; false also for one that is blocked in
+    `sys.modules`.
+    """
     try:
         return importlib.util.find_spec(module) is not None
     except ValueError:
@@ -345,10 +353,12 @@ def available_solvers() -> Solvers | None:
 
 
 def _working_linear_solvers(names: Sequence[str]) -> Iterator[str]:
-    """Yield the linear solvers with which IPOPT solves a small problem.
+    """Yield those of the named linear solvers with which IPOPT solves a small problem, in the given
+    order.
 
     The problem is solved in other processes, because IPOPT crashes with some libraries that are
-    missing. After a crash a new process continues with the next solver.
+    missing. After a crash a new process continues with the next solver; after a timeout of
+    `SOLVER_TIME_S` the remaining solvers are not tried.
     """
     remaining = list(names)
     while remaining:
@@ -379,7 +389,7 @@ def _working_linear_solvers(names: Sequence[str]) -> Iterator[str]:
 def kernel_state() -> Kernels | None:
     """Return the compiler and the cache of kernels; None if they cannot be imported.
 
-    The folder is created if necessary.
+    The folder of the cache is created if necessary.
     """
     try:
         import llvmlite
@@ -405,7 +415,9 @@ def kernel_state() -> Kernels | None:
 
 
 def thread_state() -> Threads:
-    """Return the number of threads and what determines it."""
+    """Return the number of threads and what determines it; 1 if the environment variable is not a
+    whole number.
+    """
     from .common.machine import machine_memory_mb
 
     variable = "COLLOCATION_SYSID_THREADS"
@@ -430,7 +442,9 @@ def thread_state() -> Threads:
 
 
 def _self_test_unless_missing(dependencies: Sequence[Dependency]) -> SelfTest:
-    """Return the outcome of the self test; it fails without an attempt if packages are missing."""
+    """Return the outcome of the self test, which fails without an attempt if packages are missing;
+    any exception of the test is its outcome, not raised.
+    """
     missing = [each.name for each in dependencies if each.installed is None]
     if missing:
         return SelfTest(
@@ -451,7 +465,9 @@ def _identify_small_body() -> tuple[str, bool]:
     Returns
     -------
     message : str
+        Relative error of the modulus, or why the search did not converge.
     is_passed : bool
+        Whether it converged with an error below `SELF_TEST_TOLERANCE`.
     """
     import numpy as np
 
@@ -476,15 +492,15 @@ def _identify_small_body() -> tuple[str, bool]:
     swing = Experiment(
         body,
         t_s,
-        [hand],
-        markers,
+        grasps=[hand],
+        markers=markers,
         nuisance=Nuisance.none(),
         air_density_kg_m3="none",
     )
     fixed = {"poisson": 0.3, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5}
     truth_pa = 2000.0
     tracks_m = simulate(
-        swing, {**fixed, "mu_pa": truth_pa}, "midpoint", substeps=1
+        swing, {**fixed, "mu_pa": truth_pa}, integrator="midpoint", substeps=1
     ).markers_m
     problem = Problem(
         [with_markers(swing, tracks_m)],

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .common.array_types import Array
 from .common.display import plain_text
 from .common.step_counting import StepUnit, counted_phase
 from .errors import InputError, SimulationError
@@ -22,6 +23,7 @@ from .methods.initial_trajectories import simulate_trajectories
 from .methods.solution import Method, Solution, Status, Watch
 from .model.schemes import as_scheme
 from .problem import Problem
+from .program.collocation import Collocation
 from .runs.check.cost import require_memory
 from .runs.forward_simulation import simulate_experiments, step_error
 from .runs.numerical_error import refine
@@ -74,24 +76,21 @@ class Run(SolvedProblem):
     """
 
     def __str__(self) -> str:
-        from .result.run_sections import (
-            run_summary,
-        )  # how it looks is no part of a run
+        """Return the summary of the run as text, as printed in the terminal after a solve."""
+        from .result.run_sections import run_summary
 
         return plain_text(run_summary(self.result))
 
     @cached_property
     def result(self) -> Result:
-        """Content of ``result.json`` as dataclasses."""
+        """Content of ``result.json`` as dataclasses, built at the first access."""
         return build_result(self)
 
     def table(self) -> str:
-        """Return parameters, combined intervals, their sources and the verdict, as printed in the
-        terminal.
+        """Return parameters, combined intervals, their sources and the verdict as text, as printed
+        in the terminal.
         """
-        from .result.run_sections import (
-            estimate_sections,
-        )  # how it looks is no part of a run
+        from .result.run_sections import estimate_sections
 
         return plain_text(estimate_sections(self.result))
 
@@ -125,9 +124,7 @@ class Run(SolvedProblem):
         InputError
             For an unknown experiment or field, an invalid count, or a run without motion.
         """
-        from .result.animation import (
-            experiment_named,
-        )  # how it looks is no part of a run
+        from .result.animation import experiment_named
         from .result.pictures.shapes import field_shapes
         from .result.run_record import replays
 
@@ -163,18 +160,17 @@ class Run(SolvedProblem):
             Without ipywidgets (``pip install 'collocation-sysid[interactive]'``), for an unknown
             experiment, or if no parameter was estimated.
         """
-        from .result.parameter_sliders import (
-            ParameterSliders,
-        )  # how it looks is no part of a run
+        from .result.parameter_sliders import ParameterSliders
 
         return ParameterSliders.from_run(self, experiment).widget
 
     def save(
         self, folder: str | Path, frames: bool = True, pictures: bool = True
     ) -> Path:
-        """Write the run folder, completely or not at all, and return it.
+        """Write the run folder, completely or not at all, and return its path.
 
-        The pictures are drawn after the folder is in its place.
+        An earlier run in the folder is replaced. The pictures are drawn after the folder is in its
+        place.
 
         Parameters
         ----------
@@ -189,9 +185,7 @@ class Run(SolvedProblem):
         InputError
             If the folder contains anything other than an earlier run.
         """
-        from .result.run_record import (
-            write_run,
-        )  # what files hold is no part of a run
+        from .result.run_record import write_run
 
         return write_run(self, folder, frames=frames, pictures=pictures)
 
@@ -208,8 +202,8 @@ def run(
 ) -> Run:
     """Solve a problem, simulate every experiment with the answer, and estimate uncertainties.
 
-    Once there is an answer, Ctrl-C only ends the steps that follow: `Run.missing` states which
-    results are missing.
+    Once there is an answer, Ctrl-C only ends the steps that follow: `Run.omitted_checks` states
+    which results are missing.
 
     Parameters
     ----------
@@ -217,9 +211,11 @@ def run(
     method, watch, start, scheduler
         See `solve`.
     log : callable, optional
-        Called with a text at the beginning of each step.
+        Called with a text at the beginning of each step after the solve.
     seek_causes : bool
-        Whether to test hypotheses about the cause of a misfit, see `find_misspecifications`.
+        Whether to test hypotheses about the cause of a misfit, see `find_misspecifications`;
+        without them there are no solves with finer discretisations either, even if the problem
+        requests these.
     probe : bool
         Whether to refit subsets of the data and to relax each assumption, see `deep_probes`.
 
@@ -231,34 +227,27 @@ def run(
     Raises
     ------
     InputError
-        If `solve` raises it.
+        If `solve` raises it, or a stated uncertainty or requested profile is not possible.
     """
     say = log or (lambda _: None)
     began_s = time.perf_counter()
-    solution = solve(problem, method, watch, start, scheduler)
+    solution = solve(
+        problem, method, watch=watch, start=start, scheduler=scheduler
+    )
     searched_s = time.perf_counter()
 
     def timed(answer: Run) -> Run:
-        """Return the answer with the time until now; a search with finer steps is no check."""
+        """Return the answer with the times of search and checks until now; a search with finer
+        steps counts as search.
+        """
         finer_s = answer.solution.timing.total - solution.timing.total
         checks_s = time.perf_counter() - searched_s - finer_s
         return replace(
             answer, elapsed_s=Elapsed(searched_s - began_s + finer_s, checks_s)
         )
 
-    bodies = (segment.body for segment in solution.collocation.transcriptions)
-    fields = {
-        part.field_name: part.field
-        for b in bodies
-        for part in b.parts
-        if part.field
-    }
-    problem = problem.with_lengths(
-        {name: field.length_m for name, field in fields.items()}
-    )
-    phases = {n: f for n, f in fields.items() if isinstance(f, TwoPhaseModes)}
-    problem = problem.with_fields(phases) if phases else problem
-    answer = Run(problem, solution, {}, None)
+    problem = _with_estimated_fields(problem, solution)
+    answer = Run(problem, solution, rollouts={}, uncertainty=None)
     missing = "the result has no error bars and was not checked by a forward simulation"
     try:
         answer, fit = _checked(problem, answer.solution, say=say)
@@ -275,14 +264,7 @@ def run(
                 say=say,
                 scheduler=scheduler,
             )
-        substeps = answer.solution.collocation.substeps
-        refits = (
-            c.message
-            for e in problem.experiments
-            for c in rotation_step_concerns(e, substeps)
-        )
-        of_tests = one_kind_notes(problem.experiments, problem.parameters)
-        answer = replace(answer, notes=(*refits, *of_tests, *answer.notes))
+        answer = _with_problem_notes(answer)
         if answer.uncertainty is not None and fit is not None:
             profiles = _profiles(answer, fit, say=say)
             changes = _changes(answer, say)
@@ -313,18 +295,63 @@ def run(
         return timed(replace(answer, rollouts=rollouts, omitted_checks=missing))
 
 
+def _with_estimated_fields(problem: Problem, solution: Solution) -> Problem:
+    """Return the problem with the correlation lengths of its fields that the solve used, and with
+    the modes of its two-phase fields.
+    """
+    fields = {
+        part.field_name: part.field
+        for segment in solution.collocation.transcriptions
+        for part in segment.body.parts
+        if part.field
+    }
+    problem = problem.with_lengths(
+        {name: field.length_m for name, field in fields.items()}
+    )
+    two_phase_fields = {
+        name: field
+        for name, field in fields.items()
+        if isinstance(field, TwoPhaseModes)
+    }
+    if two_phase_fields:
+        return problem.with_fields(two_phase_fields)
+    return problem
+
+
+def _with_problem_notes(answer: Run) -> Run:
+    """Return the run with notes on rotations within time steps, and on material tests of a single
+    kind, before its other notes.
+    """
+    problem = answer.problem
+    substeps = answer.solution.collocation.substeps
+    rotations = (
+        concern.message
+        for experiment in problem.experiments
+        for concern in rotation_step_concerns(experiment, substeps)
+    )
+    tests = one_kind_notes(problem.experiments, problem.parameters)
+    return replace(answer, notes=(*rotations, *tests, *answer.notes))
+
+
 def _checked(
     problem: Problem, solution: Solution, say: Log
 ) -> tuple[Run, LinearisedFit | None]:
     """Return a solution with forward simulations, uncertainties and step error, and the linearised
     fit.
 
-    The fit is None if the solution did not converge or cannot be linearised.
+    The fit is None if the solution did not converge or cannot be linearised; the run then has
+    forward simulations only, and in the latter case a note. A problem without free parameters has a
+    fit and diagnoses of the residuals, but no uncertainties.
+
+    Raises
+    ------
+    InputError
+        If the stated uncertainties do not fit the problem; the error names its file.
     """
     say("checking the result by a forward simulation")
     rollouts = simulate_experiments(problem, solution)
     if not solution.status.converged:
-        return Run(problem, solution, rollouts, None), None
+        return Run(problem, solution, rollouts=rollouts, uncertainty=None), None
     say("computing the error bars")
     rows = _row_count(solution)
     try:
@@ -339,11 +366,17 @@ def _checked(
         return Run(
             problem,
             solution,
-            rollouts,
-            None,
+            rollouts=rollouts,
+            uncertainty=None,
             notes=(f"no error bars: {error}",),
         ), None
-    answer = Run(problem, solution, rollouts, None, diagnose_markers(fit))
+    answer = Run(
+        problem,
+        solution,
+        rollouts=rollouts,
+        uncertainty=None,
+        diagnoses=diagnose_markers(fit),
+    )
     if not solution.collocation.nq:
         return answer, fit
     parameters = solution.collocation.parameters
@@ -363,7 +396,9 @@ def _checked(
 
 
 def _changes(answer: Run, say: Log) -> ResidualChanges:
-    """Return the changes of the residuals by the systematic effects and by the routine probes."""
+    """Return the changes of the residuals of a run by the systematic effects and by the routine
+    probes; `say` is called with a text before.
+    """
     say("computing the effects of assumptions")
     solution = answer.solution
     deviations = probed_deviations(answer.problem.uncertainty.considered)
@@ -375,7 +410,7 @@ def _changes(answer: Run, say: Log) -> ResidualChanges:
 
 
 def _row_count(solution: Solution) -> int:
-    """Return the number of time steps in one sweep over all experiments."""
+    """Return the number of time steps in one sweep over all fitted experiments."""
     return sum(
         s.grid_times - s.dynamics.first_row
         for s in solution.collocation.transcriptions
@@ -388,7 +423,19 @@ def _sources(
     known: Uncertainty,
     changes: ResidualChanges,
 ) -> VarianceSources:
-    """Return the systematic contributions to the uncertainty, without effects stated as exact."""
+    """Return the systematic contributions to the uncertainty, without effects stated as exact (a
+    deviation of None).
+
+    Parameters
+    ----------
+    answer : Run
+    fit : LinearisedFit
+        Fit at the solution.
+    known : Uncertainty
+        Statistical uncertainty.
+    changes : ResidualChanges
+        Changes of the residuals by all effects.
+    """
     solution = answer.solution
     deviations = answer.problem.uncertainty.assumptions.deviations
     parameters = solution.collocation.parameters
@@ -397,7 +444,12 @@ def _sources(
     )
     means = answer.problem.uncertainty.assumptions.means
     return VarianceSources.from_fit(
-        fit, budgeted, parameters, solution.q, known, means
+        fit,
+        budgeted,
+        parameters=parameters,
+        q=solution.q,
+        uncertainty=known,
+        means=means,
     )
 
 
@@ -408,7 +460,20 @@ def _probes(
     say: Log,
     deep: bool,
 ) -> tuple[Probe, ...]:
-    """Return the routine probes, or for a `deep` check those of subsets and of every assumption."""
+    """Return the routine probes, or for a `deep` check those of subsets and of every assumption,
+    with a text to `say` before.
+
+    Parameters
+    ----------
+    answer : Run
+        Run with uncertainties and systematic effects.
+    fit : LinearisedFit
+        Fit at the solution.
+    changes : ResidualChanges
+        Changes of the residuals by all effects, as of `_changes`.
+    say : callable
+    deep : bool
+    """
     solution = answer.solution
     options = answer.problem.uncertainty
     deviations = probed_deviations(options.considered)
@@ -433,7 +498,14 @@ def _probes(
 
 
 def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
-    """Return the profile likelihoods that the problem requests."""
+    """Return the profile likelihoods that the problem requests, in that order; the run must have
+    uncertainties.
+
+    Raises
+    ------
+    InputError
+        For a name without a profile; the error names the problem file.
+    """
     profiles = []
     assert answer.uncertainty is not None
     for name in answer.problem.uncertainty.profile:
@@ -460,20 +532,39 @@ def _fine_enough(
     say: Log,
     scheduler: str | None,
 ) -> tuple[Run, LinearisedFit | None]:
-    """Return the run solved again with as many substeps as its uncertainties require.
+    """Return the run solved again with as many substeps as its uncertainties require, or `coarse`
+    itself if it has enough, or no step error.
 
     The answer may already have several substeps, if it was started from such a run. A parameter
     that ended at a bound has no standard error, and coarse steps may have driven it there: it
-    starts
-    from its guess again. If every parameter ended at a bound, the largest number of substeps is
-    used.
+    starts from its guess again. If every parameter ended at a bound, the largest number of substeps
+    is used.
+
+    Parameters
+    ----------
+    coarse : Run
+    fit : LinearisedFit or None
+        Fit of that run.
+    solver : Method
+        Method of the second solve.
+    watch : callable or None
+        Called with each entry of its history.
+    say : callable
+        Called with a text before it.
+    scheduler : str or None
+        Address of a Dask scheduler; None to solve in this process.
 
     Returns
     -------
     Run
-        `coarse` with a note if the refined problem was not solved.
+        `coarse` with a note if the solve with finer steps failed or did not converge.
     LinearisedFit or None
         The fit of the returned run.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If the second solve was interrupted.
     """
     if coarse.refinement is None or fit is None:
         return coarse, fit
@@ -501,24 +592,15 @@ def _fine_enough(
     p = np.where(fit.at_bound, again.guess_p, p)
     try:
         require_memory(problem, again, method=solver)
-        positions, failure = simulate_trajectories(again, p)
-        if failure is not None:
-            raise failure
-        with connect_executor(scheduler) as workers:
-            finer = solve_with_renewed_correspondences(
-                with_workers(solver, workers),
-                again,
-                watch=watch,
-                start=again.pack(p, positions),
-            )
-        message = finer.message
+        finer = _solve_from_parameters(
+            again, p, solver=solver, watch=watch, scheduler=scheduler
+        )
+        failure = None if finer.status.converged else finer.message
     except (InputError, SimulationError) as error:
-        finer = None
-        message = str(error)
-    if finer is not None and finer.status is Status.INTERRUPTED:
-        raise KeyboardInterrupt  # the first answer is whole
-    if finer is None or not finer.status.converged:
-        note = f"{why}; the solve with {substeps} failed: {message}"
+        finer = first
+        failure = str(error)
+    if failure is not None:
+        note = f"{why}; the solve with {substeps} failed: {failure}"
         return replace(coarse, notes=(note, *coarse.notes)), fit
     most = (
         ", the largest number that is chosen automatically"
@@ -527,3 +609,42 @@ def _fine_enough(
     )
     reason = f"{why}; therefore it was solved again with {substeps}{most}"
     return _checked(problem, finer.after(first, reason), say=say)
+
+
+def _solve_from_parameters(
+    collocation: Collocation,
+    p: Array,
+    solver: Method,
+    watch: Watch | None,
+    scheduler: str | None,
+) -> Solution:
+    """Return the solution of a problem, started from a simulation at parameters p (np,).
+
+    Parameters
+    ----------
+    collocation : Collocation
+    p : (np,) array
+        Parameters (q, φ).
+    solver, watch, scheduler
+        See `_fine_enough`.
+
+    Raises
+    ------
+    SimulationError
+        If the body cannot be simulated at p.
+    InputError
+        If the scheduler cannot be used.
+    KeyboardInterrupt
+        If the solve was interrupted.
+    """
+    positions, failure = simulate_trajectories(collocation, p)
+    if failure is not None:
+        raise failure
+    with connect_executor(scheduler) as workers:
+        solution = solve_with_renewed_correspondences(
+            with_workers(solver, workers),
+            collocation,
+            watch=watch,
+            start=collocation.pack(p, positions),
+        )
+    return solution.unless_interrupted()

@@ -83,8 +83,8 @@ REPLACED_COMMANDS = {
 
 @cache
 def _command_sources() -> dict[str, tuple[str, str]]:
-    """Return the module and the first help line of each command, read from the source without
-    importing.
+    """Return the module and the first help line of each command by its name, in the order of
+    `FAMILIES` and of the files; read from the source without importing.
     """
     commands = {}
     for family in FAMILIES:
@@ -102,7 +102,9 @@ def _command_sources() -> dict[str, tuple[str, str]]:
 
 
 def _command_name(function: str) -> str:
-    """Return the name of the command that a function called `function` implements."""
+    """Return the name of the command that a function called `function` implements: hyphens in place
+    of underscores.
+    """
     return function.replace("_", "-")
 
 
@@ -113,11 +115,15 @@ class LazyCommands(TyperGroup):
     """
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names of all commands."""
+        """Return the names of all commands, in the order of their modules; the
+        context is not used.
+        """
         return [*_command_sources()]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command called `cmd_name`, or None if there is none; imports its module."""
+        """Return the command called `cmd_name`, or None if there is none; its module is imported.
+        The context is not used.
+        """
         if cmd_name not in _command_sources():
             return None
         with error_console.status(
@@ -135,10 +141,15 @@ class LazyCommands(TyperGroup):
         return get_command_from_info(info, **how)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the name and the command that the arguments begin with, and the other arguments.
+        """Return the name and the command that the arguments `args` begin with, and the other
+        arguments.
 
-        An unknown name ends the program with a message that suggests a similar command, or the
-        commands that replace it.
+        Raises
+        ------
+        click.UsageError
+            For an unknown name, with a similar command or the commands that replace it; it ends the
+            program with exit code 2. While completions are computed, only a replaced command is
+            refused.
         """
         if args and (replacement := REPLACED_COMMANDS.get(args[0])):
             ctx.fail(f"No such command {args[0]!r}: {replacement}.")
@@ -153,7 +164,9 @@ class LazyCommands(TyperGroup):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a line on each command into the help, by groups."""
+        """Write a line on each command into the help, by the groups of `COMMAND_GROUPS`, to
+        `formatter`; the context is not used.
+        """
         sources = _command_sources()
         for title, names in COMMAND_GROUPS.items():
             with formatter.section(title):
@@ -177,7 +190,7 @@ app = typer.Typer(
 
 
 def _print_version(is_requested: bool) -> None:
-    """Print the version and exit, if the option was given."""
+    """Print the version and exit if the option was given; otherwise do nothing."""
     if is_requested:
         from importlib.metadata import version
 
@@ -197,6 +210,7 @@ def _root(
         ),
     ] = False,
 ) -> None:
+    """Do nothing: the options of the program itself act by their callbacks, before any command."""
     pass
 
 
@@ -207,7 +221,9 @@ def _root_command() -> Callable[..., Any]:
 
 
 def main() -> None:
-    """Run the command line: errors become one message and an exit code."""
+    """Run the command line and end the process: errors become one message on stderr and an exit
+    code, see the module; it does not return.
+    """
     try:
         _run_command()
     except KeyboardInterrupt:  # before or after the command itself
@@ -217,7 +233,16 @@ def main() -> None:
 
 
 def _run_command() -> None:
-    """Run the command of the arguments; exit with a message for bad input or a failure."""
+    """Run the command of the arguments; the function ends with an exception in any case.
+
+    Raises
+    ------
+    SystemExit
+        With the exit code of the command; after a message, 2 for bad input and files that cannot be
+        used, 1 for a failed simulation.
+    KeyboardInterrupt
+        After an interrupt that the command does not handle.
+    """
     restore = heed_interrupts()
     # That it builds its cache of fonts, or where, is no news to who solves a problem.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
@@ -239,7 +264,7 @@ def _run_command() -> None:
 
 
 def _exit_with_error(kind: str, error: Exception, code: int) -> NoReturn:
-    """Print an error after the word `kind`, and exit with `code`."""
+    """Print an error on stderr after the word `kind`, and raise `SystemExit` with `code`."""
     error_console.print(
         Text(f"{kind}: ", style="red").append(str(error), style="default"),
         soft_wrap=True,

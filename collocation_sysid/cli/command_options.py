@@ -96,7 +96,9 @@ def command(
     """
 
     def registered(function: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Register the function in `group`, and return it unchanged."""
+        """Register the function, whose only argument is annotated with its dataclass of options, in
+        `group`, and return it unchanged.
+        """
         (kind,) = (
             each
             for name, each in get_type_hints(function).items()
@@ -105,6 +107,7 @@ def command(
         parameters = [*_typer_parameters(kind)]
 
         def called(**values: Any) -> None:
+            """Run the command with the options of the command line, by name."""
             function(_options_from_values(kind, values))
 
         called.__name__ = function.__name__
@@ -125,7 +128,9 @@ def command(
 def _typer_parameters(kind: type) -> Iterator[inspect.Parameter]:
     """Yield the parameters of a command, from which typer makes its options.
 
-    A field that is itself a dataclass of options yields one parameter for each of its fields.
+    A field that is itself a dataclass of options yields one parameter for each of its fields. Help
+    and names of an option are those of its annotation if that has a help text, else of the section
+    "Attributes" of `kind`, which must have an entry then.
     """
     documented = attributes(kind)
     for name, default, hint, marks in _typed_fields(kind):
@@ -159,14 +164,16 @@ def _typer_parameters(kind: type) -> Iterator[inspect.Parameter]:
 
 
 def _option_names(field: str, default: Any, type_text: str) -> list[str]:
-    """Return the names of an option on the command line.
+    """Return the names of an option on the command line: those in `type_text`, and unless a long
+    one is among them the name of the field before them, with hyphens.
 
     Parameters
     ----------
     field : str
-        Name of the field.
+        Name of the field; underscores at its ends are left out, as of `set_`.
     default : object
-        Default value; an option that is on by default gets a name to switch it off.
+        Default value; an option that is on by default gets a name to switch it off, as in
+        "--film/--no-film".
     type_text : str
         Type of the field in the docstring, which may contain names that begin with "-".
     """
@@ -185,11 +192,12 @@ def _options_from_values(kind: type[T], values: Mapping[str, Any]) -> T:
     kind : type
         Dataclass of options; fields that are dataclasses of options are made from the same values.
     values : mapping of name to value
+        A value for every field; values of other names are ignored.
 
     Raises
     ------
     InputError
-        Naming the option as it is written on the command line.
+        For a value that `kind` refuses, naming the option as it is written on the command line.
     """
     content = {
         name: _options_from_values(hint, values)  # type: ignore[arg-type]
@@ -227,7 +235,10 @@ def _typed_fields(kind: type) -> list[tuple[str, Any, Any, tuple[Any, ...]]]:
     for name in dict.fromkeys(name for name in order if name in defaults):
         annotated = get_origin(hints[name]) is Annotated
         hint, *marks = get_args(hints[name]) if annotated else (hints[name],)
-        if get_origin(hint) in (Union, UnionType):  # of what may be None
+        if get_origin(hint) in (
+            Union,
+            UnionType,
+        ):  # for instance a type or None
             kinds = (
                 get_args(one)[0] if get_origin(one) is Annotated else one
                 for one in get_args(hint)
@@ -246,15 +257,25 @@ class ProblemOptions:
     allow_code: AllowCode = False
 
     def read_problem(self, simulation: bool = False) -> Problem:
-        """Read the problem file with the changes of the command line.
+        """Read the problem file with the changes of the command line, and return the problem.
 
-        Notes are printed on stderr unless the command is quiet. With `simulation`, measurements may
-        be missing.
+        Notes are printed on stderr unless the command has an option `quiet` that is set.
+
+        Parameters
+        ----------
+        simulation : bool
+            Whether measurements may be missing.
+
+        Raises
+        ------
+        InputError
+            If a file or a key is not usable.
         """
         with error_console.status(f"reading {self.problem}"):
             from ..problem import Problem
 
             def say(sentence: str) -> None:
+                """Print a note on stderr unless the command is quiet."""
                 if not getattr(self, "quiet", False):
                     error_console.print(
                         Text(sentence, style="dim"), soft_wrap=True
@@ -263,7 +284,7 @@ class ProblemOptions:
             return Problem.read(
                 self.problem,
                 self.set_ or (),
-                self.allow_code,
+                allow_code=self.allow_code,
                 simulation=simulation,
                 say=say,
             )
@@ -282,12 +303,8 @@ class RunFolderOptions:
     run_folder: Annotated[Path, typer.Argument()]
 
     def __post_init__(self) -> None:
-        """Refuse a file of a run folder in its place, and name the folder.
-
-        Raises
-        ------
-        InputError
-            If the run folder is a file.
+        """Raise an `InputError` if the run folder is a file; if it is one in a run folder, the
+        message names that folder.
         """
         require_run_folder(self.run_folder)
 
@@ -302,7 +319,9 @@ class OutputOptions(Options):
     def print_result(
         self, answer: Any, content: Shown | Iterable[Shown]
     ) -> None:
-        """Print the result as JSON if requested, or else its tables and lines `content`."""
+        """Print the result on stdout: `answer` as JSON if requested, or else its tables and lines
+        `content`.
+        """
         if self.as_json:
             typer.echo(as_json(answer))
         else:

@@ -26,8 +26,8 @@ EXIT_DOUBTFUL = EXIT_NOT_CONVERGED
 
 
 def interruption_exit(saved_results: str) -> typer.Exit:
-    """Print what is kept after an interrupt and the command that continues; return the exit to
-    raise.
+    """Print on stderr what is kept after an interrupt (`saved_results`) and the command that
+    continues; return the exit to raise, with `EXIT_INTERRUPTED`.
     """
     again = shlex.join(["collocation-sysid", *sys.argv[1:]])
     error_console.print(
@@ -39,7 +39,7 @@ def interruption_exit(saved_results: str) -> typer.Exit:
 
 def print_result(content: Shown | Iterable[Shown]) -> None:
     """Print on stdout: wrapped between words on a terminal, elsewhere each line and table row
-    unbroken.
+    unbroken, and nothing at all for empty content.
     """
     console = PlainConsole()
     if console.is_terminal:

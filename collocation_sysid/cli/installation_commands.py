@@ -86,7 +86,9 @@ def completion(options: CompletionCommand) -> None:
 
 
 def installation_sections(report: InstallationReport) -> list[Shown]:
-    """Return the state of an installation as tables and a conclusion."""
+    """Return the state of an installation for display: tables of the installation, the required
+    packages and the extras, and a conclusion.
+    """
     return [
         labelled(
             "Installation",
@@ -126,7 +128,9 @@ def installation_sections(report: InstallationReport) -> list[Shown]:
 
 
 def _requirement_text(dependency: Dependency) -> str:
-    """Return the required versions, with the remedy where the installed one is not suitable."""
+    """Return the range of required versions, empty for any; with the remedy where the installed one
+    is not suitable.
+    """
     if dependency.is_suitable:
         return dependency.required
     package = f"{dependency.name}{dependency.required}"
@@ -134,7 +138,9 @@ def _requirement_text(dependency: Dependency) -> str:
 
 
 def _solver_rows(report: InstallationReport) -> dict[str, str]:
-    """Return the table rows of the solvers."""
+    """Return the table rows of the solvers, value by name; a single row if CasADi cannot be
+    imported.
+    """
     if report.solvers is None:
         return {"solvers": "unknown, because CasADi cannot be imported"}
     linear = ", ".join(report.solvers.ipopt_linear) or "none that works"
@@ -151,7 +157,9 @@ def _solver_rows(report: InstallationReport) -> dict[str, str]:
 
 
 def _kernel_rows(report: InstallationReport) -> dict[str, str]:
-    """Return the table rows of the compiler and the cache of kernels."""
+    """Return the table rows of the compiler and the cache of kernels, value by name; a single row
+    if llvmlite cannot be imported.
+    """
     kernels = report.kernels
     if kernels is None:
         return {
@@ -170,7 +178,7 @@ def _kernel_rows(report: InstallationReport) -> dict[str, str]:
 
 
 def _thread_rows(report: InstallationReport) -> dict[str, str]:
-    """Return the table rows of threads and memory."""
+    """Return the table rows of threads and memory, value by name."""
     threads = report.threads
     memory = number(threads.memory_mb and threads.memory_mb / 1e3, 3)
     return {
@@ -180,7 +188,9 @@ def _thread_rows(report: InstallationReport) -> dict[str, str]:
 
 
 def _conclusion(report: InstallationReport) -> Line:
-    """Return the outcome of the self test and of the whole check."""
+    """Return the outcome of the self test and of the whole check as a line, with packages to
+    install.
+    """
     test = report.self_test
     outcome = "passed" if test.is_passed else "FAILED"
     text = f"Self test {outcome} in {test.time_s:.1f} s: {test.message}."

@@ -15,7 +15,9 @@ class UnbrokenCode(CodeBlock):
     def __rich_console__(
         self, console: Console, options: ConsoleOptions
     ) -> RenderResult:
-        """Yield the code, indented by two spaces."""
+        """Yield the lines of the code, each indented by two spaces, whatever the width of the
+        console.
+        """
         for line in str(self.text).rstrip().splitlines():
             yield Text(
                 f"  {line}", style="cyan", no_wrap=True, overflow="ignore"

@@ -116,9 +116,9 @@ def solve(options: SolveCommand) -> None:
             finished = run(
                 problem,
                 options.method,
-                progress.iteration,
-                progress.say,
-                options.start,
+                watch=progress.iteration,
+                log=progress.say,
+                start=options.start,
                 scheduler=options.scheduler,
                 probe=options.probe,
             )
@@ -158,9 +158,11 @@ def solve(options: SolveCommand) -> None:
 def _draw_pictures(
     finished: Run, folder: Path, options: SolveCommand
 ) -> Result:
-    """Draw the pictures of a run, and return its result with the time that they took.
+    """Draw the pictures of a finished run into its folder, and return its result with the time that
+    they took.
 
-    After an interrupt the result without that time is returned, and a message says how to go on.
+    After an interrupt the result without that time is returned, and a message on stderr says how to
+    go on. Progress is shown as `options` states.
     """
     from ..result.solve_progress import SolveProgress
 
@@ -229,9 +231,10 @@ def simulate(options: SimulateCommand) -> None:
 
 
 def _draw_instability(error: SimulationError, folder: Path) -> None:
-    """Write a picture of the mode in which the body loses its stability into the folder.
+    """Write a picture of the mode in which the body loses its stability to instability.png in the
+    folder, which is made if necessary, and print its name on stderr.
 
-    `error` has such a mode.
+    `error` must have such a mode in `stability_loss`.
     """
     from ..result.figure_style import RESOLUTION_DPI
     from ..result.pictures.instability import instability_picture
@@ -299,9 +302,15 @@ def check(options: CheckCommand) -> None:
 
 
 def _write_depth_overlays(problem: Problem, folder: Path) -> None:
-    """Write a picture of each depth camera's first image with the undeformed body into the folder.
+    """Write a picture of each depth camera's first image with the undeformed body into the folder,
+    and print the names of the files.
 
-    Nothing is written without depth cameras.
+    The folder is made if necessary. Nothing is written or printed without depth cameras.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made or written in.
     """
     if not any(experiment.depths for experiment in problem.experiments):
         return

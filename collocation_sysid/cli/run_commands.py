@@ -134,7 +134,14 @@ def export(options: ExportCommand) -> None:
 def _export_body(
     options: ExportCommand, destination: ExportDestination
 ) -> None:
-    """Write the body of a run for a simulator, and print what the simulator cannot express."""
+    """Write the body of a run for a simulator, and print warnings, what the simulator cannot
+    express, the comparison if the export is verified, and the destination; or all of this as JSON.
+
+    Raises
+    ------
+    InputError
+        If run, experiment or destination are not usable.
+    """
     from ..extras.export import (
         TARGETS,
         IdentifiedBody,
@@ -147,7 +154,7 @@ def _export_body(
     target = TARGETS[name]
     destination.require_possible()
     body = IdentifiedBody.read(
-        options.run_folder, options.experiment, options.allow_code
+        options.run_folder, options.experiment, allow_code=options.allow_code
     )
     with destination.export_folder() as folder:
         exported = write_export(body, name, folder=folder)
@@ -180,7 +187,8 @@ def _export_body(
 def _export_recording(
     options: ExportCommand, destination: ExportDestination
 ) -> None:
-    """Write the recording of a run for the Rerun viewer, and print what is missing in it.
+    """Write the recording of a run for the Rerun viewer, and print what is missing in it and the
+    file; or both as JSON.
 
     Raises
     ------
@@ -353,7 +361,7 @@ def view(options: ViewCommand) -> None:
     html = options.html
     field = options.field
     if html is None:
-        opened(run, field or DEFAULT_FIELD, options.experiment)
+        opened(run, field or DEFAULT_FIELD, experiment=options.experiment)
         return
     require_possible(html.parent)
     typer.echo(

@@ -81,7 +81,9 @@ def completion_script(shell: str, root: Any) -> str:
 
 
 def named_values() -> dict[str, dict[str, tuple[str, ...]]]:
-    """Return the possible values of texts, by command and parameter."""
+    """Return the possible values of options and arguments whose type is text, by command and by
+    parameter of its function.
+    """
     from ..common.pages import page_files
     from ..extras.export import MAIN_FILES
     from ..methods import METHODS
@@ -97,7 +99,16 @@ def named_values() -> dict[str, dict[str, tuple[str, ...]]]:
 def _completed_command(
     command: Any, context: Any, values: Mapping[str, tuple[str, ...]]
 ) -> CompletedCommand:
-    """Return a command of typer with its options; `values` are by name of the parameter."""
+    """Return a command of typer with its options.
+
+    Parameters
+    ----------
+    command : Command
+    context : Context
+        Context of the group of commands.
+    values : mapping of str to tuple of str
+        Known values by name of the parameter; for others see `_values`.
+    """
     arguments = [
         p
         for p in command.get_params(context)
@@ -117,7 +128,17 @@ def _completed_command(
 def _options(
     command: Any, context: Any, values: Mapping[str, tuple[str, ...]]
 ) -> tuple[CompletedOption, ...]:
-    """Return the options of a command; one with a negation, such as --no-pictures, yields two."""
+    """Return the options of a command that help shows; one with a negation, such as --no-pictures,
+    yields two.
+
+    Parameters
+    ----------
+    command : Command
+    context : Context
+        Context of the group of commands.
+    values : mapping of str to tuple of str
+        Known values by name of the parameter; for others see `_values`.
+    """
     options = []
     for parameter in command.get_params(context):
         if parameter.param_type_name != "option" or parameter.hidden:
@@ -142,7 +163,9 @@ def _options(
 def _values(
     parameter: Any, context: Any, values: Mapping[str, tuple[str, ...]]
 ) -> tuple[str, ...]:
-    """Return the possible values of a parameter; empty for files and free text."""
+    """Return the possible values of a parameter: those in `values`, else those that its type lists;
+    empty for files and free text.
+    """
     if parameter.name in values:
         return values[parameter.name]
     items = parameter.shell_complete(context, "")
@@ -152,7 +175,9 @@ def _values(
 
 
 def _summary(text: str) -> str:
-    """Return the first sentence of a help text, shortened for a menu."""
+    """Return the first sentence of a help text without its full stop, on one line, shortened with
+    an ellipsis to `LONGEST_DESCRIPTION` for a menu.
+    """
     first = re.split(r"(?<=[a-z)])\.(?:\s|$)|\n\n", text.strip(), maxsplit=1)[0]
     line = " ".join(first.split())
     if len(line) <= LONGEST_DESCRIPTION:
@@ -163,7 +188,15 @@ def _summary(text: str) -> str:
 def bash_script(
     commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]
 ) -> str:
-    """Return the script for bash; values that are not known are completed as files."""
+    """Return the script for bash, which defines the completion when it is sourced; values that are
+    not known are completed as files.
+
+    Parameters
+    ----------
+    commands : sequence of CompletedCommand
+    root : sequence of CompletedOption
+        Options that come before a command.
+    """
     first = [*(each.name for each in commands), *_names(root)]
     lines = [
         f"# Completion of {PROGRAM} for bash.",
@@ -212,7 +245,9 @@ def bash_script(
 def zsh_script(
     commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]
 ) -> str:
-    """Return the script for zsh, to be evaluated, or put into a folder of ``fpath``."""
+    """Return the script for zsh, to be evaluated, or put into a folder of ``fpath``; arguments as
+    of `bash_script`.
+    """
     lines = [
         f"#compdef {PROGRAM}",
         f"{FUNCTION}() {{",
@@ -259,12 +294,14 @@ def zsh_script(
 
 
 def _described(name: str, description: str) -> str:
-    """Return an entry of a menu of zsh, quoted."""
+    """Return an entry of a menu of zsh, "name:description", quoted for the shell."""
     return shlex.quote(f"{name}:{description}")
 
 
 def _zsh_option(name: str, option: CompletedOption) -> str:
-    """Return the specification of an option for `_arguments`, quoted; it may occur repeatedly."""
+    """Return the specification of one name of an option for `_arguments`, quoted; the option may
+    occur repeatedly.
+    """
     text = re.sub(r"([\[\]\\:])", r"\\\1", option.description)
     value = ""
     if option.takes_value:
@@ -277,7 +314,9 @@ def _zsh_option(name: str, option: CompletedOption) -> str:
 def fish_script(
     commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]
 ) -> str:
-    """Return the script for fish."""
+    """Return the script for fish, which defines the completion when it is sourced; arguments as of
+    `bash_script`.
+    """
     begin = f"complete -c {PROGRAM}"
     lines = [f"# Completion of {PROGRAM} for fish."]
     for option in root:
@@ -301,7 +340,9 @@ def fish_script(
 
 
 def _fish_option(option: CompletedOption) -> str:
-    """Return the arguments of fish's `complete` for an option."""
+    """Return the arguments of fish's `complete` for an option: its names, its values (files if
+    these are not known) and its description.
+    """
     names = [
         f"-l {n[2:]}" if n.startswith("--") else f"-s {n[1:]}"
         for n in option.names
@@ -323,7 +364,7 @@ def _fish_quote(text: str) -> str:
 
 
 def _names(options: Sequence[CompletedOption]) -> list[str]:
-    """Return all names of options."""
+    """Return all names of options, in their order."""
     return [name for option in options for name in option.names]
 
 

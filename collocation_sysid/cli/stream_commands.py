@@ -59,14 +59,17 @@ class LiveEstimationOptions(Options):
         Raises
         ------
         InputError
-            Also if the file of --rerun cannot be written.
+            If the problem is not usable, or not for a live estimate, or if the file of --rerun
+            cannot be written.
         """
         if self.rerun is not None:
             from ..extras.live.live_recording import require_recordable
 
             require_recordable(self.rerun)
         budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
-        problem = read_problem(recording, self.set_ or (), self.allow_code)
+        problem = read_problem(
+            recording, self.set_ or (), allow_code=self.allow_code
+        )
         return LiveEstimator(problem, LiveOptions(budget_s, self.window_s))
 
     @contextmanager

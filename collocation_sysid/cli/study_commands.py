@@ -195,8 +195,10 @@ def compare_models(options: CompareModelsCommand) -> None:
         if options.damping is not None
         else (),
     )
-    for variant in variants:  # a model that cannot be would fail every run
-        Problem.read(variant.path, variant.overrides, options.allow_code)
+    for variant in variants:  # an impossible model would fail every run
+        Problem.read(
+            variant.path, variant.overrides, allow_code=options.allow_code
+        )
     planned = plan_models(
         problem, variants, method=method, allow_code=options.allow_code
     )
@@ -240,12 +242,14 @@ def sweep(options: SweepCommand) -> None:
         allow_code=options.allow_code,
     )
     # A missing file would fail every run.
-    Problem.read(options.problem, planned[0].overrides, options.allow_code)
+    Problem.read(
+        options.problem, planned[0].overrides, allow_code=options.allow_code
+    )
     _run_study(SWEEP_STUDY, options, planned=planned)
 
 
 def _single_method(text: str | None) -> str | None:
-    """Return the method named by --method, or None if the option is not used.
+    """Return the method named by --method, or None if the option is not used (`text` is None).
 
     Raises
     ------

@@ -242,7 +242,7 @@ def new(options: NewCommand) -> None:
 
 
 def _methods_table() -> Table:
-    """Return the table of the methods, with a line on each."""
+    """Return the table of the methods: name, and the first line of the docstring."""
     from ..methods import METHODS, method_summary
 
     return Table(
@@ -254,7 +254,9 @@ def _methods_table() -> Table:
 
 
 def _options_table(method: str) -> list[Shown]:
-    """Return the description of a method's options: defaults, allowed values and meaning."""
+    """Return the description of a method's options for display: a summary, the heading of its table
+    in the problem file, and default, allowed values and meaning of each option.
+    """
     from ..methods import method_options_schema, method_summary
     from ..problem.solver_schema import table_heading
 
@@ -280,7 +282,7 @@ def _options_table(method: str) -> list[Shown]:
 
 
 def _default_text(option: Mapping[str, Any]) -> str:
-    """Return the default of an option as text."""
+    """Return the default of an option as text, from its JSON schema; a tuple in brackets."""
     default = option["default"]
     items = default if isinstance(default, tuple) else [default]
     text = ", ".join(
@@ -290,7 +292,9 @@ def _default_text(option: Mapping[str, Any]) -> str:
 
 
 def _allowed_values_text(option: Mapping[str, Any]) -> str:
-    """Return the allowed values of an option in words, from its JSON schema."""
+    """Return the allowed values of an option in words, from its JSON schema, such as "number above
+    0"; for an array the words are about its items.
+    """
     if "enum" in option:
         return ", ".join(option["enum"])
     if option["type"] == "array":

@@ -57,12 +57,13 @@ def require_method(name: str, option: str) -> None:
 
 
 def method_summary(method: str) -> str:
-    """Return the first line of a method's docstring."""
+    """Return the first line of the docstring of a method, a key of `METHODS`."""
     return inspect.cleandoc(METHODS[method].__doc__ or "").splitlines()[0]
 
 
 def method_options_schema(method: str) -> dict[str, Any]:
-    """Return the JSON schema of a method's options: types, ranges, defaults and descriptions.
+    """Return the JSON schema of a method's options: types, ranges, defaults and descriptions, as a
+    new dictionary.
 
     Parameters
     ----------

@@ -128,7 +128,9 @@ class LagrangianGradient(TimedFunction):
         return nfwd == 1
 
     def get_forward(self, nfwd, name, inames, onames, opts):
-        """Return the function of the directional derivative (CasADi's interface)."""
+        """Return the function of the directional derivative, `hessian_product`, with CasADi's name
+        for it (CasADi's interface); the other arguments are not used.
+        """
         inputs = [*self._inputs, *self._outputs, *self._inputs]
         self._forward = TimedFunction(
             name,
@@ -214,11 +216,17 @@ class NlpFunctions:
         inputs = self._inputs if needs_multipliers else self._inputs[:2]
         kind = LagrangianGradient if outputs == ("grad_l",) else TimedFunction
         sparsities = [self._sparsity(output) for output in outputs]
-        made = kind(name, inputs, sparsities, evaluate, self.errors)
-        if isinstance(made, LagrangianGradient):
-            made.hessian_product = self._forward
-        self._functions.append(made)
-        return made
+        callback = kind(
+            name,
+            inputs,
+            outputs=sparsities,
+            evaluate=evaluate,
+            errors=self.errors,
+        )
+        if isinstance(callback, LagrangianGradient):
+            callback.hessian_product = self._forward
+        self._functions.append(callback)
+        return callback
 
     def _evaluate(self, inputs: list[Array], outputs: dict[str, Array]) -> None:
         """Write the requested outputs to `outputs`, in place.
@@ -296,8 +304,8 @@ class NlpFunctions:
     def _upper_triangle(
         self, z: Array, weight: float, multipliers: Array
     ) -> Array:
-        """Return the values of the upper triangle of the Hessian at z, in the order of
-        `hessian_structure`.
+        """Return the values of the upper triangle of the Hessian of weight · f + multipliers · g at
+        z, in the order of `hessian_structure`, as a new array.
         """
         values = np.empty(len(self.collocation.hessian_structure[1]))
         self._upper_values(z, weight, multipliers, values)
@@ -328,7 +336,7 @@ class NlpFunctions:
 
     @cached_property
     def _full(self) -> tuple[ca.Sparsity, NDArray[np.int64]]:
-        """Sparsity of the symmetric Hessian, and the index of each entry in the upper
+        """Sparsity of the symmetric Hessian, and for each of its entries the index in the upper
         triangle's values.
         """
         upper = self._sparsity("triu_hess")
@@ -339,7 +347,7 @@ class NlpFunctions:
         ) - 1
 
     def _sparsity(self, output: str) -> ca.Sparsity:
-        """Return the sparsity of an output, by name."""
+        """Return the sparsity of an output, by name; values and gradients are dense columns."""
         variables = self.collocation.variable_count
         rows = self.collocation.constraint_count
         if output == "jac_g":
@@ -461,4 +469,4 @@ class IterationMonitor(ca.Callback):
         )
         number = recorder.history[-1].number + 1 if recorder.history else 0
         self.lines += 1
-        recorder.add_variables(number, variables, loss)
+        recorder.add_variables(number, variables, loss=loss)

@@ -23,22 +23,16 @@ from ..recording.experiment import Experiment
 from ..recording.obstacle import Obstacle
 from .solution import Solution
 
-# Pressure times gap of each solve, in κδ².
+# Pressure times gap in each of the successive solves, in κδ².
 RELAXED = (1e-2, 1e-3, 1e-4)
-# Faces that came so near may touch, in edges.
+# Distance from an obstacle below which a face may touch it, in mean edges.
 REACH = 1.0
-# Solves a collocation from variables of it, as it is made explicit.
+# Solves a collocation from variables of its form with lifted variables.
 Solve = Callable[[Collocation, Array], Solution]
 
 
 def require_frictionless(obstacles: Iterable[Obstacle]) -> None:
-    """Raise `InputError` if an obstacle has friction.
-
-    Raises
-    ------
-    InputError
-        Names the obstacle and the alternatives.
-    """
+    """Raise `InputError` if an obstacle has friction, with its name and the alternatives."""
     for each in obstacles:
         if each.has_friction:
             raise InputError(
@@ -50,6 +44,9 @@ def require_frictionless(obstacles: Iterable[Obstacle]) -> None:
 def solve_complementarity(first: Solution, solve: Solve) -> Solution:
     """Return the solution with contact as complementarity.
 
+    Pressure times gap takes the values `RELAXED` κδ² in turn; each solve starts from the previous
+    solution.
+
     Parameters
     ----------
     first : Solution
@@ -60,7 +57,9 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
     Returns
     -------
     Solution
-        Last solution; an earlier one if its solve did not converge.
+        Solution of the last solve, with the history and the times of all; the sequence ends with
+        the first solve that does not converge. It has no `initial_multipliers`, and a note on the
+        solves.
     """
     obstacles_by_experiment = {
         segment.experiment.name: reachable_obstacles(
@@ -73,7 +72,7 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
     solution = first
     relaxed = _relax(first.collocation, obstacles_by_experiment, share=0.0)
     for share in RELAXED:
-        # Its pressures are those of the solve before, not such as the smaller product asks for.
+        # The pressures are those of the previous solve, not those of the smaller product.
         z = relaxed.with_lifted_variables().pack(
             *solution.collocation.unpack(solution.z)
         )
@@ -89,7 +88,7 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
         f"contact as complementarity: after the solve with a contact energy, {len(RELAXED)} "
         f"further solves reduced pressure times gap to {share:g} κδ²"
     )
-    # Multipliers that balance pressures which follow from gaps: the solver's leave its rounding.
+    # The multipliers are computed again where needed, as the solver's contain its rounding errors.
     return replace(
         solution, initial_multipliers=None, notes=(*solution.notes, note)
     )
@@ -108,8 +107,8 @@ def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
     Returns
     -------
     list of Obstacle
-        One per obstacle, with the faces that come within `REACH` edges of it; unchanged if none
-        does.
+        One per obstacle, with the faces that come within `REACH` of their mean edges of it; an
+        obstacle that no face comes near is unchanged.
     """
     obstacles = []
     mesh = experiment.body.mesh
@@ -135,7 +134,9 @@ def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
 
 
 def with_contact_energy(experiment: Experiment) -> Experiment:
-    """Return the experiment with the contact energy for all obstacles."""
+    """Return a copy of the experiment with the contact energy for all
+    obstacles, `relaxed` = None.
+    """
     return experiment.with_obstacles(
         [replace(o, relaxed=None) for o in experiment.obstacles]
     )

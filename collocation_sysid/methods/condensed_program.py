@@ -64,7 +64,7 @@ def complete_multipliers(
     """
     if not isinstance(program, CondensedCollocation):
         return multipliers
-    return program.complete_multipliers(z, 1.0, multipliers)
+    return program.complete_multipliers(z, 1.0, multipliers=multipliers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,7 +311,7 @@ class CondensedCollocation(Collocation):
 
     @property
     def phi_columns(self) -> slice:
-        """Slice of the nuisance parameters in z."""
+        """Slice of the nuisance parameters φ in z; none of them is eliminated."""
         first = int(self._condensed_indices[0][self.complete.phi_columns.start])
         return slice(first, first + self.nphi)
 
@@ -329,7 +329,9 @@ class CondensedCollocation(Collocation):
         return self.complete.pack(p, positions)[self._remaining[0]]
 
     def unpack(self, z: Array) -> tuple[Array, list[Array]]:
-        """Return parameters p and the positions (N, 3n) of each experiment [m]."""
+        """Return parameters p and the positions (N, 3n) of each experiment [m] from z, those of the
+        eliminated dofs included.
+        """
         return self.complete.unpack(self.complete_variables(z))
 
     def bounds(self) -> tuple[Array, Array]:
@@ -338,7 +340,9 @@ class CondensedCollocation(Collocation):
         return lower[self._remaining[0]], upper[self._remaining[0]]
 
     def complete_variables(self, z: Array) -> Array:
-        """Return the variables of the complete program from z."""
+        """Return the variables of the complete program from z, with the eliminated positions at
+        their values for the φ in z.
+        """
         variables = np.empty(self.complete.variable_count)
         variables[self._remaining[0]] = z
         for each, (positions, _) in zip(
@@ -351,7 +355,8 @@ class CondensedCollocation(Collocation):
         self, z: Array, loss_weight: float, multipliers: Array
     ) -> Array:
         """Return the multipliers of all constraints of the complete program; those of eliminated
-        constraints make the Lagrangian stationary in the eliminated positions.
+        constraints make the Lagrangian stationary in the eliminated positions, also where z is no
+        optimum.
 
         Parameters
         ----------
@@ -386,11 +391,13 @@ class CondensedCollocation(Collocation):
     # Values -------------------------------------------------------------------------------------
 
     def objective(self, z: Array) -> float:
-        """Return the loss L divided by the number of measurements."""
+        """Return the loss L in the scaling of the NLP at z."""
         return self.complete.objective(self.complete_variables(z))
 
     def gradient(self, z: Array) -> Array:
-        """Return ∂objective/∂z (variables,)."""
+        """Return ∂objective/∂z (variables,) by the remaining variables, including the dependence
+        through the eliminated positions on φ.
+        """
         slope = self.complete.gradient(self.complete_variables(z))
         for each, (_, by_phi) in zip(
             self.eliminated, self._prescribed(z), strict=True
@@ -399,7 +406,7 @@ class CondensedCollocation(Collocation):
         return slope[self._remaining[0]]
 
     def constraint_values(self, z: Array) -> Array:
-        """Return the scaled constraints g (constraints,)."""
+        """Return the scaled values (constraints,) of the constraints g that remain."""
         return self.complete.constraint_values(self.complete_variables(z))[
             self._remaining[1]
         ]
@@ -434,8 +441,8 @@ class CondensedCollocation(Collocation):
         return CondensedPattern.from_pairs(
             (self.constraint_count, self.variable_count),
             of_free_variables,
-            pairs,
-            through,
+            pairs=pairs,
+            eliminated=through,
         )
 
     @property
@@ -509,7 +516,7 @@ class CondensedCollocation(Collocation):
             )
         size = self.variable_count
         return CondensedPattern.from_pairs(
-            (size, size), remaining, pairs, through
+            (size, size), remaining, pairs=pairs, eliminated=through
         )
 
     def _is_loss_coupling(
@@ -537,8 +544,8 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
-        """Indices, in the values of the Hessian, of the diagonal entries of q and of the
-        positions.
+        """Indices, in the values of the Hessian, of the diagonal entries of q, and of those of the
+        positions that remain.
         """
         places = np.full(len(self.complete.hessian_structure[1]), -1)
         places[self._hessian.remaining] = self._hessian.targets[0]
@@ -570,7 +577,9 @@ class CondensedCollocation(Collocation):
         values = np.empty(len(layout.structure[1])) if out is None else out
         values[:] = 0
         if multipliers is not None:
-            multipliers = self.complete_multipliers(z, loss_weight, multipliers)
+            multipliers = self.complete_multipliers(
+                z, loss_weight, multipliers=multipliers
+            )
         complete_values = self._complete_hessian(
             self.complete_variables(z), loss_weight, multipliers=multipliers
         )
@@ -626,11 +635,19 @@ class CondensedCollocation(Collocation):
             p[places[clock_places]] = samples * sample
         nearest[self.complete.phi_columns] = p[self.nq :]
         if np.array_equal(nearest, z):
-            return self.complete.hessian_values(z, loss_weight, multipliers)
-        values = self.complete.hessian_values(nearest, loss_weight, None)
+            return self.complete.hessian_values(
+                z, loss_weight, multipliers=multipliers
+            )
+        values = self.complete.hessian_values(
+            nearest, loss_weight, multipliers=None
+        )
         if multipliers is not None:
-            values += self.complete.hessian_values(z, loss_weight, multipliers)
-            values -= self.complete.hessian_values(z, loss_weight, None)
+            values += self.complete.hessian_values(
+                z, loss_weight, multipliers=multipliers
+            )
+            values -= self.complete.hessian_values(
+                z, loss_weight, multipliers=None
+            )
         return values
 
 

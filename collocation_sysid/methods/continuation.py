@@ -67,12 +67,13 @@ class Continuation(Options):
     stage: Mapping[str, Any] | Callable[..., Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        """Raise an `InputError` for invalid shares or a stage that is no method, see `method`."""
         super().__post_init__()
         self.method  # noqa: B018 - refuses a stage that makes no sense
 
     @cached_property
     def method(self) -> Method:
-        """Method that solves the parts.
+        """Method that solves the parts: `stage` itself unless that is a mapping of options.
 
         Raises
         ------
@@ -96,10 +97,12 @@ class Continuation(Options):
         watch: Watch | None = None,
         start: Array | None = None,
     ) -> Solution:
-        """Solve the NLP, see `Method`; the first part starts from the first rows of `start`.
+        """Solve the NLP, see `Method`; the first part starts from the first rows of `start`, by
+        default as the method of the parts does.
 
-        Numbers and times of the history continue from part to part. The solve ends with a part that
-        was interrupted or refused; the notes contain the result of each part.
+        Numbers and times of the history, with whose entries `watch` is called, continue from part
+        to part. The solve ends with a part that was interrupted or refused; the notes contain the
+        result of each part.
         """
         climb = _ContinuationState(
             self.method, Recorder(self.name, collocation, watch=watch)
@@ -113,15 +116,17 @@ class Continuation(Options):
 
 
 def first_samples(experiment: Experiment, count: int) -> Experiment:
-    """Return the experiment with its first samples.
+    """Return the experiment with its first samples; depth cameras without a point in them are left
+    out.
 
     Parameters
     ----------
     experiment : Experiment
         Experiment.
     count : int
-        Number of samples; it is increased to three, and to the first sample with a marker or with a
-        depth image.
+        Number of samples; it is increased to three, to the first sample with a marker, and until
+        every depth camera has points and three images (one if static), but not beyond the
+        recording.
     """
     markers = experiment.markers
     stop = min(
@@ -140,8 +145,8 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
 
 
 def first_share(collocation: Collocation, share: float) -> Collocation:
-    """Return the problem with the first share, from 0 to 1, of every fitted experiment's samples;
-    validation recordings are left out.
+    """Return the problem with the first share, from 0 to 1, of every fitted experiment's samples,
+    at least `FEWEST` where there are as many; validation recordings are left out.
     """
     fitted = [segment.experiment for segment in collocation.transcriptions]
     shorter = [
@@ -208,7 +213,12 @@ class _ContinuationState:
         return solution.status not in (Status.INTERRUPTED, Status.REFUSED)
 
     def solution(self) -> Solution:
-        """Return the solution of the last part as a solution of the complete problem."""
+        """Return the solution of the last part as a solution of the complete problem, after at
+        least one part was solved.
+
+        If the last part is not the complete problem, missing positions are simulated or move
+        rigidly, and the solution has no multipliers of the method.
+        """
         assert self.last is not None
         assert self.known is not None
         last = self.last
@@ -258,7 +268,8 @@ def _continue_variables(
     """Return variables z from parameters p (np,) and the first rows of positions [m] of each
     experiment.
 
-    The missing rows are simulated or, if that fails, those of a rigid motion with the grasp.
+    The missing rows are simulated or, from where that fails, those of a rigid motion with the
+    grasp; surplus rows are cut.
     """
     parts = collocation.iterates_at(p, positions)
     known, _ = simulate_trajectories(
@@ -266,4 +277,4 @@ def _continue_variables(
         p,
         known_rows=[part.x[: part.segment.grid_times] for part in parts],
     )
-    return complete_variables(collocation, p, known)
+    return complete_variables(collocation, p, known_rows=known)

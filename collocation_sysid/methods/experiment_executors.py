@@ -51,6 +51,8 @@ class ExperimentExecutor(Protocol):
     ) -> list[Any]:
         """Apply a function to every experiment, and return the results as stored values.
 
+        An exception of the function is raised here or by `fetch`.
+
         Parameters
         ----------
         run : callable
@@ -67,7 +69,7 @@ class ExperimentExecutor(Protocol):
         ...
 
     def notes(self) -> list[str]:
-        """Return remarks for the user, for example on lost workers."""
+        """Return remarks for the user, for example on lost workers; empty if there are none."""
         ...
 
 
@@ -84,19 +86,23 @@ class LocalExecutor:
         self.threads = threads
 
     def store_segments(self, collocation: Collocation) -> list[Any]:
-        """Return the transcriptions themselves, which stay in this process."""
+        """Return the transcriptions themselves, in a new list."""
         return list(collocation.transcriptions)
 
     def map_experiments(
         self, run: Callable[..., Any], *columns: Sequence[Any]
     ) -> list[Any]:
-        """Apply a function to every experiment in parallel, and return the results themselves."""
+        """Apply a function to every experiment, in parallel threads, and return the results
+        themselves; an exception of the function is raised.
+        """
         return map_experiments(
-            lambda row: run(*row), [*zip(*columns, strict=True)], self.threads
+            lambda row: run(*row),
+            [*zip(*columns, strict=True)],
+            threads=self.threads,
         )
 
     def fetch(self, stored: Sequence[Any]) -> list[Any]:
-        """Return the stored values unchanged."""
+        """Return the stored values themselves, in a new list."""
         return list(stored)
 
     def notes(self) -> list[str]:
@@ -125,7 +131,14 @@ class DaskExecutor:
         self._first = _require_package(client)
 
     def store_segments(self, collocation: Collocation) -> list[Any]:
-        """See `ExperimentExecutor`; each body and experiment is sent only once."""
+        """Return futures of the transcriptions on the workers, which are chosen at the first call;
+        each body and experiment is sent only once.
+
+        Raises
+        ------
+        SearchEnded
+            If the scheduler or all workers are lost.
+        """
         segments = collocation.transcriptions
         with self._end_search_if_disconnected():
             known = all(
@@ -142,7 +155,14 @@ class DaskExecutor:
     def map_experiments(
         self, run: Callable[..., Any], *columns: Sequence[Any]
     ) -> list[Any]:
-        """Apply a function to every experiment on its worker, and return futures of the results."""
+        """Apply a function to every experiment on its worker, and return futures of the results at
+        once, see `ExperimentExecutor`; `store_segments` must have been called.
+
+        Raises
+        ------
+        SearchEnded
+            If the scheduler is lost.
+        """
         rows = zip(self._homes, *columns, strict=True)
         with self._end_search_if_disconnected():
             return [self._submit(home, run, *row) for home, *row in rows]
@@ -173,7 +193,9 @@ class DaskExecutor:
         )
 
     def _result(self, future: Any) -> Any:
-        """Return the result of a future, and check from time to time that workers exist."""
+        """Return the result of a future, or raise the exception of its function; check every
+        `LOOK_EVERY_S` that workers exist, and raise `SearchEnded` otherwise.
+        """
         while True:
             try:
                 return future.result(timeout=LOOK_EVERY_S)
@@ -203,12 +225,11 @@ class DaskExecutor:
     def _submit(
         self, home: str, run: Callable[..., Any], *arguments: Any
     ) -> Any:
-        """Return a future of a function on a worker; Dask may choose another worker if that is
-        lost.
+        """Return a future of a function of `arguments` on the worker at the address `home`; Dask
+        may choose another worker if that is lost.
 
         Keys begin with the function's name, from which Dask estimates the duration of a task.
         """
-        # By the name of the function dask knows how long such tasks take.
         key = f"{run.__name__}-{secrets.token_hex(16)}"
         return self.client.submit(
             _run_alone,
@@ -220,36 +241,43 @@ class DaskExecutor:
         )
 
     def _send_segment(self, transcription: Transcription, home: str) -> Any:
-        """Return a future of a transcription on a worker."""
+        """Return the future of a transcription on a worker, at the address `home`; its experiment
+        and body are sent before it, unless they have been.
+        """
 
         def send_once(value: T, make: Callable[[T], Any]) -> Any:
-            """Return the future of an object, which is made at the first call."""
+            """Return the future of an object, which `make` makes at the first call with it."""
             if value not in self._sent:
                 self._sent[value] = make(value)
             return self._sent[value]
 
-        def experiment(options: Experiment) -> Any:
+        def send_body(body: Body) -> Any:
+            """Return a new future of a body."""
+            return self._submit(home, _identity, body)
+
+        def send_experiment(experiment: Experiment) -> Any:
+            """Return a new future of an experiment, which refers to that of its body."""
             return self._submit(
                 home,
                 _with_body,
-                _with_fields(options),
-                send_once(options.body, body),
+                _with_fields(experiment),
+                send_once(experiment.body, send_body),
             )
 
-        def body(options: Body) -> Any:
-            return self._submit(home, _identity, options)
-
-        def complete_segment(options: Transcription) -> Any:
-            sent = send_once(options.experiment, experiment)
-            chart = _with_fields(options.association)
+        def send_transcription(complete: Transcription) -> Any:
+            """Return a new future of a transcription, which refers to that of its experiment."""
+            sent_experiment = send_once(complete.experiment, send_experiment)
+            association = _with_fields(complete.association)
             rest = {
-                n: v
-                for n, v in options.__getstate__().items()
-                if n not in ("experiment", "association")
+                name: value
+                for name, value in complete.__getstate__().items()
+                if name not in ("experiment", "association")
             }
-            return self._submit(home, _restore_segment, sent, chart, rest)
+            return self._submit(
+                home, _restore_segment, sent_experiment, association, rest
+            )
 
-        return send_once(transcription, complete_segment)
+        return send_once(transcription, send_transcription)
 
 
 @contextmanager
@@ -271,7 +299,8 @@ def connect_executor(scheduler: str | None) -> Iterator[DaskExecutor | None]:
 def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
     """Return the worker address of each experiment.
 
-    The experiment with the highest cost is assigned first, each to the thread with the least work.
+    The experiment with the highest cost is assigned first, each to the thread with the least work
+    so far.
 
     Parameters
     ----------
@@ -282,7 +311,7 @@ def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
 
     Raises
     ------
-    InputError
+    SearchEnded
         If there are no workers.
     """
     _require_workers(threads)
@@ -333,7 +362,7 @@ def _refusal(message: str) -> InputError:
 
 
 def _require_workers(threads: dict[str, int]) -> None:
-    """Raise `SearchEnded` if no worker is left."""
+    """Raise `SearchEnded` if no worker is left: `threads`, their numbers by address, is empty."""
     if not threads:
         raise _disconnection("No worker is left.")
 
@@ -396,8 +425,8 @@ def _with_body(experiment: Experiment, body: Body) -> Experiment:
 def _restore_segment(
     experiment: Experiment, chart: MarkerAssociation, rest: dict[str, Any]
 ) -> Transcription:
-    """Return a transcription from its experiment, its association without body, and its
-    other arguments.
+    """Return a transcription from its experiment, its association `chart` without body, and its
+    other arguments by name; workers run this function.
     """
     return Transcription(
         experiment, association=_with_fields(chart, experiment.body), **rest

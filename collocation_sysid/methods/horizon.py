@@ -130,7 +130,9 @@ class Horizon:
             )
 
     def set_collocation(self, collocation: Collocation) -> None:
-        """Use another collocation of the same problem, with measurements associated differently."""
+        """Use another collocation of the same problem, with measurements associated differently, in
+        place; iterates that were evaluated before are unchanged, see `reassociate`.
+        """
         self.collocation = collocation
         self.segments = self.workers.store_segments(collocation)
 
@@ -140,7 +142,7 @@ class Horizon:
         trajectories: Sequence[Any],
         known_iterate: Iterate | None = None,
     ) -> Iterate:
-        """Sweep all experiments at parameters p and trajectories x.
+        """Sweep all experiments at parameters p and trajectories x, and return the iterate.
 
         Parameters
         ----------
@@ -164,9 +166,10 @@ class Horizon:
     def evaluate_step(
         self, p: Array, previous: Iterate, step: Array
     ) -> Iterate:
-        """Sweep all experiments after a step of the parameters.
+        """Sweep all experiments after a step of the parameters, and return the new iterate.
 
-        Static experiments are solved for their equilibria first, see `trajectory.sweep_after_step`.
+        Static experiments are solved for their equilibria first, see
+        `trajectory_sweeps.sweep_after_step`.
 
         Parameters
         ----------
@@ -175,7 +178,7 @@ class Horizon:
         previous : Iterate
             Iterate before the step.
         step : (np,) array
-            Step of the parameters.
+            Step of the parameters, along which the positions are extrapolated.
 
         Raises
         ------
@@ -190,8 +193,8 @@ class Horizon:
         )
 
     def reassociate(self, p: Array, iterate: Iterate) -> Iterate:
-        """Return an iterate at parameters p (np,) with the measurements of the present
-        collocation.
+        """Return an iterate at parameters p (np,) with the measurements of the present collocation;
+        positions and sensitivities are those of `iterate`, not computed again.
         """
         return self._run(p, reassociate, iterate.trajectories)
 

@@ -72,7 +72,7 @@ def compute_initial_point(
     """
 
     def record(line: Iteration) -> None:
-        """Record an iteration, and end the search if the time is over."""
+        """Record an iteration, and raise `SearchEnded` if the time is over."""
         recorder.add(line)
         if recorder.elapsed_s > max_time_s:
             raise SearchEnded(Status.TIME_LIMIT)

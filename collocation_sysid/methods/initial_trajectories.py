@@ -41,9 +41,11 @@ def associated_at_guess(collocation: Collocation) -> Collocation:
         theta = segment.constants.theta(p[: segment.nq])
         try:
             first = Forces.from_experiment(
-                experiment, experiment.t_s[:1], theta
+                experiment, experiment.t_s[:1], theta=theta
             )
-            x, _ = initial_state(experiment, first, NewtonSolver(experiment))
+            x, _ = initial_state(
+                experiment, first, solver=NewtonSolver(experiment)
+            )
         except SimulationError:
             x = experiment.rigid_positions(experiment.t_s[:1]).ravel()
         positions.append(x[None])
@@ -133,7 +135,7 @@ def simulate_trajectories(
         )
 
     reached = map_experiments(
-        simulate_one, range(len(parts)), collocation.threads
+        simulate_one, range(len(parts)), threads=collocation.threads
     )
     failures = [failure for _, failure in reached if failure is not None]
     return [x for x, _ in reached], failures[0] if failures else None
@@ -181,7 +183,7 @@ def complete_variables(
     p: Array,
     known_rows: Sequence[Array] | None = None,
 ) -> Array:
-    """Return variables z from parameters and the first rows of every trajectory.
+    """Return variables z (variables,) from parameters and the first rows of every trajectory.
 
     Missing rows are those of `rigid_trajectory`.
 
@@ -192,7 +194,7 @@ def complete_variables(
     p : (np,) array
         Shared and nuisance parameters (q, φ).
     known_rows : sequence of (k, 3n) array, optional
-        First rows of every trajectory [m]; none by default.
+        First rows of every trajectory [m]; none by default, as for None.
     """
     trajectories = []
     for part in collocation.iterates_at(
@@ -217,16 +219,19 @@ def _empty_trajectories(collocation: Collocation) -> list[Array]:
 
 
 def rigid_trajectory(transcription: Transcription, theta: Array) -> Array:
-    """Return a trajectory (N, 3n) in which the initial shape moves rigidly with the grasp [m].
+    """Return a trajectory (N, 3n) in which the initial shape moves rigidly with the grasp [m], on
+    all times of the grid.
 
-    Grasped nodes have their prescribed positions. The initial shape is the initial equilibrium at
-    constants `theta` (k,) or, if that fails, the undeformed shape.
+    Grasped nodes have their prescribed positions at the guess of φ. The initial shape is the
+    initial equilibrium at constants `theta` (k,) or, if that fails, the undeformed shape.
     """
     experiment = transcription.experiment
     t_s = transcription.dynamics.t_s
     try:
-        first = Forces.from_experiment(experiment, t_s[:1], theta)
-        x0, _ = initial_state(experiment, first, NewtonSolver(experiment))
+        first = Forces.from_experiment(experiment, t_s[:1], theta=theta)
+        x0, _ = initial_state(
+            experiment, first, solver=NewtonSolver(experiment)
+        )
     except SimulationError:
         x0 = experiment.rigid_positions(t_s[:1]).ravel()
     rotations, translations = experiment.rigid_motion(t_s)

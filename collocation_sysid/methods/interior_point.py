@@ -88,7 +88,8 @@ STEP_LIMIT = np.log(2.0)
 ROW_PIVOT = 1e-11
 # Largest product of that constant with the largest curvature of the objective.
 ROW_SLOWNESS = 1e-9
-# Of MUMPS: lower than what that diagonal gives, higher than what rounding makes of a zero.
+# Pivot tolerance of MUMPS: below the pivots that this diagonal gives, above those that rounding
+# gives in place of zero.
 PIVOT_TOLERANCE = 1e-12
 # Near the optimum variables and multipliers of bounds stay where they are, to this distance.
 WARM_PUSH = 1e-9
@@ -158,12 +159,8 @@ class InteriorPoint(Options):
     ipopt: Mapping[str, IpoptValue] = field(default_factory=dict)
 
     def require(self, experiments: Iterable[Experiment]) -> None:
-        """Check that the method can solve the experiments.
-
-        Raises
-        ------
-        InputError
-            If contact is a complementarity and an obstacle has friction; the message names both.
+        """Raise an `InputError` if contact is a complementarity and an obstacle has friction; the
+        message names experiment and obstacle.
         """
         if self.contact == "complementarity":
             for each in experiments:
@@ -176,7 +173,11 @@ class InteriorPoint(Options):
         watch: Watch | None = None,
         start: Array | None = None,
     ) -> Solution:
-        """Solve the NLP, see `Method`.
+        """Solve the NLP from `start`, by default from the guess, as `initial` states; `watch` is
+        called with every entry of the history. See `Method`.
+
+        With contact as complementarity, and obstacles, further solves follow a converged one, see
+        `solve_complementarity`.
 
         Raises
         ------
@@ -190,13 +191,13 @@ class InteriorPoint(Options):
         is_hard = self.contact == "complementarity" and any(
             e.obstacles for e in experiments
         )
-        solution = self._solve(collocation, watch, start)
+        solution = self._solve(collocation, watch, start=start)
         if not is_hard or not solution.status.converged:
             return solution
         relaxed_method = replace(self, initial="simulation")
         return solve_complementarity(
             solution,
-            lambda relaxed, z: relaxed_method._solve(relaxed, watch, z),
+            lambda relaxed, z: relaxed_method._solve(relaxed, watch, start=z),
         )
 
     def _solve(
@@ -282,11 +283,11 @@ class InteriorPoint(Options):
         solution = nlpsol.solve(
             recorder,
             program,
-            start,
-            "ipopt",
-            hessian,
-            settings,
-            IPOPT_STATUS,
+            start=start,
+            plugin="ipopt",
+            hessian=hessian,
+            settings=settings,
+            statuses=IPOPT_STATUS,
             initial_multipliers=multipliers,
         )
         if "Invalid_Option" not in solution.message:
@@ -373,7 +374,13 @@ class _DampedHessian:
     """Hessian of the Lagrangian with the warm-up and proximal terms of the options.
 
     It depends on the sequence of calls: each call compares the parameters with those of the
-    previous call.
+    previous call, and adapts the damping.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Program that is passed to IPOPT.
+    options : InteriorPoint
     """
 
     def __init__(
@@ -404,7 +411,7 @@ class _DampedHessian:
         is_settled = self._ends_warm_up(self.collocation.parameters_from(z))
         is_exact = self.options.hessian == "exact" and is_settled
         self.collocation.hessian_values(
-            z, weight, multipliers if is_exact else None, values
+            z, weight, multipliers=multipliers if is_exact else None, out=values
         )
         values[self._of_x] += self.options.proximal
         if not is_settled:
@@ -413,8 +420,10 @@ class _DampedHessian:
             values[self._of_q] += weight * self._damping * largest
 
     def _ends_warm_up(self, p: Array) -> bool:
-        """Return whether the step to p (np,) was short, and not because of damping; p is stored and
-        the damping adapted to the length of the step.
+        """Return whether the exact Hessian may be used at p (np,): the step from the previous p is
+        shorter than `warm_up` in every parameter and the damping is negligible, or `warm_up` is 0.
+
+        p is stored, and the damping, at most 1, adapted to the length of the step of q.
         """
         steps = np.abs(p - self._last_p) / self.collocation.reach_p
         self._last_p = p

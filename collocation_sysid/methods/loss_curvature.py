@@ -49,7 +49,7 @@ def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
     previous_curvature = float(step @ curvature @ step)
     if (
         previous_curvature != 0
-    ):  # a B that has become too large shrinks to what this step saw
+    ):  # scale down a B that exceeds the curvature along this step
         curvature = curvature * min(
             1.0, abs(float(step @ curvature_step) / previous_curvature)
         )
@@ -100,13 +100,8 @@ def with_curvature(
 
 
 def require_second_derivatives(collocation: Collocation) -> None:
-    """Check that the problem has exact second derivatives.
-
-    Raises
-    ------
-    InputError
-        For materials with memory, forces with internal variables, measured wrenches and custom
-        sensors of grasp forces.
+    """Raise an `InputError` if the problem has no exact second derivatives: for materials with
+    memory, forces with internal variables, measured wrenches and custom sensors of grasp forces.
     """
     if collocation.has_eliminated_histories:
         raise InputError(
@@ -153,7 +148,7 @@ def exact_curvature(
             for k in range(len(iterate.p))
         ]
     )
-    hessian = collocation.hessian(z, 1.0, multipliers)
+    hessian = collocation.hessian(z, 1.0, multipliers=multipliers)
     reduced = (
         directions.T @ (hessian @ directions) / (2 * collocation.loss_scale)
     )
@@ -164,7 +159,7 @@ def _tangent_direction(
     collocation: Collocation, iterate: Iterate, k: int
 ) -> Array:
     """Return the change (variables,) of all variables per unit of the parameter with index k, along
-    the equations of motion; other parameters do not change.
+    the equations of motion linearised at `iterate`; other parameters do not change.
     """
     unit = np.eye(len(iterate.p))[k]
     position_changes = [

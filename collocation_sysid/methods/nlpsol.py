@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from contextvars import copy_context
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -52,7 +52,8 @@ def solve(
     judge: Callable[[Status, Array, Array], Status] = lambda status, *_: status,
     initial_multipliers: InitialMultipliers | None = None,
 ) -> Solution:
-    """Solve the recorder's collocation.
+    """Solve the recorder's collocation, and return the solution; if the solver did not converge,
+    its best iterate.
 
     Ctrl-C stops the solver after the iteration, or after 2 s; a second one ends the process.
 
@@ -81,6 +82,9 @@ def solve(
     ------
     InputError
         If the solver does not know an option, with the solver's message.
+    Exception
+        The first exception of a function of the program or of the recorder's `watch`, which ends
+        the solver.
     """
     collocation = recorder.collocation
     watch = recorder.stopwatch
@@ -104,13 +108,15 @@ def solve(
         }
         solver = _create_solver(plugin, functions, settings=options)
     initial_variables = convert_variables(start, collocation, target=program)
-    z, multipliers, return_status, count = _run(
+    result = _run(
         solver,
         program.bounds(),
         start=initial_variables,
         monitor=monitor,
         multipliers=initial_multipliers,
     )
+    z = result.variables
+    multipliers = result.multipliers
     if errors and not isinstance(errors[0], _SolverAbandoned):
         raise errors[0]
     watch.evaluations = previous_evaluations_s + functions.seconds
@@ -121,7 +127,7 @@ def solve(
     watch.linear_algebra = max(
         previous_linear_algebra_s, recorder.elapsed_s - accounted_s
     )
-    status = statuses.get(return_status, Status.NUMERICAL_FAILURE)
+    status = statuses.get(result.return_status, Status.NUMERICAL_FAILURE)
     if monitor.stop or (recorder.is_late and not status.converged):
         status = Status.INTERRUPTED if monitor.stop else Status.TIME_LIMIT
     if not (status.converged and np.isfinite(z).all()):
@@ -130,24 +136,23 @@ def solve(
             np.zeros(program.constraint_count),
         )
     # A solver that never began leaves its count as memory had it.
-    iterations = (
-        0 if status is Status.REFUSED else count or max(0, monitor.lines - 1)
-    )
-    problem_multipliers = complete_multipliers(program, z, multipliers)[
-        : collocation.constraint_count
-    ]
+    iterations = result.iterations or max(0, monitor.lines - 1)
+    if status is Status.REFUSED:
+        iterations = 0
+    problem_multipliers = complete_multipliers(
+        program, z, multipliers=multipliers
+    )[: collocation.constraint_count]
     problem_variables = convert_variables(z, program, target=collocation)
     status = judge(status, problem_variables, problem_multipliers)
-    message = (
-        f"{status.sentence} ({NAMES.get(plugin, plugin)}: {return_status})"
-    )
+    name = NAMES.get(plugin, plugin)
+    message = f"{status.sentence} ({name}: {result.return_status})"
     return recorder.solution(
         status,
         message,
-        problem_variables,
-        problem_multipliers,
-        iterations,
-        functions.calls,
+        z=problem_variables,
+        multipliers=problem_multipliers,
+        iterations=iterations,
+        evaluations=functions.calls,
     )
 
 
@@ -155,6 +160,15 @@ def _create_solver(
     plugin: str, functions: NlpFunctions, settings: dict[str, Any]
 ) -> ca.Function:
     """Return CasADi's solver of a program.
+
+    Parameters
+    ----------
+    plugin : str
+        CasADi's name of the solver.
+    functions : NlpFunctions
+        Functions of the program.
+    settings : dict
+        Options of the plugin, with its functions of derivatives.
 
     Raises
     ------
@@ -190,14 +204,48 @@ class _SolverAbandoned(Exception):
     """Exception of the callbacks of a solver that was abandoned on its thread."""
 
 
+class _NlpsolResult(NamedTuple):
+    """Result of a solver of `nlpsol`.
+
+    Attributes
+    ----------
+    variables : (variables,) array
+        Last variables; NaN if the solver failed or was abandoned.
+    multipliers : (constraints,) array
+        Multipliers of the constraints; empty if the solver failed or was abandoned.
+    return_status : str
+        Status that the solver states; if it raised a `RuntimeError` the last line of the message,
+        and if it was abandoned "left behind".
+    iterations : int
+        Number of iterations; 0 if the solver does not count them, failed or was abandoned.
+    """
+
+    variables: Array
+    multipliers: Array
+    return_status: str
+    iterations: int
+
+    @classmethod
+    def failure(cls, count: int, return_status: str) -> _NlpsolResult:
+        """Return the result of a solver that failed, for `count` variables."""
+        return cls(
+            np.full(count, np.nan),
+            np.zeros(0),
+            return_status=return_status,
+            iterations=0,
+        )
+
+
 def _run(
     solver: ca.Function,
     bounds: tuple[Array, Array],
     start: Array,
     monitor: IterationMonitor,
     multipliers: InitialMultipliers | None,
-) -> tuple[Array, Array, str, int]:
+) -> _NlpsolResult:
     """Run a solver, on a thread of its own if this is the main thread.
+
+    A failure of the solver is part of the result, and no error.
 
     Parameters
     ----------
@@ -211,14 +259,6 @@ def _run(
         Can stop the solver; receives its errors.
     multipliers : InitialMultipliers or None
         Initial multipliers; None for those of the solver.
-
-    Returns
-    -------
-    tuple
-        Variables, multipliers of the constraints, return status of the solver, and number of
-        iterations. If the solver raised a `RuntimeError`, variables are NaN, multipliers empty, the
-        status is the last line of the error's message, and the number is 0. The same holds if it
-        was abandoned, with the status "left behind".
     """
     lower, upper = bounds
     arguments = {"x0": start, "lbx": lower, "ubx": upper, "lbg": 0, "ubg": 0}
@@ -227,35 +267,33 @@ def _run(
             "lam_g0": multipliers.constraints,
             "lam_x0": multipliers.bounds,
         }
-    results: list[tuple[Array, Array, str, int]] = []
+    results: list[_NlpsolResult] = []
 
     def search() -> None:
         """Call the solver and append its result."""
         try:
             answer = solver(**arguments)
             stats = solver.stats()
-        except (
-            RuntimeError
-        ) as error:  # of its own, or what a callback's failure makes of it
+        except RuntimeError as error:  # of the solver or a failed callback
             message = str(error).strip().splitlines()[-1].split(": ", 1)[-1]
-            results.append(
-                (np.full(len(start), np.nan), np.zeros(0), message, 0)
-            )
+            results.append(_NlpsolResult.failure(len(start), message))
             return
-        z = answer["x"].full().ravel()
-        multipliers = answer["lam_g"].full().ravel()
-        count = int(stats.get("iter_count") or 0)
-        results.append((z, multipliers, str(stats["return_status"]), count))
+        results.append(
+            _NlpsolResult(
+                answer["x"].full().ravel(),
+                answer["lam_g"].full().ravel(),
+                return_status=str(stats["return_status"]),
+                iterations=int(stats.get("iter_count") or 0),
+            )
+        )
 
     if threading.current_thread() is threading.main_thread():
         _run_on_thread(search, monitor)
     else:
         search()
-    return (
-        results[0]
-        if results
-        else (np.full(len(start), np.nan), np.zeros(0), "left behind", 0)
-    )
+    if not results:
+        return _NlpsolResult.failure(len(start), "left behind")
+    return results[0]
 
 
 def _run_on_thread(
@@ -298,7 +336,9 @@ def _interruptible(monitor: IterationMonitor) -> Iterator[None]:
         del handlers[signal.SIGTERM]
 
     def request(number: int, _frame: object) -> None:
-        """Request a stop, and let the next signal interrupt the process."""
+        """Request a stop by a signal, and let the next signal of this number
+        interrupt the process.
+        """
         monitor.stop = True
         signal.signal(number, signal.default_int_handler)
 

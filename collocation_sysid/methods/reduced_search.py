@@ -108,6 +108,25 @@ class SearchOptions(Options):
     factorisation: Choice = "auto"
 
 
+@dataclass(frozen=True, eq=False)
+class _ReassociatedTrial:
+    """Trial whose depth points have been associated at its own estimates.
+
+    Attributes
+    ----------
+    trial : Iterate
+        Trial with the association of the point before it.
+    collocation : Collocation
+        Problem with the association at the trial.
+    reassociated : Iterate
+        Trial with that association.
+    """
+
+    trial: Iterate
+    collocation: Collocation
+    reassociated: Iterate
+
+
 class ReducedSearch:
     """State of a reduced-space search: best parameters and trajectories, trust region, number of
     sweeps.
@@ -117,16 +136,23 @@ class ReducedSearch:
     p : (np,) array
         Best parameters (q, φ).
     trajectories : list or None
-        Best trajectories, stored by the workers, see `trajectory.trajectory_positions`; None before
-        the first.
+        Best trajectories, stored by the workers, see `trajectory_sweeps.trajectory_positions`; None
+        before the first.
+    point : Iterate or None
+        Best iterate, which was accepted last; None before the first.
     sweeps : int
         Number of sweeps and simulations so far.
     trust : float
         Longest step, relative to `reach`.
     reach : (np,) array
         Change of each parameter that counts as a step of one.
+    lower, upper : (np,) array
+        Bounds of the parameters.
     has_depth_cameras : bool
         Whether an experiment has depth cameras.
+    is_associated : bool
+        Whether depth cameras of unknown position have been associated with trajectories of
+        sufficient length.
     indefinite_steps : int
         Time steps with an indefinite matrix at the best point.
     most_measurements : int
@@ -159,7 +185,7 @@ class ReducedSearch:
         self.recorder = recorder
         self.collocation = collocation = recorder.collocation
         self.sweeps = 0
-        # Points that depth cameras see belong to what is near: they tell of no long step.
+        # Depth points are associated with the nearest surface, which is valid for short steps.
         self.has_depth_cameras = any(
             segment.depths for segment in collocation.transcriptions
         )
@@ -172,7 +198,6 @@ class ReducedSearch:
         self.is_associated = True
         self.reach = collocation.reach_p
         self.p: Array = collocation.guess_p
-        # Kept by the workers, see `trajectory.trajectory_positions`.
         self.trajectories: list[Any] | None = None
         self.workers = workers
         if start is not None:
@@ -183,8 +208,7 @@ class ReducedSearch:
                 for part in collocation.iterates(start)
             ]
         self.point: Iterate | None = None
-        # The last trial, where cameras have looked anew.
-        self.camera_trial: Any = None, None, None
+        self.camera_trial: _ReassociatedTrial | None = None
         nodes = [segment.body.nodes_m for segment in collocation.transcriptions]
         self.edge_m = min(
             segment.length_m for segment in collocation.transcriptions
@@ -193,7 +217,7 @@ class ReducedSearch:
             float(np.ptp(points, axis=0).max()) for points in nodes
         )
 
-    # The ladder -------------------------------------------------------------------------------
+    # Horizons of increasing length ------------------------------------------------------------
 
     def run(self) -> tuple[Status, str]:
         """Solve the complete problem from the given positions or, without any, on increasing
@@ -264,15 +288,17 @@ class ReducedSearch:
         )
 
     def _extend_to(self, horizon: Horizon) -> None:
-        """Extend the trajectories to the length of a horizon.
+        """Extend the trajectories to the length of a horizon by simulation, in place.
 
-        If the simulation fails, the rows that were reached are fitted first, and then extended
-        again.
+        If the simulation fails, a simulation from the start is used instead if it reaches further;
+        the rows that were reached are fitted, and then extended again. Measurements are associated
+        with the first trajectories.
 
         Raises
         ------
         SimulationError
-            If this does not reach further.
+            If this does not reach further, the first simulation does not reach `FEWEST` rows, or
+            the limit of sweeps is reached.
         """
         furthest = 0
         while True:
@@ -306,7 +332,7 @@ class ReducedSearch:
             self._associate_initially(horizon, is_first=previous is None)
             self._minimise(self._horizon(rows, last=False), is_last=False)
 
-    # One rung ---------------------------------------------------------------------------------
+    # Steps on one horizon ---------------------------------------------------------------------
 
     def _minimise(self, horizon: Horizon, is_last: bool) -> Status:
         """Take Gauss–Newton steps on one horizon until convergence, and return the status.
@@ -327,7 +353,10 @@ class ReducedSearch:
         tolerance = self.options.tolerance
         self.trust = min(self.options.trust, self.largest_trust)
         point = self._accept(
-            horizon, horizon.evaluate(self.p, self.trajectories, self.point)
+            horizon,
+            horizon.evaluate(
+                self.p, self.trajectories, known_iterate=self.point
+            ),
         )
         rejections = 0
         curvature = np.zeros((len(point.p), len(point.p)))
@@ -335,7 +364,7 @@ class ReducedSearch:
         while True:
             step = self._next_step(point, curvature)
             length = self._step_length(step)
-            # A step that the trust region cuts short says nothing about the distance to go.
+            # A step that the trust region shortens contains no information on the remaining distance.
             is_full_step = length < 0.99 * self.trust
             is_short = is_full_step and length <= tolerance
             if is_short and point.feasibility_m <= FEASIBLE * self.size_m:
@@ -350,8 +379,8 @@ class ReducedSearch:
                     self._record(
                         point.p + step,
                         final_positions,
-                        point.predicted_loss(step),
-                        summaries,
+                        loss=point.predicted_loss(step),
+                        summaries=summaries,
                     )
                     return Status.CONVERGED
             predicted_share = 1.0 - point.predicted_loss(step) / max(
@@ -361,8 +390,10 @@ class ReducedSearch:
                 return Status.CONVERGED
             if self.sweeps >= self.options.max_iterations:
                 return Status.ITERATION_LIMIT
-            trial = self._try(horizon, point, step)
-            is_better = trial is not None and self._judge(point, step, trial)
+            trial = self._try(horizon, point, step=step)
+            is_better = trial is not None and self._judge(
+                point, step, trial=trial
+            )
             if (
                 trial is not None
                 and is_better
@@ -384,7 +415,7 @@ class ReducedSearch:
             if self.has_depth_cameras and length <= LEAST_DETERMINED_SHARE:
                 return (
                     Status.CONVERGED
-                )  # what is seen changes by more than such a step gains
+                )  # the association changes the loss by more than such a step
             if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
                 return Status.STALLED
             self.trust = SHRINK * length
@@ -408,12 +439,13 @@ class ReducedSearch:
         return secant_update(curvature, previous, after=after)
 
     def _step_length(self, step: Array) -> float:
-        """Return the largest change of a parameter relative to `reach`."""
+        """Return the largest change of a parameter by a step (np,), relative to `reach`."""
         return float(np.abs(step / self.reach).max(initial=0.0))
 
     def _next_step(self, point: Iterate, curvature: Array) -> Array:
-        """Return the step (np,) from `point` that minimises the model, with the neglected curvature
-        (np, np) added, within bounds and trust region.
+        """Return the step (np,) from `point` that minimises the quadratic model of the loss, with
+        the neglected curvature (np, np) added as far as `with_curvature` allows, within bounds and
+        trust region.
         """
         low = np.maximum(self.lower - point.p, -self.trust * self.reach)
         high = np.minimum(self.upper - point.p, self.trust * self.reach)
@@ -431,7 +463,7 @@ class ReducedSearch:
         self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
         try:
-            trial = horizon.evaluate_step(p, point, step)
+            trial = horizon.evaluate_step(p, point, step=step)
         except SimulationError:
             return None
         return trial if trial.is_finite else None
@@ -468,13 +500,14 @@ class ReducedSearch:
         return True
 
     def _make_feasible(self, horizon: Horizon, point: Iterate) -> Iterate:
-        """Return the point after its feasibility step or, if that does not converge, with a
-        simulated trajectory; the result is accepted as the best so far.
+        """Return the point after its feasibility step or, if that does not halve the infeasibility,
+        with a simulated trajectory; the result is accepted as the best so far, see `_resimulated`
+        for a failure.
 
         The loss of the projected trajectory is then accurate to a higher order, so that trials are
         no longer compared with a loss that is too low.
         """
-        refined = self._try(horizon, point, np.zeros(len(point.p)))
+        refined = self._try(horizon, point, step=np.zeros(len(point.p)))
         if (
             refined is None
             or refined.feasibility_m > CONTRACTION * point.feasibility_m
@@ -504,8 +537,8 @@ class ReducedSearch:
         )
 
     def _are_feasible(self, summaries: list[FitSummary]) -> bool:
-        """Return whether the residuals of the equations of motion are much smaller than the
-        tolerance.
+        """Return whether the largest residual of the equations of motion of every experiment is at
+        most `FEASIBLE_FORCE` times its unit of force.
         """
         return all(
             each.violation_n <= FEASIBLE_FORCE * segment.force_n
@@ -514,11 +547,11 @@ class ReducedSearch:
             )
         )
 
-    # Where recordings are read ----------------------------------------------------------------
+    # Association of the measurements ----------------------------------------------------------
 
     def _associate_initially(self, horizon: Horizon, is_first: bool) -> None:
         """Associate markers and cameras of unknown position with the first rows of the
-        trajectories, and replace the collocation of the search and the horizon.
+        trajectories, and replace the collocation of the search and the horizon, in place.
 
         Nothing happens after the first time, unless the trajectories were then too short for the
         cameras; nor if all positions are known.
@@ -539,7 +572,7 @@ class ReducedSearch:
             ]
             if any(counts):
                 rows = horizon.first_rows(self.trajectories, counts)
-                # What cameras see later is not there yet.
+                # Images of later rows are associated when the trajectories are long enough.
                 self.is_associated = (
                     not self.has_depth_cameras or [*map(len, rows)] == counts
                 )
@@ -560,14 +593,17 @@ class ReducedSearch:
         self.p = p
 
     def _reassociate(self, horizon: Horizon, point: Iterate) -> Iterate:
-        """Return the point with measurements associated at its estimates, and use that collocation
-        from now on; the point itself if nothing changes, or after `REREADINGS` updates.
+        """Return the point with measurements associated at its estimates, and use that collocation,
+        in place; the point itself if nothing changes, or after `REREADINGS` updates.
+
+        For the trial that `_is_better_for_cameras` has associated, that association is used.
         """
-        trial, collocation, after = self.camera_trial
-        is_camera_trial = trial is point
-        if is_camera_trial:
-            p = after.p
+        stored = self.camera_trial
+        if stored is not None and stored.trial is point:
+            collocation = stored.collocation
+            p = stored.reassociated.p
         else:
+            stored = None
             counts = [
                 segment.rows_to_follow
                 for segment in self.collocation.transcriptions
@@ -578,7 +614,9 @@ class ReducedSearch:
             return point
         self.reassociations += 1
         self._set_collocation(horizon, collocation, p=p)
-        return after if is_camera_trial else horizon.reassociate(p, point)
+        if stored is not None:
+            return stored.reassociated
+        return horizon.reassociate(p, point)
 
     def _is_better_for_cameras(
         self, horizon: Horizon, point: Iterate, trial: Iterate
@@ -598,8 +636,11 @@ class ReducedSearch:
             self.most_measurements, before.measurement_count
         )
         after = self._reassociate(horizon, trial)
-        self.reassociations -= self.collocation is not before
-        self.camera_trial = trial, self.collocation, after
+        if self.collocation is not before:
+            self.reassociations -= 1  # it counts when the trial is accepted
+        self.camera_trial = _ReassociatedTrial(
+            trial, self.collocation, reassociated=after
+        )
         measurements = self.collocation.measurement_count
         each = after.loss / max(1, measurements)
         before_each = point.loss / max(1, before.measurement_count)
@@ -618,7 +659,9 @@ class ReducedSearch:
             report.indefinite_steps for report in point.reports
         )
         summaries = [report.fit_summary for report in point.reports]
-        self._record(point.p, point.trajectories, point.loss, summaries)
+        self._record(
+            point.p, point.trajectories, loss=point.loss, summaries=summaries
+        )
         return point
 
     def _record(

@@ -105,7 +105,7 @@ class ReducedSpace(SearchOptions):
             status = lost.status
             message = lost.message
             trajectories, _ = simulate_trajectories(collocation, search.p)
-        z = complete_variables(collocation, search.p, trajectories)
+        z = complete_variables(collocation, search.p, known_rows=trajectories)
         rows = [segment.grid_times for segment in collocation.transcriptions]
         is_complete = (
             trajectories is not None and [len(x) for x in trajectories] == rows
@@ -117,12 +117,19 @@ class ReducedSpace(SearchOptions):
             None if is_complete else np.zeros(collocation.constraint_count)
         )
         return recorder.solution(
-            status, message, z, multipliers, search.sweeps, search.sweeps
+            status,
+            message,
+            z=z,
+            multipliers=multipliers,
+            iterations=search.sweeps,
+            evaluations=search.sweeps,
         )
 
 
 def memory_mb(collocation: Collocation) -> float:
-    """Estimate the memory of a solve [MB]; it increases linearly with the number of time steps."""
+    """Return an estimate of the memory of a solve [MB]; it increases linearly with the number of
+    time steps.
+    """
     # Two points with positions, p and Z; positions of the answer and of its gradients.
     columns = 2 * (2 + collocation.nq) + 6
     values = columns * collocation.variable_count

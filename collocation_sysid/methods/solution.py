@@ -226,7 +226,8 @@ class Solution:
         first : Solution
             Solve that ended before this one began.
         why : str
-            Reason for the second solve; it is inserted between the notes of both.
+            Reason for the second solve; it is inserted between the notes of both, also if it is
+            empty.
         """
         previous_iterations = max(
             [first.iterations, *(line.number for line in first.history[-1:])]
@@ -267,7 +268,9 @@ class Solution:
 
     @property
     def q(self) -> Array:
-        """Estimated shared parameters (nq,) in the transformed coordinates of the solver."""
+        """Estimated shared parameters (nq,) in the transformed coordinates of the solver, a view of
+        `z`.
+        """
         return self.z[: self.collocation.nq]
 
     @property
@@ -279,7 +282,7 @@ class Solution:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Physical values by parameter name."""
+        """Physical values by parameter name, fixed and tied parameters included."""
         return self.collocation.parameters.values(self.q)
 
     @cached_property
@@ -402,7 +405,9 @@ class Solution:
 
     @cached_property
     def rms_m(self) -> float:
-        """Root mean square distance of all markers from their measurements [m]."""
+        """Root mean square distance of all markers from their measurements [m];
+        0 without samples.
+        """
         return self.collocation.rms_marker_distance_m(self.z)
 
     @cached_property
@@ -438,7 +443,9 @@ class Solution:
 
     @cached_property
     def kkt_residual(self) -> float:
-        """Largest violation of the NLP's first-order optimality conditions, see `Collocation`."""
+        """Largest violation of the NLP's first-order optimality conditions at `multipliers`, see
+        `Collocation.kkt_residual`.
+        """
         return self.collocation.kkt_residual(self.z, self.multipliers)
 
     @property
@@ -482,15 +489,16 @@ def wrench_rms(
 def custom_sensor_rms(
     experiment: Experiment, predicted: Mapping[str, Array]
 ) -> dict[str, float]:
-    """Return the RMS residuals of custom sensors by name, in the unit of each sensor.
+    """Return the RMS residuals of custom sensors by name, in the unit of each sensor, over all its
+    values.
 
     Parameters
     ----------
     experiment : Experiment
         Experiment with the measured values.
     predicted : mapping of str to (S, m) array
-        Predicted values by sensor name. Samples that are NaN, predicted or measured, are ignored; a
-        sensor without any other has the value NaN.
+        Predicted values by sensor name, for each sensor of the experiment. Samples that are NaN,
+        predicted or measured, are ignored; a sensor without any other has the value NaN.
     """
     residuals = (
         (g.name, predicted[g.name] - g.measured_values)
@@ -582,17 +590,19 @@ def constraint_multipliers(
     """
 
     def of_experiment(iterate: ExperimentIterate) -> Array:
-        """Return the multipliers of one experiment's equations of motion."""
+        """Return the multipliers of one experiment's equations of motion, of its prescribed
+        displacements zero.
+        """
         segment = iterate.segment
         gradient = collocation.loss_scale * iterate.gradient()[0]
         solver = Sweep(segment, stopwatch=stopwatch)
         y = segment.force_n * solver.backward(
-            iterate.x, iterate.equations, gradient
+            iterate.x, iterate.equations, gradient=gradient
         )
         return segment.select_rows(y)
 
     multipliers_by_experiment = map_experiments(
-        of_experiment, collocation.iterates(z), collocation.threads
+        of_experiment, collocation.iterates(z), threads=collocation.threads
     )
     multipliers = np.concatenate(multipliers_by_experiment)
     if any(
@@ -606,8 +616,8 @@ def constraint_multipliers(
 def _set_grasp_multipliers(
     collocation: Collocation, z: Array, multipliers: Array
 ) -> None:
-    """Set the multipliers (constraints,) of prescribed displacements to minus the remaining
-    gradient of the Lagrangian, in place.
+    """Set the multipliers (constraints,) of prescribed displacements at variables z to minus the
+    remaining gradient of the Lagrangian, in place; the others are unchanged.
 
     The constraints of prescribed displacements have unit Jacobian rows.
     """

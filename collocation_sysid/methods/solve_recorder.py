@@ -161,7 +161,8 @@ class Recorder:
         self.add(line)
 
     def add(self, line: Iteration) -> None:
-        """Add an entry to the history and pass it to `watch`, unless that is None.
+        """Add an entry to the history and pass it to `watch`, unless that is None; exceptions of
+        `watch` are not caught.
 
         Coefficients of spatially varying parameters are removed from the entry, because there are
         many.

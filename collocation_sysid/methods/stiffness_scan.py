@@ -146,7 +146,7 @@ def start_problem(
         reason = "at the guess, the simulation is farther from the measurements than an undeformed body"
     result = rescue(collocation, reason, is_complete=is_complete)
     if result is None:
-        return collocation, None  # the method will tell what it needs
+        return collocation, None  # the method reports what it needs
     if failure is None and misfit <= result.misfit[result.best]:
         return collocation, None
     return replace(collocation, parameters=result.parameters), result
@@ -155,7 +155,8 @@ def start_problem(
 def rescue(
     collocation: Collocation, reason: str, is_complete: bool = False
 ) -> Scan | None:
-    """Return a scan without the given guesses; None if it finds no start.
+    """Return a scan without the given guesses; None if no modulus is free on a logarithmic scale,
+    or the body cannot be simulated at any stiffness.
 
     Parameters
     ----------
@@ -307,7 +308,9 @@ def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
 
 
 def typical_constants(parameters: Parameters) -> dict[str, float]:
-    """Return values by parameter name: guesses, or typical ones of a soft body (`SOFT_PA`)."""
+    """Return values of all parameters by name: guesses, or typical ones of a
+    soft body (`SOFT_PA`).
+    """
     return typical_parameters(parameters, SOFT_PA).guesses
 
 
@@ -424,8 +427,8 @@ def _residuals(iterate: ExperimentIterate) -> Array:
 
 
 def _compared_samples(transcription: Transcription) -> int:
-    """Return the number of first samples of an experiment that are compared: a share of the
-    recording, and at least one sample of each measurement.
+    """Return the number of first samples of an experiment that are compared: the first of `SHARES`,
+    and at least one sample of each measurement; at most all.
     """
     t_s = transcription.experiment.t_s
     first_samples = [transcription.experiment.markers.first_visible_sample]
@@ -442,6 +445,11 @@ def _compared_samples(transcription: Transcription) -> int:
 
 class _TrialSimulation:
     """Simulation of the first part of every recording, and its misfit.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem with units of all parameters.
 
     Attributes
     ----------
@@ -477,7 +485,9 @@ class _TrialSimulation:
                 segment.dynamics.t_s[:rows]
             )
             positions.append(rigid_positions.reshape(rows, -1))
-        return _misfit(self.collocation, self.collocation.guess_p, positions)
+        return _misfit(
+            self.collocation, self.collocation.guess_p, positions=positions
+        )
 
     def evaluate_guess(
         self, is_complete: bool
@@ -488,7 +498,7 @@ class _TrialSimulation:
         """
         p = self.collocation.guess_p
         positions, failure = self._simulate(
-            p, None, self.all_rows if is_complete else self.rows
+            p, None, rows=self.all_rows if is_complete else self.rows
         )
         if failure is not None:
             return np.nan, failure
@@ -508,7 +518,7 @@ class _TrialSimulation:
             Trajectories at another modulus, near which equilibria are searched; None without.
         """
         p = self._p(young_pa)
-        positions, failure = self._simulate(p, guess, self.rows)
+        positions, failure = self._simulate(p, guess, rows=self.rows)
         if failure is not None:
             self.failure = failure
             return np.nan, None
@@ -518,7 +528,7 @@ class _TrialSimulation:
         """Return whether the complete recordings can be simulated at a Young's modulus [Pa]; if
         not, the error is stored in `failure`.
         """
-        _, failure = self._simulate(self._p(young_pa), None, self.all_rows)
+        _, failure = self._simulate(self._p(young_pa), None, rows=self.all_rows)
         self.failure = failure or self.failure
         return failure is None
 
@@ -538,7 +548,7 @@ class _TrialSimulation:
     def _evaluate(self, p: Array, positions: Sequence[Array]) -> float:
         """Return the misfit of trajectories at p; NaN if it is not finite."""
         first = [x[:rows] for x, rows in zip(positions, self.rows, strict=True)]
-        misfit = _misfit(self.collocation, p, first)
+        misfit = _misfit(self.collocation, p, positions=first)
         return misfit if np.isfinite(misfit) else np.nan
 
     def _simulate(

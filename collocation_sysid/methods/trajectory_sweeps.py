@@ -126,7 +126,6 @@ class SweepResult:
         """Return the memory size in bytes, from which a scheduler estimates the cost of a
         transfer.
         """
-        # So that a scheduler knows what moving it would take.
         arrays = (self.x, self.tangent.step, self.tangent.by_p, self.slope)
         return object.__sizeof__(self) + sum(each.nbytes for each in arrays)
 
@@ -153,8 +152,8 @@ class SimulationResult:
 def trajectory_positions(
     trajectory: SweepResult | SimulationResult | Array,
 ) -> Array:
-    """Return the positions (rows, 3n) [m] of a sweep result, a simulation, or an array of
-    positions.
+    """Return the positions (rows, 3n) [m] of a sweep result (before its feasibility step) or of a
+    simulation; an array of positions is returned as it is.
     """
     return trajectory if isinstance(trajectory, np.ndarray) else trajectory.x
 
@@ -197,7 +196,9 @@ def sweep(
     if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
         raise SimulationError(massless, float(dynamics.t_s[0]))
     tangent = solver.forward(
-        part.x, part.equations, known_sweep.tangent if known_sweep else None
+        part.x,
+        part.equations,
+        known=known_sweep.tangent if known_sweep else None,
     )
     return _sweep_result(
         part,
@@ -243,7 +244,7 @@ def sweep_after_step(
         If a time step is singular or not finite.
     """
     part = _iterate(
-        transcription, p, x=extrapolate(transcription, previous, step)
+        transcription, p, x=extrapolate(transcription, previous, step=step)
     )
     dynamics = part.equations.dynamics
     x = part.x
@@ -297,8 +298,8 @@ def reassociate(
 def extrapolate(
     transcription: Transcription, sweep_result: SweepResult, step: Array
 ) -> Array:
-    """Return positions (rows, 3n) [m] after the feasibility step of a sweep and a step (k,) of the
-    experiment's parameters, to first order.
+    """Return positions (rows, 3n) [m] after the feasibility step of `sweep_result` and a step (k,)
+    of the experiment's parameters, to first order.
     """
     return (
         sweep_result.x
@@ -357,7 +358,7 @@ def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
     """
     part = _iterate(transcription, p, x=x)
     return FitSummary.from_iterate(
-        part, x, float(np.abs(part.residual_n).max())
+        part, x, violation_n=float(np.abs(part.residual_n).max())
     )
 
 
@@ -398,7 +399,7 @@ def _sweep_result(
         tangent.by_p, tangent.grasp_forces
     )
     predictions = iterate.observation.linearise(
-        iterate.x, response, tangent.step
+        iterate.x, response, step=tangent.step
     )
     matches = zip(predictions, iterate.segment.residuals, strict=True)
     residuals_and_slopes = [
@@ -427,7 +428,7 @@ def _sweep_result(
         else float(np.abs(iterate.x - previous.x).max()),
         indefinite_steps=tangent.indefinite_count,
         fit_summary=FitSummary.from_iterate(
-            iterate, iterate.x + tangent.step, tangent.violation_n
+            iterate, iterate.x + tangent.step, violation_n=tangent.violation_n
         ),
         times_s=times_s,
     )

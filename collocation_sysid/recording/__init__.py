@@ -3,8 +3,7 @@
 Begin with `experiment` (one recording with all its parts). Its parts are in:
 
 - `grasp`, `poses`, `measured_wrench`: prescribed displacements, the rigid motions that prescribe
-  them, and
-measured reaction forces.
+  them, and measured reaction forces.
 - `obstacle`, `obstacle_solids`: rigid obstacles for contact, and their shapes.
 - `loads`, `tendon`, `pressure`, `actuator`: point masses, forces, tendons and pressures.
 - `markers`, `placement`: tracked markers and where they sit on the body.
@@ -16,8 +15,8 @@ measured reaction forces.
 
 Files are read by `marker_files` (markers), `pose_files` (poses), `time_tables` (forces,
 displacements, pressures, custom sensors) and the subpackage `formats`; `recording_writers` writes
-them. `alignment`, `sample_times` and `rigid_fit` prepare data: one time grid, sample times,
-rigid fits. `experiment_refinement` moves an experiment to a finer mesh, `grasp_rotation` finds the
+them. `alignment`, `sample_times` and `rigid_fit` prepare data: one time grid, sample times, rigid
+fits. `experiment_refinement` moves an experiment to a finer mesh, `grasp_rotation` finds the
 fastest rotation of its grasps, and `checked_arrays` and `node_selection` check arrays and node
 selections.
 """

@@ -9,7 +9,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    Generic,
+    NamedTuple,
+    Self,
+    TypeVar,
+)
 
 import casadi as ca
 
@@ -24,9 +32,34 @@ if TYPE_CHECKING:
 S = TypeVar("S", PolylineLength, EnclosedVolume)
 
 
+class Calibration(NamedTuple):
+    """Calibration of an actuator.
+
+    Attributes
+    ----------
+    factor : float
+        Factor on the stated tension or pressure.
+    offset : float
+        Part of the tension [N] or pressure [Pa] that is lost.
+    log_lag_ratio : float
+        Logarithm of the ratio of its lag to the stated lag.
+    """
+
+    factor: float
+    offset: float
+    log_lag_ratio: float
+
+
 @dataclass(frozen=True, eq=False)
 class BodyMeasure(Generic[S]):
-    """A scalar S of the shape of a given body: the length of a tendon, or a volume."""
+    """A scalar S of the shape of a given body: the length of a tendon, or a volume.
+
+    Attributes
+    ----------
+    body : Body
+    measure : PolylineLength or EnclosedVolume
+        The scalar S of that body.
+    """
 
     body: Body
     measure: S
@@ -56,8 +89,8 @@ class Actuator(ABC, Generic[S]):
     declared_values: TimeSeries
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
-    unit: ClassVar[str]  # of the tension or pressure
-    offset_field: ClassVar[str]  # the field of what is lost
+    unit: ClassVar[str]  # unit of the tension or pressure
+    offset_field: ClassVar[str]  # field of the lost part
 
     def on_body(self, body: Body) -> Self:
         """Return the actuator with its scalar S evaluated for a body.
@@ -88,41 +121,54 @@ class Actuator(ABC, Generic[S]):
         return self.body_measure.measure
 
     @property
-    def calibration(self) -> tuple[float, float, float]:
-        """Factor, offset, and logarithm of the lag over the stated lag, as stated: zero."""
-        return self.factor, getattr(self, self.offset_field), 0.0
+    def calibration(self) -> Calibration:
+        """Stated calibration: factor and offset of the actuator, and zero for the logarithm of the
+        ratio of its lag to the stated one.
+        """
+        return Calibration(
+            self.factor,
+            offset=getattr(self, self.offset_field),
+            log_lag_ratio=0.0,
+        )
 
     def with_calibration(
         self, factor: float, offset: float, log_lag_ratio: float
     ) -> Self:
-        """Return the actuator with another calibration; without a lag, `log_lag_ratio` has no
-        effect.
+        """Return a copy of the actuator with another factor and offset; `log_lag_ratio` has no
+        effect on an actuator without a lag.
         """
         return replace(self, factor=factor, **{self.offset_field: offset})
 
     def input_data(self, t_s: Array) -> Array:
         """Return the data (d, T) of which `calibrated_amplitude` is a function at the times `t_s`
-        (T,).
+        (T,): here the stated tension or pressure, d = 1.
         """
         return self.declared_values.values_at(t_s)[None]
 
     def calibrated_amplitude(
         self, data: ca.SX, factor: Any, offset: Any, log_lag_ratio: Any
     ) -> ca.SX:
-        """Return the amplitude c for a calibration, as an expression of `input_data` (d,)."""
-        return self.energy_amplitude(data, factor, offset)
+        """Return the amplitude c for a calibration, as an expression of `input_data` (d,) at one
+        time; without a lag `log_lag_ratio` is ignored. Factor and offset are as of `Calibration`,
+        numbers or expressions.
+        """
+        return self.energy_amplitude(data, factor, offset=offset)
 
     @abstractmethod
     def energy_amplitude(
         self, declared_value: Any, factor: Any, offset: Any
     ) -> Any:
-        """Return the amplitude c for a stated tension or pressure: numbers, arrays or CasADi
-        expressions.
+        """Return the amplitude c for a stated tension or pressure `declared_value`, a factor on it
+        and an offset that is lost: numbers, arrays or CasADi expressions.
         """
 
     def energy_amplitude_at(self, t_s: Array) -> Array:
-        """Return the amplitude c at the times `t_s` (T,), as (T,)."""
-        factor, offset, _ = self.calibration
+        """Return the amplitude c at the times `t_s` (T,), as (T,), with the actuator's own
+        calibration.
+        """
+        calibration = self.calibration
         return self.energy_amplitude(
-            self.declared_values.values_at(t_s), factor, offset
+            self.declared_values.values_at(t_s),
+            calibration.factor,
+            offset=calibration.offset,
         )

@@ -77,18 +77,20 @@ def align(
     resample_hz : float, optional
         Rate of the new grid, which starts at the first sample that is kept.
     every : int
-        Use every n-th sample of the markers.
+        Use every n-th of the marker samples that are kept, from the first on, before any
+        resampling; 1 for all.
     grasp_intervals_s : sequence of (float, float), optional
         First and last time at which each grasp holds; its poses need not cover other times. The
         whole recording by default.
     static : bool
-        Whether the grid is the markers' own time, however it is spaced, and one sample is enough.
+        Whether the grid is the markers' own time, however it is spaced, and one sample is enough;
+        `resample_hz` is then ignored.
 
     Raises
     ------
     InputError
-        If the window is empty, the markers' time is uneven, or poses and markers share fewer than
-        three samples.
+        If the window is empty, the markers' time is uneven, the rate is not positive or leaves one
+        sample, or a cut to the time of the poses leaves fewer than three samples.
     """
     table = table if window_s is None else _cut_to_window(table, window_s)
     grasp_intervals_s = grasp_intervals_s or [(-np.inf, np.inf)] * len(poses)
@@ -100,7 +102,9 @@ def align(
     )
     if every > 1:
         table = MarkerTable(
-            table.t_s[::every], table.names, table.positions_m[::every]
+            table.t_s[::every],
+            table.names,
+            positions_m=table.positions_m[::every],
         )
     if static:
         t_s = grid = table.t_s
@@ -108,11 +112,11 @@ def align(
         sample_interval_s(table.t_s, "markers")
         t_s = table.t_s
         grid = evenly_spaced_s(table.t_s)
-        table = MarkerTable(grid, table.names, table.positions_m)
+        table = MarkerTable(grid, table.names, positions_m=table.positions_m)
     else:
         t_s = grid = _even_grid(table.t_s, resample_hz)
         table = MarkerTable(
-            grid, table.names, _interpolate_markers(table, grid)
+            grid, table.names, positions_m=_interpolate_markers(table, grid)
         )
     moved = []
     for k, sequence in enumerate(poses):
@@ -132,7 +136,8 @@ def _cut_to_poses(
     grasp_intervals_s: Sequence[tuple[float, float]],
     fewest: int,
 ) -> tuple[MarkerTable, list[str]]:
-    """Return the markers at times for which every active grasp has a pose, and notes on the cuts.
+    """Return the markers at times for which every active grasp has a pose, and notes on the cuts:
+    an empty list, and the same table, if nothing is cut.
 
     Parameters
     ----------
@@ -147,7 +152,7 @@ def _cut_to_poses(
     Raises
     ------
     InputError
-        If fewer samples remain.
+        If fewer samples remain after a cut; without a cut their number is not checked.
     """
     t_s = table.t_s
     is_inside = np.ones(len(t_s), dtype=bool)
@@ -158,7 +163,7 @@ def _cut_to_poses(
     ]
     for sequence, (from_s, until_s) in moving:
         slack_s = _tolerance_s(sequence, t_s)
-        # Beyond its first or last pose a grasp must not be asked for one.
+        # A grasp must not be evaluated beyond its first or last pose.
         if from_s < sequence.t_s[0] - slack_s:
             is_inside &= t_s >= sequence.t_s[0] - slack_s
         if until_s > sequence.t_s[-1] + slack_s:
@@ -189,15 +194,18 @@ def _cut_to_poses(
     )
     if cut[0] > t_s[0]:
         note += f"; start now refers to the state at {cut[0]:.9g} s now"
-    return MarkerTable(cut, table.names, table.positions_m[is_inside]), [note]
+    return MarkerTable(
+        cut, table.names, positions_m=table.positions_m[is_inside]
+    ), [note]
 
 
 def _cut_to_window(
     table: MarkerTable, window_s: tuple[float, float]
 ) -> MarkerTable:
-    """Return the samples within a window, its first and last time [s] included.
+    """Return the samples of a table within a window, its first and last time [s] included.
 
-    Times count as inside up to `STEP_TOLERANCE` median intervals beyond it.
+    Times count as inside up to `STEP_TOLERANCE` median intervals beyond it. Notes of the table are
+    left out.
 
     Raises
     ------
@@ -216,7 +224,9 @@ def _cut_to_window(
             f"the markers run from {table.t_s[0]:.9g} s to {table.t_s[-1]:.9g} s"
         )
     return MarkerTable(
-        table.t_s[is_inside], table.names, table.positions_m[is_inside]
+        table.t_s[is_inside],
+        table.names,
+        positions_m=table.positions_m[is_inside],
     )
 
 
@@ -241,7 +251,10 @@ def _even_grid(t_s: Array, rate_hz: float) -> Array:
 
 def _interpolate_markers(table: MarkerTable, grid: Array) -> Array:
     """Return marker positions (G, M, 3) [m] at the times `grid` (G,), linear between samples; NaN
-    beside a missing sample or within a gap of the times.
+    beside a missing sample or within a gap of the times, over `_GAP_STEPS` median intervals.
+
+    At a time within `_SAME_TIME_STEPS` of a sample it is that sample, whatever its neighbour. The
+    table must have at least two samples.
     """
     t_s = table.t_s
     x = table.positions_m
@@ -317,7 +330,8 @@ def _tolerance_s(poses: PoseSequence, t_s: Array) -> float:
 
 def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
     """Return the predicate of a note on poses that were interpolated to the times `grid` (G,), and
-    on gaps of the poses; the caller adds the subject.
+    on gaps of the poses within the grid (over `_GAP_STEPS` median intervals); the caller adds the
+    subject.
     """
     how = (
         "held"
@@ -344,7 +358,8 @@ def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
 
 def _jump_notes(poses: PoseSequence, grid: Array) -> list[str]:
     """Return the predicate of a note on jumps of smoothly interpolated poses between the first and
-    last time of `grid` (G,), as a list; empty if there are none.
+    last time of `grid` (G,), as a list of one; empty if there are none or the interpolation is not
+    smooth.
     """
     if poses.interpolation != "smooth":
         return []
@@ -365,5 +380,5 @@ def _rate_hz(t_s: Array) -> float:
 
 
 def _span_text(t_s: Array) -> str:
-    """First and last of some times as text."""
+    """First and last of times (T,) as text, "from 0 s to 1.5 s"."""
     return f"from {t_s[0]:.9g} s to {t_s[-1]:.9g} s"

@@ -38,7 +38,7 @@ def read_only_floats(
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must hold numbers: {error}") from error
-    _require_shape(array.shape, shape, name)
+    _require_shape(array.shape, shape, name=name)
     if finite and not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise InputError(
@@ -51,8 +51,8 @@ def read_only_floats(
 def float_converter(
     shape: tuple[int | None, ...], name: str, finite: bool = True
 ) -> Callable[[ArrayLike], Array]:
-    """Return a function that copies values to a read-only array; arguments and errors are those of
-    `read_only_floats`.
+    """Return a function that copies values to a read-only array; shape, name and finite are
+    arguments of `read_only_floats`, whose errors the returned function raises.
     """
     return lambda values: read_only_floats(
         values, shape, name=name, finite=finite
@@ -71,7 +71,7 @@ def read_only_tracks(
     ----------
     values : array_like
     shape : tuple of int or None
-        Expected shape; None allows any length.
+        Expected shape, of three axes; None allows any length.
     name : str
         Name of the positions, for messages.
 
@@ -91,19 +91,20 @@ def read_only_nodes(
     values: ArrayLike, shape: tuple[int | None, ...], name: str
 ) -> Index:
     """Return a read-only int64 copy of node indices, whose shape must match `shape` (None: any
-    length).
+    length). Order and repeats are kept, and an empty array of any type is accepted.
 
     Raises
     ------
     InputError
-        If the values are not whole numbers from 0 upwards, or the shape differs.
+        If the values are not whole numbers (of an integer type) from 0 upwards, or the shape
+        differs; `name` is what the indices are, for the message.
     """
     indices = np.asarray(values)
     if indices.size and not np.issubdtype(indices.dtype, np.integer):
         raise InputError(
             f"{name} must hold node numbers (integers), not {indices.dtype}"
         )
-    _require_shape(indices.shape, shape, name)
+    _require_shape(indices.shape, shape, name=name)
     nodes = indices.astype(np.int64)
     if nodes.size and nodes.min() < 0:
         raise InputError(
@@ -121,7 +122,9 @@ def point_text(point: ArrayLike) -> str:
 def _require_shape(
     shape: tuple[int, ...], expected: tuple[int | None, ...], name: str
 ) -> None:
-    """Raise an `InputError` unless `shape` matches `expected`, in which None allows any length."""
+    """Raise an `InputError` about `name` unless `shape` matches `expected`, in which None allows
+    any length.
+    """
     matches = len(shape) == len(expected) and all(
         want is None or have == want
         for have, want in zip(shape, expected, strict=True)

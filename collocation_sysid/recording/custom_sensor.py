@@ -105,6 +105,9 @@ class Gauge:
     unit: str = key(str, default="")
 
     def __post_init__(self) -> None:
+        """Check the sensor and complete it in place: `values` become (S, m), and `columns` the name
+        of the sensor, with _1, _2, … if m > 1, where none are given.
+        """
         where = f"the reading '{self.name}'"
         points = cast(Sequence[Any], self.points_m)
         times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
@@ -234,8 +237,9 @@ class Gauge:
     def _count_of_values(self) -> int:
         """Evaluate the expression and its Jacobian at rest, and return the number m of its values.
 
-        Rest means the undeformed places of the points without velocity, or force and torque of one
-        each.
+        Rest means the undeformed places of the points without velocity and acceleration, or force
+        and torque with all components one; unknowns are zero, and the time is that of the first
+        sample.
 
         Raises
         ------
@@ -255,7 +259,9 @@ class Gauge:
         names = POINT_INPUTS if self.grasp is None else GRASP_INPUTS
         try:
             read = self.read(
-                t_s, observables, ca.vertsplit(own) if self.unknowns else []
+                t_s,
+                observables,
+                unknowns=ca.vertsplit(own) if self.unknowns else [],
             )
         except (Exception, SystemExit) as error:
             raise InputError(

@@ -77,6 +77,9 @@ class DepthCamera:
     poses: PoseSequence | None = key(converter=_require_poses, default=None)
 
     def __post_init__(self) -> None:
+        """Check the camera, and store matrix, distortion and pose as read-only arrays, in place;
+        the pose is the identity by default.
+        """
         pose = read_only_floats(
             np.eye(4) if self.pose is None else self.pose, (4, 4), name="pose"
         )
@@ -113,8 +116,13 @@ class DepthCamera:
             vars(self)["matrix"] = matrix
 
     def pose_at(self, t_s: ArrayLike) -> tuple[Array, Array]:
-        """Return rotations (S, 3, 3) and translations (S, 3) [m] from the camera's frame to the
-        world at times (S,) [s]; the same for all times if the camera does not move.
+        """Return rotations R (S, 3, 3) and translations p (S, 3) [m] from the camera's frame to the
+        world, x = R X + p, at times (S,) [s]; the same for all times if the camera does not move.
+
+        Raises
+        ------
+        InputError
+            If the poses of a moving camera do not cover a time, see `PoseSequence.at`.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         rotation = self.pose[:3, :3]
@@ -127,9 +135,11 @@ class DepthCamera:
         return rotations @ rotation, rotations @ translation + translations
 
     def points_at_unit_depth(self, pixels: Array) -> Array:
-        """Return the points (P, 3) at depth z = 1 that appear at the pixels (P, 2), u and v.
+        """Return the points (P, 3) at depth z = 1 in the camera's frame that appear at the pixels
+        (P, 2), u and v.
 
-        Distortion is inverted by a fixed-point iteration.
+        Distortion is inverted by `UNDISTORTION_ITERATIONS` steps of a fixed-point iteration,
+        without a check of convergence. The camera must have a matrix.
         """
         distorted = np.linalg.solve(
             self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T
@@ -153,7 +163,8 @@ class DepthCamera:
         """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, with
         distortion.
 
-        This is the inverse of `points_at_unit_depth`. Points must be in front of the camera, z > 0.
+        At z = 1 this is the inverse of `points_at_unit_depth`. Points must be in front of the
+        camera, z > 0, and the camera must have a matrix.
         """
         x, y = (points_m[:, :2] / points_m[:, 2:]).T
         k1, k2, p1, p2, k3 = np.append(
@@ -172,7 +183,7 @@ class DepthCamera:
 
     def undistorted_pixels(self, points_m: Array) -> Array:
         """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, without
-        distortion.
+        distortion; points must have z > 0, and the camera a matrix.
         """
         projected = points_m @ self.matrix.T
         return projected[:, :2] / projected[:, 2:]
@@ -251,6 +262,14 @@ class Depth:
     images_m: Sequence[Any] = ()
 
     def __post_init__(self) -> None:
+        """Check the times, and thin the clouds in place, see `_thin_cloud`.
+
+        Raises
+        ------
+        InputError
+            If times do not increase, their number differs from that of the clouds, no cloud has a
+            point, or images are not usable, see `_check_images`.
+        """
         where = f"the depth camera '{self.name}'"
         times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
         if fault := first_unordered_time(times):
@@ -275,8 +294,8 @@ class Depth:
         )
 
     def _check_images(self, count: int) -> tuple[Array | None, ...]:
-        """Return `images_m` in single precision, with NaN for pixels without depth; empty if there
-        are none.
+        """Return `images_m` in single precision, with NaN for pixels without a positive depth, and
+        None where an image is None; an empty tuple if there are no images.
 
         Parameters
         ----------
@@ -331,14 +350,20 @@ class Depth:
         ----------
         name : str
         images_m : array_like
+            Zero, negative or NaN where there is no depth.
         camera : DepthCamera
             Camera with a matrix.
         sigma_m : float
             Standard deviation of the depth [m].
         t_s : (S,) array_like
-            Times [s].
+            Times [s]; one time, 0, by default.
         **options
-            Further fields of `Depth`.
+            Further fields of `Depth`; `images_m` is replaced.
+
+        Raises
+        ------
+        InputError
+            If the camera has no matrix, or as `Depth` does.
         """
         images = np.asarray(images_m, dtype=float)
         images = images[None] if images.ndim == 2 else images
@@ -351,9 +376,10 @@ class Depth:
 
     def _thin_cloud(self, cloud: Array) -> Array:
         """Return the finite points of a cloud (P, 3) or (P, 6), one for each cube of a grid of
-        `spacing_m`.
+        `spacing_m`, in their order in the cloud.
 
-        Of the points in a cube the one nearest to its centre across the optical axis is selected.
+        Of the points in a cube the one nearest to the cube's centre across the optical axis is
+        selected; the depth has no influence.
 
         Raises
         ------
@@ -387,11 +413,15 @@ class Depth:
 
     @property
     def points_m(self) -> list[Array]:
-        """Points (P, 3) of each sample in the camera's frame [m], without normals."""
+        """Points (P, 3) of each sample in the camera's frame [m], after thinning and without
+        normals; (0, 3) for a dropout.
+        """
         return [cloud[:, :3] for cloud in self.clouds]
 
     def until_time(self, end_s: float) -> Depth | None:
-        """Return the samples up to the time `end_s`; None if these have no point."""
+        """Return a copy with the samples up to the time `end_s`, this one included; None if these
+        have no point.
+        """
         count = int(np.searchsorted(self.sample_times_s, end_s, side="right"))
         if not any(map(len, self.clouds[:count])):
             return None
@@ -405,13 +435,13 @@ class Depth:
 
     @property
     def first_sample_with_points(self) -> int:
-        """Index of the first sample that has points."""
+        """Index, from 0, of the first sample that has points."""
         return next(k for k, cloud in enumerate(self.clouds) if len(cloud))
 
 
 def samples_with_outlines(count: int) -> set[int]:
-    """Return the indices of those of `count` samples whose images are stored for their outlines: at
-    most `MOST_OUTLINE_IMAGES`, evenly spread.
+    """Return the indices, from 0, of those of `count` samples whose images are stored for their
+    outlines: all, or `MOST_OUTLINE_IMAGES` of them, evenly spread with the first and the last.
     """
     return set(
         np.unique(
@@ -425,7 +455,8 @@ def samples_with_outlines(count: int) -> set[int]:
 def until_all_cameras_see(
     depths: Sequence[Depth], t_s: Array, count: int, fewest: int
 ) -> tuple[int, list[Depth]]:
-    """Return how many first samples of an experiment include points of every depth camera.
+    """Return how many first samples of an experiment include points of every depth camera, and the
+    images until then.
 
     Parameters
     ----------
@@ -433,14 +464,15 @@ def until_all_cameras_see(
     t_s : (T,) array
         Times of the experiment.
     count : int
-        Least number of samples.
+        Least number of samples of the experiment; returned unchanged without cameras.
     fewest : int
         Least number of images of each camera, as far as it has so many.
 
     Returns
     -------
     count : int
-        Number of first samples of the experiment.
+        Number of first samples of the experiment; the last of them is not before any of the
+        required images.
     depths : list of Depth
         Images until then, of the cameras that have points by then.
     """
@@ -460,10 +492,12 @@ def until_all_cameras_see(
 
 
 def points_from_image(image_m: Array, camera: DepthCamera) -> Array:
-    """Return the points (P, 3) [m] of a depth image (rows, columns) [m]; zero and NaN are no depth.
+    """Return the points (P, 3) [m] in the camera's frame of a depth image (rows, columns) [m], by
+    rows; zero, negative values and NaN are no depth.
 
-    Pixels beside a jump of the depth, beside a pixel without depth or at the border of the image
-    are left out, as they may mix two surfaces.
+    Pixels whose depth differs from that of one of the four neighbours by `LARGEST_RELATIVE_JUMP` or
+    more, pixels beside one without depth, and those at the border of the image are left out, as
+    they may mix two surfaces.
 
     Raises
     ------
@@ -492,21 +526,22 @@ def points_from_image(image_m: Array, camera: DepthCamera) -> Array:
 def depth_image(
     camera: DepthCamera, shape: tuple[int, int], triangles_m: Array
 ) -> Array:
-    """Render a depth image [m] of opaque triangles.
+    """Render a depth image [m] of opaque triangles, both sides of which are visible.
 
     Parameters
     ----------
     camera : DepthCamera
-        Its distortion is ignored.
+        Camera with a matrix; its distortion and pose are ignored.
     shape : (int, int)
         Rows and columns.
     triangles_m : (F, 3, 3) array
-        Corners in the camera's frame; triangles that reach behind the camera are left out.
+        Corners in the camera's frame; triangles that reach behind the camera (z ≤ 0) are left out.
 
     Returns
     -------
     (rows, columns) array
-        Depth of the nearest triangle, NaN where there is none.
+        Depth z of the nearest triangle at the centre of each pixel, which has whole coordinates;
+        NaN where there is none.
     """
     image = np.full(shape, np.inf)
     for corners in triangles_m[(triangles_m[:, :, 2] > 0).all(axis=1)]:

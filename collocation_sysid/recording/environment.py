@@ -15,7 +15,9 @@ USUAL_KG_M3: float = AIR_KG_M3
 
 
 def usual_air_density() -> float:
-    """Return the density of the air around experiments that state none [kg/m³]."""
+    """Return `USUAL_KG_M3`, the density of the air around experiments that state none [kg/m³], as
+    it is at the time of the call.
+    """
     return USUAL_KG_M3
 
 
@@ -25,7 +27,8 @@ def air_density(value: Any) -> float:
     Raises
     ------
     InputError
-        If it is neither "none" nor a finite number that is not negative.
+        If it is neither "none" nor a finite number of at least zero; booleans and numbers as text
+        are refused.
     """
     if isinstance(value, str) and value == VACUUM:
         return 0.0

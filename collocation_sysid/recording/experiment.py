@@ -51,7 +51,9 @@ DEFAULT_NUISANCE = Nuisance()
 
 
 def _state(name: str) -> Callable[[ArrayLike], Array]:
-    """Return a converter of nodal vectors (n, 3) for the field ``start_<name>``."""
+    """Return a converter of arrays (k, 3), with any k, to read-only floats for the field
+    ``start_<name>``, which raises an `InputError` for another shape or values that are not finite.
+    """
     return float_converter((None, 3), f"start_{name}")
 
 
@@ -153,6 +155,12 @@ class Experiment:
     specimen: HomogeneousDeformation | None = None
 
     def __post_init__(self) -> None:
+        """Check the experiment and complete its fields, in place.
+
+        The body gets the frames of the obstacles, grasps and loads their nodes on the body, markers
+        their placement, and pressures their rim, as far as they do not have them; obstacles are put
+        last in `grasps`.
+        """
         loads = ("masses", "forces", "tendons", "pressures")
         vars(self)["body"] = with_obstacle_frames(
             self.body, self.obstacles, is_static=self.is_static
@@ -221,8 +229,8 @@ class Experiment:
 
     @property
     def symmetry(self) -> int:
-        """Ratio of the specimen's loads to those of the modelled part; 1 if the wrenches state
-        different ones.
+        """Ratio of the specimen's loads to those of the modelled part: that of the wrenches; 1 if
+        there are no wrenches, or they state different ratios.
         """
         symmetries = {wrench.symmetry for wrench in self.wrenches}
         return symmetries.pop() if len(symmetries) == 1 else 1
@@ -235,7 +243,9 @@ class Experiment:
         )
 
     def with_obstacles(self, obstacles: Iterable[Obstacle]) -> Experiment:
-        """Return the experiment with these obstacles in place of its own."""
+        """Return a copy of the experiment with these obstacles in place of its own; all checks are
+        repeated.
+        """
         return replace(self, grasps=(*self.body_grasps, *obstacles))
 
     @property
@@ -257,7 +267,9 @@ class Experiment:
 
     @cached_property
     def prescribed_dofs(self) -> Index:
-        """Sorted dofs (3 · node + axis) with prescribed displacements at every sample time."""
+        """Sorted dofs (3 · node + axis) with prescribed displacements at every sample time, those
+        of the obstacles' frames included.
+        """
         is_prescribed = self.is_prescribed(self.t_s)
         return np.flatnonzero(is_prescribed.all(axis=0))
 
@@ -275,12 +287,19 @@ class Experiment:
     ) -> tuple[NDArray[np.bool_], Array]:
         """Return which nodal coordinates are prescribed at the times `t_s` (T,), and their values.
 
+        The n nodes include those of the obstacles' frames.
+
         Returns
         -------
         is_prescribed : (T, n, 3) bool
             Whether a grasp prescribes the coordinate.
         positions_m : (T, n, 3)
             Prescribed coordinates [m]; NaN where a coordinate is free.
+
+        Raises
+        ------
+        InputError
+            If a grasp is active at a time that its poses do not cover, see `PoseSequence.at`.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         is_prescribed = self.is_prescribed(times)
@@ -294,8 +313,8 @@ class Experiment:
         return is_prescribed, positions
 
     def is_prescribed(self, t_s: ArrayLike) -> NDArray[np.bool_]:
-        """Return whether each nodal coordinate is prescribed at the times `t_s` (T,), as (T, n, 3)
-        bool.
+        """Return whether a grasp prescribes each nodal coordinate at the times `t_s` (T,), as (T,
+        n, 3) bool; the nodes include those of the obstacles' frames.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         is_prescribed = np.zeros(
@@ -310,7 +329,8 @@ class Experiment:
 
     def prescribed_positions(self, t_s: ArrayLike) -> Array:
         """Return the coordinates of `prescribed_dofs` (g,) at the times `t_s` (T,), (T, g) [m]; NaN
-        at times at which a dof is free.
+        at times at which a dof is free, which are not among the samples. Errors as of
+        `prescribed_displacements`.
         """
         positions = self.prescribed_displacements(t_s)[1]
         return positions.reshape(len(positions), -1)[:, self.prescribed_dofs]
@@ -318,12 +338,15 @@ class Experiment:
     def moving_node_mass_kg(self, t_s: ArrayLike) -> Array:
         """Return the mass that moves with each node at the times `t_s` (T,), as (T, n) [kg].
 
-        The sum of the body's mass at its stated densities and of the point masses.
+        It is the sum of the body's mass at its stated densities and of the point masses; added mass
+        of the air is not included.
         """
         return self.body.node_mass + self.point_mass_at_nodes_kg(t_s)
 
     def point_mass_at_nodes_kg(self, t_s: ArrayLike) -> Array:
-        """Return the mass of all point masses at each node at times `t_s` (T,), as (T, n) [kg]."""
+        """Return the mass of all point masses at each node at times `t_s` (T,), as (T, n) [kg],
+        with the share that acts then, see `share`.
+        """
         n = len(self.body.nodes_m)
         times = np.atleast_1d(t_s)
         mass = np.broadcast_to(0.0, (len(times), n))
@@ -352,6 +375,9 @@ class Experiment:
     ) -> Array:
         """Return the share (T,), from 0 to 1, of a load whose time `change` ("from_s" or "until_s")
         has passed at the given times, see `share`.
+
+        In a motion it is 0 or 1 throughout unless that time is strictly within the recording;
+        static, 1 from that time on.
         """
         at_s = getattr(load, change)
         if self.is_static:
@@ -369,7 +395,7 @@ class Experiment:
 
     def declared_node_forces_n(self, t_s: ArrayLike) -> Array:
         """Return the stated forces on each node, without gravity and actuators, at times `t_s`
-        (T,), as (T, n, 3) [N].
+        (T,), as (T, n, 3) [N], with the share that acts then, see `share`.
         """
         n = len(self.body.nodes_m)
         times = np.atleast_1d(t_s)
@@ -382,7 +408,9 @@ class Experiment:
 
     @property
     def instrumented_grasps(self) -> tuple[int, ...]:
-        """Indices of the grasps whose force or torque is measured, by a wrench or custom sensor."""
+        """Indices in `grasps`, counted from 0, of the grasps and obstacles whose force or torque is
+        measured by a wrench or a custom sensor.
+        """
         grasps_of_gauges = {
             gauge.grasp - 1
             for gauge in self.readings
@@ -397,8 +425,11 @@ class Experiment:
 
     @property
     def has_known_force(self) -> bool:
-        """Whether a stated mass, force or actuator, or a measured force, sets the scale of all
-        forces.
+        """Whether a stated or measured force sets the scale of all forces.
+
+        True if a force is measured at a grasp or obstacle, the amplitude of an actuator differs
+        from zero at a sample, or a point mass or stated force acts on a free dof at a sample. The
+        weight of the body itself does not count.
         """
         if self.instrumented_grasps:
             return True
@@ -426,7 +457,9 @@ class Experiment:
 
     @property
     def coupled_graph(self) -> JointPattern:
-        """Mesh graph of the body with the couplings of its actuators, obstacles and air drag."""
+        """Mesh graph of the body with the couplings of its actuators, obstacles and, where it acts,
+        air drag; computed anew at each access.
+        """
         couplings = [each.measure.couplings for each in self.actuators]
         couplings += [
             each.contact_surface(self.body).points.couplings
@@ -439,15 +472,24 @@ class Experiment:
 
     @property
     def sparsity(self) -> SymmetricPattern:
-        """Sparsity pattern of the derivatives of the forces on the body."""
+        """Sparsity pattern of the derivatives of the forces on the body, which is that of
+        `coupled_graph`.
+        """
         return self.coupled_graph.pattern
 
     def rigid_positions(self, t_s: ArrayLike) -> Array:
-        """Return the node positions (T, n, 3) [m] if a grasp carried the undeformed body rigidly.
+        """Return the node positions (T, n, 3) [m] at times `t_s` (T,) if a grasp carried the
+        undeformed body rigidly.
 
         The first grasp that holds all axes at every sample is used; without one, the first that
         holds some axes at every sample, else the first. Without a grasp the body stays in its
         undeformed place. The frames of obstacles follow their own poses.
+
+        Raises
+        ------
+        InputError
+            If poses do not cover a time, see `PoseSequence.at`; those of a grasp that is not active
+            at every sample are repeated beyond their ends instead.
         """
         rotations, translations = self.rigid_motion(t_s)
         places = (
@@ -469,7 +511,9 @@ class Experiment:
         )
 
     def rigid_motion(self, t_s: ArrayLike) -> tuple[Array, Array]:
-        """Return rotations (T, 3, 3) and translations (T, 3) [m] of `rigid_positions`."""
+        """Return rotations R (T, 3, 3) and translations p (T, 3) [m] of `rigid_positions`, x = R X
+        + p, with the same choice of the grasp and the same errors; identities without a grasp.
+        """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         if not self.body_grasps:
             return np.tile(np.eye(3), (len(times), 1, 1)), np.zeros(
@@ -497,9 +541,9 @@ class Experiment:
     def place_sigma_m(self) -> Array:
         """Prior standard deviation (M,) of each marker's place [m].
 
-        It is that of the marker, if `markers.places_sigma_m` gives one, and else the
+        It is that of the marker where `markers.places_sigma_m` has a finite one, and else the
         `marker_offset_m` of the nuisance parameters; zero where the place is exact. Where no place
-        is given it is the diagonal of the body.
+        is given it is the diagonal of the bounding box of the body's nodes.
         """
         markers = self.markers
         usual = self.nuisance.marker_offset_m or 0.0
@@ -511,6 +555,9 @@ class Experiment:
         return np.where(markers.located, sigma_m, body_m)
 
     def _check_kind(self) -> None:
+        """Raise an `InputError` if a static experiment has another `start` or `start_rule` than the
+        default.
+        """
         if not self.is_static:
             return
         for name, usual in (
@@ -524,6 +571,9 @@ class Experiment:
                 )
 
     def _check_air(self) -> None:
+        """Raise an `InputError` unless the air is lighter than each region of the body at its
+        stated density.
+        """
         lightest = min(self.body.parts, key=lambda part: part.density_kg_m3)
         if self.air_density_kg_m3 < lightest.density_kg_m3:
             return
@@ -536,6 +586,15 @@ class Experiment:
         )
 
     def _check_time(self) -> None:
+        """Check the sample times against each other and against those of all measurements.
+
+        Raises
+        ------
+        InputError
+            If there are fewer than three samples (static: one), times are uneven (static: not
+            ascending) or differ from the markers' times, nothing is measured, or as
+            `_check_grasp_times`, `_check_custom_sensors` and `_check_depth_cameras`.
+        """
         fewest = 1 if self.is_static else 3
         if len(self.t_s) < fewest:
             raise InputError(
@@ -559,6 +618,14 @@ class Experiment:
             )
         if self.markers.sample_count == 0:
             self._require_measurements()
+        self._check_grasp_times()
+        self._check_custom_sensors()
+        self._check_depth_cameras()
+
+    def _check_grasp_times(self) -> None:
+        """Raise an `InputError` if poses do not cover the samples at which their grasp is active,
+        or a wrench has too few samples within the experiment.
+        """
         for grasp in self.grasps:
             grasp.poses.at(self.t_s[grasp.is_active(self.t_s)])
             if grasp.wrench is not None:
@@ -568,6 +635,11 @@ class Experiment:
                     name="the wrench of a grasp",
                     is_static=self.is_static,
                 )
+
+    def _check_custom_sensors(self) -> None:
+        """Raise an `InputError` if two custom sensors have the same name, one has too few samples
+        within the experiment, or one refers to no grasp.
+        """
         for gauge in self.readings:
             what = f"the reading '{gauge.name}'"
             if [other.name for other in self.readings].count(gauge.name) > 1:
@@ -588,6 +660,10 @@ class Experiment:
                     f"{len(self.grasps)}"
                 )
 
+    def _check_depth_cameras(self) -> None:
+        """Raise an `InputError` if two depth cameras have the same name, one has too few images
+        within the experiment, or one of a static experiment has an image between the samples.
+        """
         for depth in self.depths:
             what = f"the depth camera '{depth.name}'"
             if [other.name for other in self.depths].count(depth.name) > 1:
@@ -610,6 +686,9 @@ class Experiment:
                 )
 
     def _require_measurements(self) -> None:
+        """Raise an `InputError` if, besides markers, nothing is measured either: no custom sensor,
+        depth camera or wrench.
+        """
         if self.readings or self.depths or self.instrumented_grasps:
             return
         if not self.markers.names:
@@ -620,6 +699,9 @@ class Experiment:
         )
 
     def _check_nodes(self) -> None:
+        """Raise an `InputError` if a grasp, point mass, force or placement refers to a node that
+        the body does not have, or two grasps hold a dof at the same time.
+        """
         n = len(self.body.nodes_m)
         grasped = prescribed_dofs(self.grasps)
         if grasped.size and grasped[-1] >= 3 * n:
@@ -644,6 +726,7 @@ class Experiment:
             )
 
     def _check_obstacles(self) -> None:
+        """Raise an `InputError` if two obstacles have the same name."""
         names = [obstacle.name for obstacle in self.obstacles]
         if twice := [name for k, name in enumerate(names) if name in names[:k]]:
             raise InputError(
@@ -651,6 +734,14 @@ class Experiment:
             )
 
     def _check_actuators(self) -> None:
+        """Check names and times of the actuators, and fix the rims of the pressures, in place.
+
+        Raises
+        ------
+        InputError
+            If two actuators have the same name, a stated course does not cover the recording, or a
+            pressure has a rim that is not held.
+        """
         names = [actuator.name for actuator in self.actuators]
         if twice := [name for k, name in enumerate(names) if name in names[:k]]:
             raise InputError(
@@ -669,6 +760,16 @@ class Experiment:
         vars(self)["pressures"] = bounded
 
     def _check_start(self) -> None:
+        """Check the start, and complete a given state in place: velocities are zero by default, and
+        the frames of the obstacles are appended.
+
+        Raises
+        ------
+        InputError
+            If `loaded_since_s` is given for a start other than an equilibrium, a state is missing,
+            has another shape or is given although `start` is not "given", or the equilibrium is not
+            unique.
+        """
         if np.isfinite(self.loaded_since_s) and self.start != "equilibrium":
             raise InputError(
                 f"loaded_since_s is given, but start is '{self.start}'; loaded_since_s is the "
@@ -702,6 +803,8 @@ class Experiment:
         """Append positions and velocities of the obstacles' frames to a given start state without
         them, in place; a state that has them is unchanged.
 
+        Velocities are differences over a thousandth of the time between samples.
+
         Parameters
         ----------
         node_count : int
@@ -720,6 +823,9 @@ class Experiment:
             vars(self)[name] = np.vstack([getattr(self, name), own])
 
     def _require_unique_equilibrium(self) -> None:
+        """Raise an `InputError` if the grasps at the first sample leave the body a rigid motion;
+        with obstacles nothing is checked, as these may support the body.
+        """
         if self.obstacles:
             return  # these may carry it: the rest state is looked for
         is_prescribed = self.is_prescribed(self.t_s[:1])[0]

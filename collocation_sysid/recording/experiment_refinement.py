@@ -15,15 +15,24 @@ if TYPE_CHECKING:
 
 
 def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
-    """Return the experiment on a finer body.
+    """Return the experiment on a finer body, a refinement of its own.
 
-    Selections of nodes are evaluated on the finer mesh. Markers are material points: their places
-    on the undeformed body stay, whether they are nodes, inside elements or beyond the surface.
+    Selections by boxes and balls are evaluated on the finer mesh; of other selections, and of node
+    numbers, the middle of an edge belongs to the finer nodes if both ends do. Markers are material
+    points: their places on the undeformed body stay, whether they are nodes, inside elements or
+    beyond the surface. A given start state is interpolated.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    finer : Body
+        Refined body of the same shape.
     """
     body = experiment.body
     markers = experiment.markers
 
     def refined_load(load):
+        """Return a grasp, point mass or force with its nodes on the finer body."""
         return replace(
             load,
             nodes=refine_nodes(
@@ -62,8 +71,8 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
 
 
 def _interpolated(state: Array | None, body: Body, finer: Body) -> Array | None:
-    """Return nodal vectors (n, 3) of a body, interpolated to the nodes (n', 3) of the finer body by
-    the shape functions; None for None.
+    """Return nodal vectors `state` (n, 3) of a body, interpolated to the nodes (n', 3) of the finer
+    body by the shape functions; None for None.
     """
     if state is None:
         return None

@@ -90,6 +90,7 @@ class Grasp:
     wrench: Wrench | None = None
 
     def __post_init__(self) -> None:
+        """Check the grasp, see `_check_times_and_axes`."""
         self._check_times_and_axes()
 
     def _check_times_and_axes(self) -> None:
@@ -118,8 +119,13 @@ class Grasp:
             vars(self)["selection"] = self.nodes
 
     def on_body(self, body: Body, t_s: Array) -> Grasp:
-        """Return the grasp with the selected nodes of a body, and matrices as poses at `t_s`
-        (T,).
+        """Return the grasp with the selected nodes of a body, and matrices as poses at `t_s` (T,);
+        self if nothing changes.
+
+        Raises
+        ------
+        InputError
+            If the selection has no nodes on this body, or matrices are no rigid motions.
         """
         return self._with_nodes(select_on_body(self.nodes, body), t_s)
 
@@ -145,7 +151,7 @@ class Grasp:
 
     def is_active(self, t_s: ArrayLike) -> NDArray[np.bool_]:
         """Return whether the nodes are held at the times `t_s` (T,), as (T,) bool: from `from_s` to
-        `until_s`, both included.
+        `until_s`, both included within `TIME_TOLERANCE_S`.
         """
         times = np.asarray(t_s, dtype=np.float64)
         return (times >= self.from_s - TIME_TOLERANCE_S) & (
@@ -153,29 +159,39 @@ class Grasp:
         )
 
     def positions_at(self, nodes_m: Array, t_s: ArrayLike) -> Array:
-        """Return the positions (T, h, 3) [m] of the grasped nodes at the times `t_s` (T,).
+        """Return the positions (T, h, 3) [m] of the h grasped nodes at the times `t_s` (T,) if the
+        poses carry them, along all axes and also while the grasp does not hold.
 
         Parameters
         ----------
         nodes_m : (n, 3) array
             All nodes of the undeformed body.
         t_s : (T,) array
+
+        Raises
+        ------
+        InputError
+            If the poses do not cover a time, see `PoseSequence.at`.
         """
         return self.poses.moved_positions(nodes_m[self.nodes], t_s)
 
 
 def prescribed_nodes(grasps: Sequence[Grasp]) -> Index:
-    """Return all nodes that are held at some time along some axis, sorted."""
+    """Return all nodes that are held at some time along some axis, sorted without repeats; errors
+    as of `prescribed_dofs`.
+    """
     return np.unique(prescribed_dofs(grasps) // 3)
 
 
 def prescribed_dofs(grasps: Sequence[Grasp]) -> Index:
-    """Return all dofs (3 · node + axis) that are held at some time, sorted.
+    """Return all dofs (3 · node + axis) that are held at some time, sorted without repeats; empty
+    without grasps.
 
     Raises
     ------
     InputError
-        If two grasps hold the same node at the same time along the same axis.
+        If two grasps hold the same node along the same axis and their time windows share an
+        instant.
     """
     for (i, first), (j, second) in combinations(enumerate(grasps, start=1), 2):
         shared = np.intersect1d(first.prescribed_dofs, second.prescribed_dofs)
@@ -199,7 +215,7 @@ def prescribed_dofs(grasps: Sequence[Grasp]) -> Index:
     )
 
 
-# What is left free --------------------------------------------------------------------------------
+# Free rigid motions -------------------------------------------------------------------------------
 
 
 def free_rigid_motions(
@@ -207,6 +223,8 @@ def free_rigid_motions(
 ) -> list[str]:
     """Return the rigid motions that these prescribed coordinates leave free, in words; empty if
     none, and one entry for all motions together if nothing is prescribed.
+
+    Translations come first, then rotations, each along coordinate axes where possible.
 
     Parameters
     ----------
@@ -234,7 +252,7 @@ def free_rigid_motions(
     free = directions[rank:]
     if not len(free):
         return []
-    # What is left without a turn, and the axes of what turns.
+    # Free motions without rotation, and the axes of the free rotations.
     shifts = _null_space(free[:, 3:].T) @ free[:, :3]
     rotations = free[:, 3:]
     return [
@@ -250,14 +268,16 @@ def free_rigid_motions(
 
 
 def _null_space(matrix: Array) -> Array:
-    """Return an orthonormal basis (k, n) of the null space of a matrix (m, n)."""
+    """Return an orthonormal basis (k, n) of the null space of a matrix (m, n) with entries of the
+    order of one: singular values up to `SMALLEST_SINGULAR_VALUE` count as zero.
+    """
     _, values, directions = np.linalg.svd(matrix)
     return directions[int((values > SMALLEST_SINGULAR_VALUE).sum()) :]
 
 
 def _axis_aligned_basis(vectors: Array) -> Iterator[Array]:
     """Yield the unit vectors (3,) of an orthonormal basis of the span of vectors (k, 3), along
-    coordinate axes where possible.
+    coordinate axes where possible; nothing if all are zero.
     """
     _, values, directions = np.linalg.svd(
         vectors.reshape(-1, 3), full_matrices=False
@@ -272,8 +292,8 @@ def _axis_aligned_basis(vectors: Array) -> Iterator[Array]:
 
 
 def _direction_text(direction: Array) -> str:
-    """Return the name of a coordinate axis, or the components of another direction (3,), as
-    text.
+    """Return "x", "y" or "z" for a unit vector (3,) along that axis, in either sense, or else its
+    components as text.
     """
     axis = int(np.abs(direction).argmax())
     if abs(direction[axis]) > 1 - 1e-6:

@@ -30,13 +30,16 @@ class GraspRotation:
     Attributes
     ----------
     experiment : str
+        Name of the experiment.
     angle_rad : float
+        Angle of the rotation within the step.
     time_s : float
         Begin of the step.
     step_s : float
         Length of the step.
     remedy : str
-        What to change in the problem, for messages.
+        What to change in the problem, for messages: the substeps that reduce the angle to
+        `TARGET_ANGLE_RAD`, or, for poses held between samples, a smooth interpolation.
     """
 
     experiment: str
@@ -52,12 +55,14 @@ class GraspRotation:
 
 
 def fastest_rotation(experiment: Experiment, substeps: int) -> GraspRotation:
-    """Return the largest rotation of an experiment's grasps within a step of the time grid.
+    """Return the largest rotation of an experiment's grasps and obstacles within a step of the time
+    grid, while they are active.
 
     Parameters
     ----------
     experiment : Experiment
-        Of a static experiment the angle is 0, as there are no steps.
+        Of a static experiment the angle is 0, as there are no steps, and the time that of the first
+        sample.
     substeps : int
         Steps per sample.
     """

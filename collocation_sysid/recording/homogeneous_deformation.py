@@ -74,14 +74,14 @@ class HomogeneousDeformation:
 
     @property
     def needs_inner_node(self) -> bool:
-        """Whether all components of F are prescribed, so that a free node has to be added inside
-        the cell.
+        """Whether the test prescribes all nodes of a single tetrahedron, so that a free node has to
+        be added inside the cell.
         """
         return not self.free
 
     def displaced_nodes(self) -> dict[int, tuple[Array, Array]]:
-        """Return for each moving node, by its index, its displacements by e₁ and by e₂, each (3,)
-        [m].
+        """Return for each moving node of the cell, by its index from 0, the displacement by a unit
+        strain e₁ and by a unit strain e₂, each (3,) [m]; nodes at rest are left out.
         """
         directions = np.zeros((2, 4, 3))
         for k, components in enumerate((self.first, self.second)):
@@ -96,7 +96,9 @@ class HomogeneousDeformation:
         }
 
     def prescribed_axes(self, node: int) -> Axes:
-        """Return the axes along which a node of the cell is prescribed, by its index."""
+        """Return the axes along which a node of the cell is prescribed, by its index from 0: all
+        but the own axis of a node on an axis of `free`.
+        """
         own = AXES[node - 1] if node else ""
         prescribed = "".join(
             axis for axis in AXES if not (axis == own and axis in self.free)
@@ -150,7 +152,8 @@ TESTS = tuple(DEFORMATIONS)
 
 
 def cell_mesh(*, with_inner_node: bool) -> TetMesh:
-    """Return the cell: one tetrahedron, or four that share a node at its centre.
+    """Return the cell: one tetrahedron of 4 nodes, or, `with_inner_node`, four tetrahedra that
+    share a fifth node at its centre.
 
     The additional node follows the homogeneous deformation and does not change the forces on the
     others.

@@ -38,7 +38,7 @@ class TimeSeries:
     Parameters
     ----------
     values : (...) or (m, ...) array
-        One value, or a row for each time.
+        One value, or a row for each time. Stored as (m, ...), with m = 1 for one value.
     t_s : (m,) array, optional
         Sample times, ascending; None for a constant.
     what : str
@@ -49,7 +49,8 @@ class TimeSeries:
     Raises
     ------
     InputError
-        If shapes disagree, a value is not finite, or time does not increase.
+        If shapes disagree, a value is not finite, time does not increase, or several rows have no
+        times.
     """
 
     values: Array
@@ -90,11 +91,13 @@ class TimeSeries:
         return np.interp(times, self.t_s, self.values)
 
     def require_covered(self, t_s: Array, name: str) -> None:
-        """Raise an `InputError` if the samples do not cover the times `t_s` (T,) of a recording.
+        """Raise an `InputError` if the samples do not cover the times `t_s` (T,) of a recording, up
+        to `TIME_TOLERANCE_S`; a constant covers all.
 
         Parameters
         ----------
         t_s : (T,) array
+            Ascending; only the first and the last are compared.
         name : str
             What the values belong to, for the message.
         """
@@ -123,7 +126,17 @@ def smooth_ramp(time_steps: Any) -> Any:
 
 
 class Load:
-    """Something that acts on nodes of a body during a time window."""
+    """Something that acts on nodes of a body during a time window: base class of `PointMass` and
+    `Force`.
+
+    Attributes
+    ----------
+    nodes : (k,) int array or Selection
+    from_s, until_s : float
+        First and last time [s]; infinite where unlimited.
+    description_name : str
+        Kind of the load, for messages.
+    """
 
     nodes: Index
     from_s: float
@@ -132,6 +145,9 @@ class Load:
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     def __post_init__(self) -> None:
+        """Store nodes given as a selection as `selection`, too, in place; raise an `InputError`
+        unless `from_s` is before `until_s`.
+        """
         if not self.from_s < self.until_s:
             raise InputError(
                 f"a {self.description_name} acts from {self.from_s:g} s until {self.until_s:g} s; "
@@ -141,7 +157,9 @@ class Load:
             vars(self)["selection"] = self.nodes
 
     def on_body(self, body: Body) -> Self:
-        """Return the load with its selection replaced by the selected nodes of a body."""
+        """Return the load with its selection replaced by the selected nodes of a body; self if it
+        has node numbers already.
+        """
         nodes = select_on_body(self.nodes, body)
         return self if nodes is self.nodes else replace(self, nodes=nodes)
 
@@ -181,7 +199,9 @@ class PointMass(Load):
     description_name: ClassVar[str] = "point mass"
 
     def node_mass_kg(self, node_count: int) -> Array:
-        """Return the mass at each of the body's nodes, (n,) [kg]."""
+        """Return the mass at each of the body's n = `node_count` nodes, (n,) [kg], at full share;
+        the time window is not applied, see `Experiment.share`.
+        """
         mass = np.zeros(node_count)
         mass[self.nodes] = self.mass_kg / len(self.nodes)
         return mass
@@ -228,6 +248,7 @@ class Force(Load):
     description_name: ClassVar[str] = "force"
 
     def __post_init__(self) -> None:
+        """Check window and forces, and store the forces as (1, 3) or (m, 3), in place."""
         super().__post_init__()
         course = TimeSeries(self.force_n, self.t_s, what="force_n", shape=(3,))
         vars(self).update(force_n=course.values, t_s=course.t_s)

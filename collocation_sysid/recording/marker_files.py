@@ -51,6 +51,9 @@ class MarkerTable:
     notes: tuple[str, ...] = key(converter=tuple[str, ...], default=())
 
     def __post_init__(self) -> None:
+        """Check times and shapes, and mark incomplete samples as missing, in place; an `InputError`
+        for times that do not increase or another shape.
+        """
         if fault := first_unordered_time(self.t_s):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
         shape = (len(self.t_s), len(self.names), 3)
@@ -106,13 +109,17 @@ def read_markers(
     used_names = [labels.get(label, label) for label in raw.labels]
     coordinates, notes = _mark_missing(raw, used_names)
     return MarkerTable(
-        t_s, tuple(used_names), coordinates * metres, (*raw.notes, *notes)
+        t_s,
+        tuple(used_names),
+        positions_m=coordinates * metres,
+        notes=(*raw.notes, *notes),
     )
 
 
 def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
     """Return the tracks of the markers that `choose` selects from a file of any known format;
-    `choose` returns their indices from the labels.
+    `choose` returns their indices from the labels. A text without a known beginning is read as
+    plain CSV.
 
     Raises
     ------
@@ -121,7 +128,7 @@ def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
     """
     content = read_bytes(path)
     if c3d.is_c3d(content):
-        return c3d.read(path, content, choose)
+        return c3d.read(path, content, choose=choose)
     text = decode(content)
     start = text.lstrip().lstrip('"')
     known = (
@@ -153,6 +160,7 @@ def _label_chooser(
     def choose(
         labels: Sequence[str], excluded: Collection[str] = ()
     ) -> list[int]:
+        """Return the indices of the chosen labels, see `LabelChooser`."""
         _require_distinct(labels, "two markers are labelled")
         for label in renamed:
             _require_one_of(label, labels, what="label")
@@ -193,7 +201,9 @@ def _require_distinct(names: Sequence[str], message: str) -> None:
 
 
 def _require_one_of(name: str, known: Sequence[str], what: str) -> None:
-    """Raise an `InputError` if a name is not among the names in the file."""
+    """Raise an `InputError` if a name is not among the names `known` in the file; `what` is the
+    kind of name in the message, and similar names are suggested.
+    """
     if name not in known:
         hint = hint_at(name, known)
         raise InputError(
@@ -202,13 +212,13 @@ def _require_one_of(name: str, known: Sequence[str], what: str) -> None:
 
 
 def _length_unit(raw: RawTracks, length_unit: str | None) -> str:
-    """Return the unit of length by the file or by the user, `length_unit`, else the default of the
+    """Return the unit of length by the user, `length_unit`, or by the file, else the default of the
     format.
 
     Raises
     ------
     InputError
-        If both differ, or none states a unit.
+        If file and user state different units, or neither does and the format has no default.
     """
     if length_unit and raw.unit and length_unit != raw.unit:
         raise InputError(
@@ -255,7 +265,9 @@ def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
 
 
 def _require_rate(t_s: Array, key: str, rate_hz: float) -> None:
-    """Raise an `InputError` if neither the mean nor the median time step agrees with a frame rate.
+    """Raise an `InputError` if neither the mean nor the median step of times (T,) agrees with a
+    frame rate within `_RATE_TOLERANCE`; fewer than two times are not checked. `key` is where the
+    rate is stated, for the message.
 
     Lost frames change the mean step, and coarsely printed times the median: one of them must agree.
     """
@@ -279,7 +291,8 @@ def _mark_missing(
 ) -> tuple[Array, list[str]]:
     """Return coordinates (T, M, 3) with NaN for missing samples, and notes on how many are missing.
 
-    Markers with the same losses share a note.
+    A sample is missing if a coordinate is NaN, or all are 0 in a format in which zeros mean that.
+    Markers with the same losses share a note; without losses there is none.
     """
     x = raw.coordinates
     blank = np.asarray(np.isnan(x).any(axis=2))

@@ -89,6 +89,9 @@ class Markers:
     )
 
     def __post_init__(self) -> None:
+        """Check the markers and complete the fields, in place: names m1, m2, … by default, and
+        `sigma_m` as an array (M,).
+        """
         shape = len(self.t_s), None, 3
         tracks = read_only_tracks(
             self.positions_m, shape, name="marker positions"
@@ -122,6 +125,8 @@ class Markers:
     def _check_places(self, m: int) -> None:
         """Check the places of the m markers, and store them in place: without a placement
         `places_m` (m, 3), NaN where unknown, and `located` (m,); `places_sigma_m` as an array (m,).
+
+        With a placement all markers are located unless `located` is given.
 
         Raises
         ------
@@ -173,7 +178,11 @@ class Markers:
     def on_body(
         self, body: Body, undeformed_places: UndeformedPlaces | None = None
     ) -> Markers:
-        """Return the markers with their placement on a body.
+        """Return the markers with their placement on a body, without `places_m`; self if they have
+        a placement already.
+
+        A marker without a place is put on the point of the body nearest to its first present
+        sample.
 
         Parameters
         ----------
@@ -228,13 +237,13 @@ class Markers:
 
     @property
     def first_visible_sample(self) -> int:
-        """Index of the first sample in which a marker is seen; 0 if none is."""
+        """Index, from 0, of the first sample in which a marker is present; 0 if none is."""
         return int(self.is_present.any(axis=1).argmax())
 
     @cached_property
     def first_samples(self) -> tuple[Array, Array]:
-        """Return the first present sample (M, 3) of every marker [m], NaN if there is none, and its
-        time (M,) [s].
+        """First present sample (M, 3) of every marker [m], NaN if there is none, and its time (M,)
+        [s], then that of the first sample.
         """
         rows = self.is_present.argmax(axis=0)
         return self.positions_m[rows, np.arange(len(self.names))], self.t_s[
@@ -257,7 +266,9 @@ class Markers:
         return int(self.is_present.sum())
 
     def predict_positions(self, node_positions_m: ArrayLike) -> Array:
-        """Return predicted marker positions (..., M, 3) from node positions (..., n, 3)."""
+        """Return predicted marker positions (..., M, 3) from node positions (..., n, 3), by the
+        weights of `placement`, which must be set.
+        """
         nodes_m = np.asarray(node_positions_m, dtype=np.float64)
         element_nodes_m = nodes_m[..., self.placement.nodes, :]
         return np.einsum(

@@ -76,6 +76,7 @@ class Wrench:
     symmetry: int = key(AtLeastOne, default=1)
 
     def __post_init__(self) -> None:
+        """Check the measurements and store them as read-only floats (S, 6), in place."""
         if not len(self.t_s):
             raise InputError("a wrench without samples; expected at least one")
         shape = len(self.t_s), 6
@@ -112,13 +113,17 @@ class Wrench:
 
     @property
     def component_names(self) -> tuple[str, ...]:
-        """Names of the measured components, such as "fz"."""
+        """Names of the components that are measured at any sample, such as "fz", in the order of
+        `COMPONENTS`.
+        """
         return tuple(
             COMPONENTS[k] for k in np.flatnonzero(self.measured_components)
         )
 
     @property
     def sigmas(self) -> Array:
-        """(6,) standard deviations [N, N m]; those of torques are 1 if none is stated."""
+        """(6,) standard deviations of the components [N, N m]; those of torques are 1 if `sigma_nm`
+        is None, as no torque is measured then.
+        """
         torque = 1.0 if self.sigma_nm is None else self.sigma_nm
         return np.repeat([self.sigma_n, torque], 3)

@@ -55,6 +55,7 @@ class NodesSection(Section):
 
     @model_validator(mode="after")
     def _one(self) -> NodesSection:
+        """Require exactly one key; a validation error for none or several."""
         require_one(self, *type(self).model_fields)
         return self
 
@@ -72,7 +73,9 @@ KINDS: dict[str, Any] = {
 
 
 def selection_from_section(section: NodesSection | str) -> Selection:
-    """Return the selection that a table in the problem file states; a text names a point array."""
+    """Return the selection that a table in the problem file states; a text names a point array or
+    physical group.
+    """
     if isinstance(section, str):
         return Named(section)
     ((kind, value),) = (
@@ -96,6 +99,7 @@ def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
     """
 
     def chosen(selection: Any) -> Any:
+        """Return sorted distinct read-only node numbers, or a `Selection` unchanged."""
         if isinstance(selection, Selection):
             return selection
         nodes = np.unique(
@@ -112,5 +116,12 @@ def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
 
 
 def select_on_body(nodes: Index | Selection, body: Body) -> Index:
-    """Return the nodes of a body that a selection selects; node numbers are returned unchanged."""
+    """Return the nodes of a body that a selection selects, sorted; node numbers are returned
+    unchanged, without a check.
+
+    Raises
+    ------
+    InputError
+        If the selection has no nodes on this body.
+    """
     return body.select(nodes) if isinstance(nodes, Selection) else nodes

@@ -144,6 +144,9 @@ class NuisanceRow:
     considered: float | None = None
 
     def __post_init__(self) -> None:
+        """Set the default label, in place: the name, with the component of marker parameters and
+        the axis of vectors.
+        """
         if not self.label:
             which = " of {which}" * (self.of == "marker")
             axis = ", {axis}" * bool(self.axes)
@@ -151,8 +154,10 @@ class NuisanceRow:
 
     @property
     def prior(self) -> str:
-        """Key of the prior standard deviation in the problem file, with its unit, such as
-        "prior_m".
+        """Key of the prior standard deviation in the problem file: "prior_" and the unit in lower
+        case, such as "prior_m".
+
+        It is "prior" for the unit "1", "prior_sigmas" for "σ" and "prior_1_m2" for "1/m²".
         """
         unit = {"1": "", "σ": "_sigmas", "1/m²": "_1_m2"}.get(
             self.unit, f"_{self.unit.lower()}"
@@ -161,7 +166,9 @@ class NuisanceRow:
 
     @property
     def usual(self) -> str:
-        """Default standard deviation as text in a readable unit, such as "5 ms"."""
+        """Default standard deviation as text in a readable unit, such as "5 ms"; zero where `sigma`
+        is None.
+        """
         size, unit = in_readable_unit(self.sigma or 0.0, self.unit)
         return f"{size:.4g}{unit}"
 
@@ -179,8 +186,10 @@ def cayley_rotation(rotation_vector: ca.SX) -> ca.SX:
 
 
 def in_readable_unit(value: float, unit: str) -> tuple[float, str]:
-    """Return a value in a readable unit (mm, ms, °, …), and that unit as it is printed behind the
-    value.
+    """Return a value in a readable unit, and that unit as text to print directly behind the value.
+
+    Units of `READABLE_UNITS` are converted (m to " mm", s to " ms", rad to "°", kg to " g", N m to
+    " mN m", 1 to " %"), and "σ" is not printed (""). Another unit is kept, with a blank in front.
     """
     factor, shown = READABLE_UNITS.get(unit, (1.0, f" {unit}"))
     return factor * value, shown
@@ -195,7 +204,9 @@ def _rotate_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
 
 
 def _shift_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
-    """Shift a marker's predicted position y (3,) by `values` (3,) [m]."""
+    """Return a marker's predicted position y (3,) [m] plus `values` (3,) [m]; time and data are not
+    used.
+    """
     return y + values
 
 
@@ -208,7 +219,7 @@ def _distort_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
 
 
 def _has_markers(experiment: Any) -> bool:
-    """Return whether the experiment has markers."""
+    """Return whether the experiment has a marker, also one without samples."""
     return bool(experiment.markers.names)
 
 
@@ -223,21 +234,23 @@ def _has_depth_outlines(experiment: Any) -> bool:
 
 
 def _camera_sharing_key(experiment: Any) -> dict[str, Any]:
-    """Return what must agree in recordings that share the pose of their depth cameras."""
+    """Return what must agree in recordings that share the pose of their depth cameras: the body
+    (the same object), and the pose of each camera in order.
+    """
     places = [tuple(d.camera.pose.ravel()) for d in experiment.depths]
     return {"body": id(experiment.body), "pose of its cameras": places}
 
 
 def _is_motion(experiment: Any) -> bool:
-    """Return whether the experiment is a motion."""
+    """Return whether the experiment is a motion, and not static."""
     return not experiment.is_static
 
 
 def _has_observable_hand_eye(experiment: Any) -> bool:
-    # Nothing but what markers see tells how the body is off in its grasp, and a start that is
-    # given tells where it is.
-    """Return whether markers determine the position of the body in its grasp (hand–eye
-    transform).
+    """Return whether markers determine the position of the body in its grasp (hand–eye transform).
+
+    True if the body has a grasp that is not an obstacle, there are markers, and the start is an
+    equilibrium.
     """
     return (
         bool(experiment.body_grasps)
@@ -247,12 +260,16 @@ def _has_observable_hand_eye(experiment: Any) -> bool:
 
 
 def _largest_place_step_m(experiment: Any) -> float:
-    """Return how far a marker's place may move in a step of the solver [m]."""
+    """Return the largest change of a marker's place in a step of the solver [m]: `EDGES_A_STEP`
+    mean edges of the mesh.
+    """
     return EDGES_A_STEP * float(experiment.body.mesh.quality().edge_mean_m)
 
 
 def _hand_eye_sharing_key(experiment: Any) -> dict[str, Any]:
-    """Return what must agree in recordings that share the hand–eye transform."""
+    """Return what must agree in recordings that share the hand–eye transform: the body (the same
+    object), and the set of nodes in its grasps without obstacles.
+    """
     nodes = {
         int(node) for grasp in experiment.body_grasps for node in grasp.nodes
     }
@@ -864,6 +881,15 @@ class Nuisance:
     own: Sequence[NuisanceRow] = field(default=(), hash=False)
 
     def __post_init__(self) -> None:
+        """Check custom kinds, deviations and scopes.
+
+        Raises
+        ------
+        InputError
+            If a custom kind is not usable (see `_check_custom_kind`) or has the name of another
+            kind, a standard deviation is not above zero, or `scope` names an unknown kind or has a
+            text other than `SCOPE_TEXT` describes.
+        """
         for row in self.own:
             _check_custom_kind(row)
             if [each.name for each in self.kinds].count(row.name) > 1:
@@ -893,20 +919,28 @@ class Nuisance:
         return (*KINDS, *self.own)
 
     def sigma(self, row: NuisanceRow) -> float | None:
-        """Standard deviation of a kind's prior; None where it is not estimated."""
+        """Return the standard deviation of a kind's prior, in its unit; None where it is not
+        estimated.
+
+        For a custom kind it is that of `row`, otherwise the field of this object.
+        """
         return row.sigma if row in self.own else getattr(self, row.name)
 
     @classmethod
     def none(cls, **deviations: Any) -> Nuisance:
         """Return a `Nuisance` that estimates only the fields given by name, with their standard
         deviations; all others are None and thus exact.
+
+        `scope` and `own` may be given, too; by default they are empty.
         """
         nothing: dict[str, Any] = {row.name: None for row in KINDS}
         return Nuisance(**(nothing | deviations))
 
 
 def _check_custom_kind(row: NuisanceRow) -> None:
-    """Raise an `InputError` if a custom kind has another component, no prior, or no effect."""
+    """Raise an `InputError` if a custom kind is of a component other than "recording" or "marker",
+    has no sigma, or does not have exactly one of `reading` and `clock`.
+    """
     if row.of not in ("recording", "marker"):
         raise InputError(
             f"{row.name} is of a {row.of}; expected of = 'recording' or 'marker'"

@@ -116,6 +116,9 @@ class Obstacle(Grasp):
     relaxed: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
+        """Check time window, axes and friction; an `InputError` if `axes` is not "xyz", the
+        friction is above its bound, or the name of its parameter does not end with "friction".
+        """
         self._check_times_and_axes()
         if self.axes != "xyz":
             raise InputError(
@@ -136,7 +139,7 @@ class Obstacle(Grasp):
 
     def with_frame_nodes(self, frame: Index, t_s: Array) -> Obstacle:
         """Return the obstacle tied to the nodes (4,) of its frame: the origin and the ends of three
-        axes.
+        axes; self if nothing changes.
 
         Poses that are matrices (T, 4, 4) become a `PoseSequence` at the times `t_s` (T,).
         """
@@ -144,13 +147,15 @@ class Obstacle(Grasp):
         return self._with_nodes(self.nodes if same else frame, t_s)
 
     def contact_surface(self, body: Body) -> ContactSurface:
-        """Contact points between a body and the obstacle; the result is cached."""
+        """Return the contact points between a body and the obstacle; the latest
+        results are cached.
+        """
         return _contact_surface(body, self)
 
     @property
     def offset_direction(self) -> Array:
-        """Direction (3,) of the obstacle's uncertain offset: the sum of the axes whose zero is
-        uncertain; if there are none, the direction that its shape states.
+        """Direction (3,) of the obstacle's uncertain offset: the sum of the unit vectors of the
+        axes in `zero`, not normalised; if there are none, the unit vector that its shape states.
         """
         uncertain_axes = np.array([float(axis in self.zero) for axis in "xyz"])
         return (
@@ -193,7 +198,9 @@ class Obstacle(Grasp):
 
     @property
     def has_friction(self) -> bool:
-        """Whether the obstacle has friction."""
+        """Whether the obstacle has friction: a coefficient above zero, or a parameter as
+        coefficient.
+        """
         return self.friction != 0
 
     @cached_property
@@ -209,17 +216,18 @@ class Obstacle(Grasp):
 @lru_cache(maxsize=32)
 def _contact_surface(body: Body, obstacle: Obstacle) -> ContactSurface:
     """Return the contact points between a body and an obstacle; the last 32 pairs are cached."""
-    return ContactSurface.from_body(body, obstacle.nodes, obstacle.faces)
+    return ContactSurface.from_body(body, obstacle.nodes, chosen=obstacle.faces)
 
 
 def with_obstacle_frames(
     body: Body, obstacles: Sequence[Obstacle], *, is_static: bool
 ) -> Body:
     """Return the body with four nodes for the frame of each obstacle, and the coefficients of
-    friction that are parameters among its constants.
+    friction that are parameters among its constants; self if it has these already. Frames of other
+    obstacles are replaced.
 
-    The Jacobian of the contact forces is not symmetric if an obstacle has friction, or if pressures
-    are averaged over time steps, which happens in motions without `relaxed` contact.
+    The Jacobian of the contact forces is declared as not symmetric if an obstacle has friction, or
+    if pressures are averaged over time steps, which happens in motions without `relaxed` contact.
     """
     named = (each.friction_constant for each in obstacles)
     frictions = tuple(
@@ -229,4 +237,6 @@ def with_obstacle_frames(
         each.has_friction or (each.relaxed is None and not is_static)
         for each in obstacles
     )
-    return body.with_frames(len(obstacles), unsymmetric, frictions)
+    return body.with_frames(
+        len(obstacles), has_skew_contact=unsymmetric, frictions=frictions
+    )

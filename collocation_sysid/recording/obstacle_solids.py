@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -25,7 +25,9 @@ class Solid(ABC):
 
     @abstractmethod
     def signed_distance(self, point: ca.SX) -> ca.SX:
-        """Signed distance of a point (3,) from the surface [m], an expression; negative inside."""
+        """Return the signed distance of a point (3,) from the surface [m], an expression; negative
+        inside.
+        """
 
     @abstractmethod
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
@@ -41,27 +43,32 @@ class Solid(ABC):
 
     @property
     def offset_direction(self) -> Array:
-        """(3,) unit vector along which the solid's position is uncertain."""
+        """(3,) unit vector along which the solid's position is uncertain: the z axis unless a solid
+        states another.
+        """
         return np.array([0.0, 0.0, 1.0])
 
     @property
     def has_tilt(self) -> bool:
-        """Whether a tilt of the solid may be estimated."""
+        """Whether a tilt of the solid may be estimated: false unless a solid states otherwise."""
         return False
 
     @property
     def tilt_centre_m(self) -> Array:
-        """(3,) point about which the solid is tilted [m]."""
+        """(3,) point about which the solid is tilted [m]; the origin unless a solid states another
+        one.
+        """
         return np.zeros(3)
 
 
 def _unit_vector_converter(name: str) -> Any:
-    """Return a function that normalises a vector (3,).
+    """Return a function that normalises a vector (3,) to unit length.
 
     It raises an `InputError` that begins with `name` for a zero vector or another shape.
     """
 
     def made(value: Any) -> Array:
+        """Return the normalised vector (3,)."""
         vector = float_converter((3,), name)(value)
         length = float(np.linalg.norm(vector))
         if not length > 0:
@@ -122,8 +129,8 @@ class Plane(Solid):
         return [np.array(corners)]
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
-        """Signed distance of a point (3,) from the plane along its normal [m]; negative behind the
-        plane.
+        """Return the signed distance of a point (3,) from the plane along its normal [m]; negative
+        behind the plane.
         """
         return ca.dot(ca.DM(self.normal), point - ca.DM(self.point_m))
 
@@ -144,14 +151,14 @@ class Sphere(Solid):
     )
 
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
-        """Return three circles, one across each axis; both arguments are ignored."""
+        """Return three closed circles (33, 3), one across each axis; both arguments are ignored."""
         return [
             _circle(self.centre_m, axis, radius_m=self.radius_m)
             for axis in np.eye(3)
         ]
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
-        """Signed distance of a point (3,) from the sphere [m]; negative inside."""
+        """Return the signed distance of a point (3,) from the sphere [m]; negative inside."""
         return _length(point - ca.DM(self.centre_m)) - self.radius_m
 
 
@@ -169,6 +176,24 @@ def _checked_ends(value: Any) -> Array:
             "the ends of an axis are at the same place; expected two places"
         )
     return ends
+
+
+class CylindricalCoordinates(NamedTuple):
+    """Place of a point relative to the axis of a solid of revolution.
+
+    Attributes
+    ----------
+    axial_m : SX
+        Distance along the axis from its middle [m], positive towards the second end.
+    radial_m : SX
+        Distance from the axis [m], at least 0.
+    half_length_m : float
+        Half of the length of the axis [m].
+    """
+
+    axial_m: ca.SX
+    radial_m: ca.SX
+    half_length_m: float
 
 
 @declaration
@@ -189,21 +214,15 @@ class _AxialSolid(Solid):
         quarters = range(0, len(first) - 1, (len(first) - 1) // 4)
         return [first, last, *(np.array([first[k], last[k]]) for k in quarters)]
 
-    def _cylindrical_coordinates(
-        self, point: ca.SX
-    ) -> tuple[ca.SX, ca.SX, float]:
-        """Return the cylindrical coordinates of a point (3,) and half of the length of the axis
-        [m].
-
-        The coordinates are the distance along the axis from its middle, and the distance from the
-        axis.
-        """
+    def _cylindrical_coordinates(self, point: ca.SX) -> CylindricalCoordinates:
+        """Return the cylindrical coordinates of a point (3,) [m] about the axis of the solid."""
         first, last = self.ends_m
         half = float(np.linalg.norm(last - first)) / 2
         axis = ca.DM((last - first) / (2 * half))
         offset = point - ca.DM((first + last) / 2)
         axial = ca.dot(axis, offset)
-        return axial, _length(offset - axial * axis), half
+        radial = _length(offset - axial * axis)
+        return CylindricalCoordinates(axial, radial, half_length_m=half)
 
 
 @declaration
@@ -222,9 +241,14 @@ class Cylinder(_AxialSolid):
     rounding_m: float = key(NotNegative, default=0.0)
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
-        """Signed distance of a point (3,) from the cylinder [m]; negative inside."""
-        axial, radial, half = self._cylindrical_coordinates(point)
-        beyond = ca.vertcat(radial - self.radius_m, ca.fabs(axial) - half)
+        """Return the signed distance of a point (3,) from the cylinder [m]; negative inside, where
+        it is that to the nearest of the side and the ends.
+        """
+        place = self._cylindrical_coordinates(point)
+        beyond = ca.vertcat(
+            place.radial_m - self.radius_m,
+            ca.fabs(place.axial_m) - place.half_length_m,
+        )
         return _corner_distance(beyond + self.rounding_m) - self.rounding_m
 
 
@@ -240,10 +264,10 @@ class Capsule(_AxialSolid):
     """
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
-        """Signed distance of a point (3,) from the capsule [m]; negative inside."""
-        axial, radial, half = self._cylindrical_coordinates(point)
-        beyond = ca.fmax(ca.fabs(axial) - half, 0)
-        return _length(ca.vertcat(beyond, radial)) - self.radius_m
+        """Return the signed distance of a point (3,) from the capsule [m]; negative inside."""
+        place = self._cylindrical_coordinates(point)
+        beyond = ca.fmax(ca.fabs(place.axial_m) - place.half_length_m, 0)
+        return _length(ca.vertcat(beyond, place.radial_m)) - self.radius_m
 
 
 @declaration
@@ -264,6 +288,7 @@ class Cuboid(Solid):
     rounding_m: float = key(NotNegative, default=0.0)
 
     def __post_init__(self) -> None:
+        """Raise an `InputError` unless the first corner is lower than the second along all axes."""
         if not (self.corners_m[0] < self.corners_m[1]).all():
             raise InputError(
                 "the corners of a box have to be its lowest, then its highest"
@@ -288,7 +313,7 @@ class Cuboid(Solid):
         ]
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
-        """Signed distance of a point (3,) from the box [m]; negative inside."""
+        """Return the signed distance of a point (3,) from the box [m]; negative inside."""
         low, high = self.corners_m
         beyond = ca.fabs(point - ca.DM((low + high) / 2)) - ca.DM(
             (high - low) / 2
@@ -297,12 +322,16 @@ class Cuboid(Solid):
 
 
 def orthogonal_axes(normal: Array) -> Array:
-    """Return two unit vectors (2, 3) orthogonal to a direction (3,) and to each other."""
+    """Return two unit vectors (2, 3) orthogonal to a nonzero direction (3,) and to each other;
+    which of all such pairs is not specified.
+    """
     return np.linalg.svd(normal[None])[2][1:]
 
 
 def _circle(centre_m: Array, axis: Array, radius_m: float) -> Array:
-    """Return a closed polyline (33, 3) of the circle about a centre (3,) across an axis (3,)."""
+    """Return a closed polyline (33, 3) of the circle with the radius `radius_m` [m] about a centre
+    (3,), across an axis (3,) of any length.
+    """
     angle = np.linspace(0, 2 * np.pi, 33)
     round_m = np.stack(
         [np.cos(angle), np.sin(angle)], axis=1
@@ -311,12 +340,16 @@ def _circle(centre_m: Array, axis: Array, radius_m: float) -> Array:
 
 
 def _length(vector: ca.SX) -> ca.SX:
-    """Euclidean norm with finite second derivatives at zero."""
+    """Return the Euclidean norm √(|v|² + 1e-24 m²) of a vector, with finite second derivatives at
+    zero.
+    """
     return ca.sqrt(ca.sumsqr(vector) + SMALLEST_SQUARE_M2)
 
 
 def _corner_distance(beyond: ca.SX) -> ca.SX:
-    """Signed distance from a convex corner, by the signed distances from each of its sides."""
+    """Return the signed distance [m] from a convex corner with orthogonal sides, by the signed
+    distances `beyond` (k,) from each of its sides; negative inside.
+    """
     return _length(ca.fmax(beyond, 0)) + ca.fmin(ca.mmax(beyond), 0)
 
 
@@ -330,5 +363,5 @@ KINDS: dict[str, type[Solid]] = {
 
 
 def solid_key(solid: Solid) -> str:
-    """Key of a solid's kind in a problem file, such as "sphere_m"."""
+    """Return the key of a solid's kind in a problem file, such as "sphere_m"."""
     return next(name for name, kind in KINDS.items() if isinstance(solid, kind))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,6 +53,9 @@ class Placement:
     node_count: int
 
     def __post_init__(self) -> None:
+        """Store read-only copies, in place; an `InputError` if shapes disagree or a node is not
+        below `node_count`.
+        """
         nodes = read_only_nodes(
             self.nodes, (None, None), name="nodes of the placement"
         )
@@ -77,7 +80,7 @@ def place_markers(
     max_distance_m: float | None = None,
     names: Sequence[str] | None = None,
 ) -> Placement:
-    """Find each marker's place on the body.
+    """Return each marker's place on the body.
 
     Parameters
     ----------
@@ -92,14 +95,16 @@ def place_markers(
         nearest to it. "auto": the nearest node if within 5 % of the mean edge length, else
         embedded.
     max_distance_m : float, optional
-        Largest distance between marker and body; by default the mean edge length.
+        Largest distance between marker and body, or, of a marker on a node, between marker and
+        node; by default the mean edge length.
     names : sequence of str, optional
-        Marker names for messages; indices by default.
+        Marker names for messages; indices from 0 by default.
 
     Raises
     ------
     InputError
-        If a marker has no position or is too far from the body.
+        If a marker has a position that is not finite or is too far from the body, the rule is
+        unknown, or names and positions differ in number.
     """
     points = read_only_floats(
         points_m, (None, 3), name="marker positions", finite=False
@@ -142,7 +147,10 @@ def place_markers(
             nodes[k], weights[k] = shape.weights_at_node(vertex)
             distance[k] = node_distance[vertex]
         else:
-            nodes[k], weights[k], distance[k] = shape.weights_at_point(point)
+            located = shape.weights_at_point(point)
+            nodes[k] = located.nodes
+            weights[k] = located.weights
+            distance[k] = located.distance_m
         if distance[k] > limit_m:
             raise InputError(
                 f"marker '{labels[k]}' at {point_text(point)} m is "
@@ -155,6 +163,24 @@ def place_markers(
     )
 
 
+class LocatedPoint(NamedTuple):
+    """A point as a linear combination of the nodes of one element.
+
+    Attributes
+    ----------
+    nodes : (npe,) int array
+        Nodes of the element.
+    weights : (npe,) array
+        Values of their shape functions at the point, which sum to one.
+    distance_m : float
+        Distance of the point from the surface [m]; 0 inside the body.
+    """
+
+    nodes: Index
+    weights: Array
+    distance_m: float
+
+
 class LocatedBody:
     """A body in one configuration, prepared for locating points in it.
 
@@ -163,6 +189,17 @@ class LocatedBody:
     nodes_m : (n, 3) array
         Node positions.
     body : Body
+
+    Attributes
+    ----------
+    mean_edge_m : float
+        Mean length of the edges of the mesh.
+    origin : (E, 3) array
+        First corner of each element.
+    inverse : (E, 3, 3) array
+        Inverse of the matrix whose rows are the edges from that corner to the other three.
+    triangles : (F, 3, 3) array
+        Corners of the surface.
     """
 
     def __init__(self, nodes_m: Array, body: Body) -> None:
@@ -179,28 +216,30 @@ class LocatedBody:
         self.triangles = nodes_m[body.mesh.surface]
 
     def weights_at_node(self, node: int) -> tuple[Index, Array]:
-        """Return nodes (npe,) and weights (npe,) of a marker on a node: those of the first element
-        with that node; the weight of the node is 1.
+        """Return nodes (npe,) and weights (npe,) of a marker on a node, by its index: nodes of the
+        first element that has the node, whose weight is 1 and all others 0.
         """
         cell = self.body.cells[np.argmax((self.body.cells == node).any(axis=1))]
         return cell, (cell == node).astype(np.float64)
 
-    def weights_at_point(self, point: Array) -> tuple[Index, Array, float]:
-        """Return nodes (npe,), weights (npe,) and the distance from the surface [m] of a point
-        (3,).
+    def weights_at_point(self, point: Array) -> LocatedPoint:
+        """Return nodes and weights of a point (3,), and its distance from the surface.
 
-        The distance is 0 inside the body.
+        A point outside the body is an extrapolation from the nearest element.
         """
         cell, distance = self.nearest_cell(point)
-        return (
+        return LocatedPoint(
             self.body.cells[cell],
             self._shape_functions_at(point, cell),
-            distance,
+            distance_m=distance,
         )
 
     def nearest_cell(self, point: Array) -> tuple[int, float]:
         """Return the index of the element that contains a point (3,), or is nearest to it, and its
-        distance from the body [m], 0 inside.
+        distance from the surface [m], 0 inside. Elements are taken with straight edges.
+
+        If several elements share the nearest edge or corner, it is the one in which the least
+        barycentric coordinate of the point is largest.
         """
         depth = self.barycentric(point, slice(None)).min(axis=1)
         cell = int(np.argmax(depth))
@@ -218,15 +257,13 @@ class LocatedBody:
 
     def weights_at_nearest_point(self, point: Array) -> tuple[Index, Array]:
         """Return nodes (npe,) and weights (npe,) of the point of the body that is nearest to a
-        point (3,).
+        point (3,): the point itself if it is inside.
         """
-        nodes, weights, distance = self.weights_at_point(point)
-        if distance == 0.0:
-            return nodes, weights
-        nodes, weights, _ = self.weights_at_point(
-            self.nearest_surface_point(point)[0]
-        )
-        return nodes, weights
+        located = self.weights_at_point(point)
+        if located.distance_m > 0.0:
+            nearest_m, _ = self.nearest_surface_point(point)
+            located = self.weights_at_point(nearest_m)
+        return located.nodes, located.weights
 
     def nearest_surface_point(self, point: Array) -> tuple[Array, Array]:
         """Return the nearest point (3,) [m] of the surface of straight triangles, and two
@@ -240,8 +277,8 @@ class LocatedBody:
         )
 
     def barycentric(self, points: Array, cells: slice | Index) -> Array:
-        """Return barycentric coordinates (k, 4) of points (k, 3), or of one (3,), in the cells
-        (k,).
+        """Return barycentric coordinates (k, 4) of points (k, 3), or of one point (3,), in the
+        cells with the indices (k,), as of straight edges; negative outside a cell.
         """
         rest = np.einsum(
             "ei,eij->ej", points - self.origin[cells], self.inverse[cells]
@@ -249,8 +286,8 @@ class LocatedBody:
         return np.column_stack([1.0 - rest.sum(axis=1), rest])
 
     def barycentric_gradients(self, cells: Index) -> Array:
-        """Return the derivatives (k, 4, 3) of the barycentric coordinates by the point, in the
-        cells (k,).
+        """Return the derivatives (k, 4, 3) of the barycentric coordinates by the point [1/m], in
+        the cells with the indices (k,).
         """
         rest = np.asarray(
             np.swapaxes(self.inverse[cells], 1, 2), dtype=np.float64
@@ -258,10 +295,12 @@ class LocatedBody:
         return np.concatenate([-rest.sum(axis=1, keepdims=True), rest], axis=1)
 
     def _shape_functions_at(self, point: Array, cell: int) -> Array:
-        """Return the shape functions (npe,) of an element at a point (3,).
+        """Return the shape functions (npe,) of an element, by its index, at a point (3,), which may
+        be outside the element.
 
         Barycentric coordinates of the corners are exact for straight edges. In a quadratic element
-        with curved edges they are corrected iteratively until the element maps them to the point.
+        with curved edges they are corrected iteratively until the element maps them to the point;
+        the best iterate is returned, without a check.
         """
         one = np.array([cell])
         local = self.barycentric(point, one)
@@ -282,6 +321,8 @@ class LocatedBody:
 def nearest_points_of_triangles(point: Array, triangles: Array) -> Array:
     """Return the point (F, 3) of each triangle (F, 3, 3) that is nearest to one point (3,), or to
     the point (F, 3) of that triangle.
+
+    For a degenerate triangle with three distinct corners it lies on a side.
     """
     point = point[..., None, :]
     ends = np.roll(triangles, -1, axis=1)

@@ -109,8 +109,8 @@ def read_poses(
 def _checked_sequence(
     t_s: Array, positions_m: Array, quaternions: Array, row_names: list[str]
 ) -> PoseSequence:
-    """Return a pose sequence from times (T,) [s], positions (T, 3) [m] and quaternions (T, 4),
-    ordered x, y, z, w.
+    """Return a smooth pose sequence from times (T,) [s], positions (T, 3) [m] and quaternions (T,
+    4), ordered x, y, z, w.
 
     Raises
     ------
@@ -121,15 +121,15 @@ def _checked_sequence(
         t_s, positions_m, quaternions_xyzw=quaternions
     ):
         raise InputError(fault[1], where=row_names[fault[0]])
-    return PoseSequence(t_s, positions_m, quaternions)
+    return PoseSequence(t_s, positions_m, quaternions_xyzw=quaternions)
 
 
 # Columns ------------------------------------------------------------------------------------------
 
 
 def _read_columns(grid: TextTable, places: Iterable[int]) -> Array:
-    """Return the cells of these columns as numbers (rows, columns); blank cells raise an
-    `InputError`.
+    """Return the cells of the columns with the indices `places` as numbers (rows, columns); an
+    `InputError` for a blank cell or one that is no number.
     """
     return numeric_cells(grid, list(places), blank_allowed=False)
 
@@ -158,7 +158,8 @@ def _column_error(grid: TextTable) -> InputError:
 def _position_columns(
     grid: TextTable, length_unit: str | None
 ) -> tuple[list[int], float]:
-    """Return the indices of the columns of x, y, z, and the factor from their unit to metres.
+    """Return the indices of the columns named x, y, z (in capitals, too), and the factor from their
+    unit to metres.
 
     Parameters
     ----------
@@ -209,7 +210,8 @@ def _quaternion_columns(
     ----------
     grid : TextTable
     order : {"xyzw", "wxyz"} or None
-        Stated order of the columns; needed if the columns are numbered.
+        Stated order of the columns; needed if the columns are numbered, q0 to q3 or q1 to q4. For
+        columns qx, qy, qz, qw it has to be None or their order in the file.
     columns : list of int
         Columns that hold neither time nor position.
 

@@ -29,7 +29,7 @@ Poses = tuple[tuple[Array, Array], ...]
 
 # Largest deviation of a quaternion's norm from one: files print four digits or more.
 QUATERNION_NORM_TOLERANCE = 1e-3
-# A held pose starts at its sample, also where the time asked for is rounded to just before it.
+# A held pose starts at its sample, also if the time is rounded to just before it.
 _INTERVAL_SNAP_STEPS = 1e-6
 # Largest entry of RᵀR − I of a rotation: files print few digits, and mistakes are far larger.
 _ORTHONORMALITY_TOLERANCE = 1e-3
@@ -78,6 +78,7 @@ class PoseSequence:
     interpolation: Interpolation = key(Interpolation, default="smooth")
 
     def __post_init__(self) -> None:
+        """Check the poses, see `first_pose_fault`, and normalise the quaternions, in place."""
         t_s = self.t_s
         m = len(self.t_s)
         if not m:
@@ -99,7 +100,9 @@ class PoseSequence:
 
     @classmethod
     def fixed(cls, t0_s: float = 0.0) -> PoseSequence:
-        """Return the identity pose for all time: grasped nodes stay where they are undeformed."""
+        """Return the identity pose for all time, as a single sample at `t0_s`: grasped nodes stay
+        where they are undeformed.
+        """
         return cls(
             np.array([t0_s]), np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]])
         )
@@ -112,12 +115,13 @@ class PoseSequence:
         interpolation: Interpolation = "smooth",
     ) -> PoseSequence:
         """Return the poses of 4×4 matrices [[R, p], [0, 1]], (m, 4, 4) [m], at the times `t_s`
-        (m,).
+        (m,); `interpolation` as of the class.
 
         Raises
         ------
         InputError
-            If shapes disagree, or a matrix is no rigid motion; the first such matrix is named.
+            If shapes disagree, or a matrix is no rigid motion; the first such matrix is named,
+            counting from 1.
         """
         times = read_only_floats(
             t_s, (None,), name="t_s of the poses", finite=False
@@ -161,7 +165,9 @@ class PoseSequence:
         )
 
     def with_shift(self, shift_m: ArrayLike) -> PoseSequence:
-        """Return the poses with a constant (3,) [m] added to their positions."""
+        """Return the poses with a constant (3,) [m], in the world's frame, added to each of their
+        positions.
+        """
         return replace(self, positions_m=self.positions_m + np.asarray(shift_m))
 
     def at(self, t_s: ArrayLike) -> tuple[Array, Array]:
@@ -207,8 +213,8 @@ class PoseSequence:
         return self._interpolate_linearly(times)
 
     def _interpolate_linearly(self, times: Array) -> tuple[Array, Array]:
-        """Return linearly interpolated rotations (k, 3, 3) and translations (k, 3) at times
-        (k,).
+        """Return rotations (k, 3, 3) (SLERP) and translations (k, 3) at times (k,), linear between
+        samples and continued linearly beyond them; at least two samples.
         """
         k = np.clip(
             np.searchsorted(self.t_s, times, side="right") - 1,
@@ -226,7 +232,9 @@ class PoseSequence:
         return rotations, self.positions_m[k] + fraction * step_m
 
     def moved_positions(self, points_m: ArrayLike, t_s: ArrayLike) -> Array:
-        """Return positions (T, k, 3) [m] of undeformed points (k, 3) at the times `t_s` (T,)."""
+        """Return positions R X + p (T, k, 3) [m] of undeformed points X (k, 3) at the times `t_s`
+        (T,); errors as of `at`.
+        """
         rotations, translations = self.at(t_s)
         points = np.asarray(points_m, dtype=np.float64)
         return (
@@ -236,8 +244,8 @@ class PoseSequence:
 
     @cached_property
     def jumps_s(self) -> Array:
-        """Times (j,) of the samples after which the position or the rotation jumps [s]; empty
-        without jumps.
+        """Times (j,) of the samples after which the position or a component of the quaternion jumps
+        [s], see `jump_intervals`; empty without jumps.
         """
         of_position = jump_intervals(self.t_s, self.positions_m)
         of_rotation = jump_intervals(self.t_s, self.quaternions_xyzw)
@@ -267,7 +275,9 @@ class PoseSequence:
         return (self._rotations[:-1].inv() * self._rotations[1:]).as_rotvec()
 
     def _require_times_covered(self, times: Array) -> None:
-        """Raise an `InputError` if a time is over half a sample outside the sequence."""
+        """Raise an `InputError` if a time is over half a sample interval outside the sequence, or
+        NaN; the sequence must have at least two samples.
+        """
         first_step, last_step = np.diff(self.t_s)[[0, -1]]
         earliest = self.t_s[0] - max(0.5 * first_step, TIME_TOLERANCE_S)
         latest = self.t_s[-1] + max(0.5 * last_step, TIME_TOLERANCE_S)
@@ -283,10 +293,11 @@ class PoseSequence:
 def first_pose_fault(
     t_s: Array, positions_m: Array, quaternions_xyzw: Array
 ) -> tuple[int, str] | None:
-    """Return the index of the first unusable pose and what is wrong with it; None if all are fine.
+    """Return the index, from 0, of the first unusable pose and what is wrong with it; None if all
+    are fine.
 
     Values that are not finite are reported first, then times that do not increase, then quaternions
-    that are not of unit norm.
+    whose norm differs from 1 by more than `QUATERNION_NORM_TOLERANCE`.
     """
     finite = np.isfinite(
         np.column_stack([t_s, positions_m, quaternions_xyzw])
@@ -310,10 +321,12 @@ def first_pose_fault(
 
 
 def first_matrix_fault(t_s: Array, matrices: Array) -> tuple[int, str] | None:
-    """Return the index of the first of (m, 4, 4) matrices that is no rigid motion, and the reason.
+    """Return the index, from 0, of the first of (m, 4, 4) matrices that is no rigid motion, and the
+    reason; None if all are rigid motions.
 
-    None if all are rigid motions. This check is needed as SciPy silently orthonormalises any
-    matrix.
+    A rigid motion has finite values, the last row 0, 0, 0, 1 and a rotation: orthonormal with
+    positive determinant. The times `t_s` (m,) appear in the reason. This check is needed as SciPy
+    silently orthonormalises any matrix.
     """
     rotations = matrices[:, :3, :3]
     with np.errstate(invalid="ignore"):
@@ -348,8 +361,8 @@ def first_matrix_fault(t_s: Array, matrices: Array) -> tuple[int, str] | None:
 
 
 def _unit_and_continuous(quaternions: Array) -> Array:
-    """Normalise quaternions (m, 4) and choose their signs so that neighbours are in the same
-    hemisphere.
+    """Return quaternions (m, 4) that are normalised, with signs such that neighbours are in the
+    same hemisphere, as a read-only array; the first keeps its sign.
     """
     unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     aligned = np.sum(unit[1:] * unit[:-1], axis=1) >= 0.0
@@ -359,15 +372,16 @@ def _unit_and_continuous(quaternions: Array) -> Array:
     return continuous
 
 
-# Between samples ---------------------------------------------------------------------------------
+# Interpolation -----------------------------------------------------------------------------------
 
 
 def jump_intervals(t_s: Array, values: Array) -> Index:
-    """Return the indices of the intervals in which values (m, k) jump; interval i begins at sample
-    i.
+    """Return the indices of the intervals in which values (m, k) at times `t_s` (m,) jump; interval
+    i is from sample i to i + 1.
 
-    A jump is a change that is more than 10 times as fast as those just before and just after, and
-    not small compared with the range of the values. The first and the last interval are not tested.
+    A jump is a change that is more than 10 times as fast as the faster one of the intervals just
+    before and just after, and larger than a thousandth of the range of the values. The first and
+    the last interval are not tested.
     """
     change = np.linalg.norm(np.diff(values, axis=0), axis=1)
     rate = change / np.diff(t_s)
@@ -379,10 +393,11 @@ def jump_intervals(t_s: Array, values: Array) -> Index:
 
 
 def smooth_spline(t_s: Array, values: Array) -> PPoly:
-    """Return the cubic spline through values (m, k), m > 1, with two continuous derivatives.
+    """Return the cubic spline through values (m, k), m > 1, at times `t_s` (m,), with two
+    continuous derivatives ("not-a-knot" ends).
 
-    Across a jump the spline is linear, with separate splines on either side, as one spline would
-    overshoot near the jump. Three samples make a parabola and two a line.
+    Across a jump, see `jump_intervals`, the spline is linear, with separate splines on either side,
+    as one spline would overshoot near the jump. Three samples make a parabola and two a line.
     """
     broken = jump_intervals(t_s, values)
     coefficients = np.zeros((4, len(t_s) - 1, values.shape[1]))
@@ -396,7 +411,7 @@ def smooth_spline(t_s: Array, values: Array) -> PPoly:
     return PPoly(coefficients, t_s)
 
 
-# Over a recording --------------------------------------------------------------------------------
+# Checks over a recording -------------------------------------------------------------------------
 
 
 def require_determined_motion(
@@ -413,15 +428,16 @@ def require_determined_motion(
     t_s : (T,) array
         Times of the recording's samples.
     interval_s : (float, float)
-        First and last time at which the grasp holds.
+        First and last time at which the grasp holds; may be infinite.
     file : str or Path
         File of the poses, for messages.
 
     Raises
     ------
     InputError
-        For a single pose, for poses that are missing for more than a sample at either end, and for
-        a smooth motion that is sampled below 1 Hz.
+        For a single pose; for a smooth motion that is sampled below 1 Hz; and for poses that are
+        missing for more than a sample at either end. The last is not reported if the poses cover
+        fewer than three samples, as they may be of another recording.
     """
     first_s = max(t_s[0], interval_s[0])
     last_s = min(t_s[-1], interval_s[1])
@@ -458,7 +474,7 @@ def _typical_step_s(
     poses: PoseSequence, first_s: float, last_s: float
 ) -> float:
     """Return the median time [s] between consecutive poses from `first_s` to `last_s` between which
-    the grasp moves; 0 if it rests.
+    the grasp moves by more than `LARGEST_REST_DIFFERENCE`; 0 if it rests.
     """
     shift_m = np.abs(np.diff(poses.positions_m, axis=0)).max(axis=1)
     turn = np.abs(np.diff(poses.quaternions_xyzw, axis=0)).max(axis=1)

@@ -29,8 +29,8 @@ PLANE_TOLERANCE = 1e-9
 
 
 def _checked_faces(faces: Selection | ArrayLike) -> Selection | Index:
-    """Return a selection, or node numbers (F, 3) of triangles; an `InputError` for anything
-    else.
+    """Return a selection unchanged, or a copy of node numbers (F, 3) of triangles; an `InputError`
+    for anything else.
     """
     if isinstance(faces, Selection):
         return faces
@@ -90,6 +90,9 @@ class Pressure(Actuator[EnclosedVolume]):
     offset_field: ClassVar[str] = "loss_pa"
 
     def __post_init__(self) -> None:
+        """Check the stated pressures and store them as `declared_values`, in place; an `InputError`
+        for a constant pressure with a lag.
+        """
         pressure = TimeSeries(
             self.pressure_pa, self.t_s, what=f"pressure_pa of {self.name}"
         )
@@ -105,7 +108,7 @@ class Pressure(Actuator[EnclosedVolume]):
             )
 
     def _measure_on(self, body: Body) -> EnclosedVolume:
-        """Return the volume behind the faces of a body.
+        """Return the volume on the pressure's side of the faces of a body, positive for a cavity.
 
         Raises
         ------
@@ -137,7 +140,7 @@ class Pressure(Actuator[EnclosedVolume]):
 
     def on_refined_body(self, body: Body, finer: Body) -> Pressure:
         """Return the pressure on the body `finer`, whose mesh is that of `body` with every element
-        split in eight.
+        split in eight; without `body_measure`, which an experiment sets.
 
         A selection by position or name stays as it is; faces given by indices are split in four.
         """
@@ -155,45 +158,59 @@ class Pressure(Actuator[EnclosedVolume]):
     def energy_amplitude(
         self, declared_value: Any, factor: Any, offset: Any
     ) -> Any:
-        """Return the amplitude of the energy: minus the pressure in the body."""
+        """Return the amplitude of the energy, minus the pressure in the body: `offset` − `factor` ·
+        `declared_value` [Pa].
+        """
         return offset - factor * declared_value
 
     def with_calibration(
         self, factor: float, offset: float, log_lag_ratio: float
     ) -> Self:
-        """Return the pressure with another calibration."""
+        """Return the pressure with another factor and offset [Pa], and its own lag times
+        exp(`log_lag_ratio`).
+        """
         lag_s = self.lag_s * float(np.exp(log_lag_ratio))
         return replace(self, factor=factor, loss_pa=offset, lag_s=lag_s)
 
     def input_data(self, t_s: Array) -> Array:
-        """Return the times (1, T) if the pressure lags, else the stated pressures (1, T)."""
+        """Return the times (1, T) [s] if the pressure lags, else the stated pressures (1, T) [Pa]
+        at the times `t_s` (T,).
+        """
         return t_s[None] if self.lag_s else super().input_data(t_s)
 
     def calibrated_amplitude(
         self, data: ca.SX, factor: Any, offset: Any, log_lag_ratio: Any
     ) -> ca.SX:
-        """Return minus the pressure for a calibration, as an expression of `input_data` (1,)."""
+        """Return minus the pressure [Pa] for a calibration, as an expression of `input_data` (1,)
+        at one time; without a lag `log_lag_ratio` is ignored.
+        """
         if not self.lag_s:
-            return self.energy_amplitude(data, factor, offset)
+            return self.energy_amplitude(data, factor, offset=offset)
         pressure_pa = self._lagging_pressure(
             data, self.lag_s * ca.exp(log_lag_ratio)
         )
-        return self.energy_amplitude(pressure_pa, factor, offset)
+        return self.energy_amplitude(pressure_pa, factor, offset=offset)
 
     def energy_amplitude_at(self, t_s: Array) -> Array:
-        """Return minus the pressure in the body at the times `t_s` (T,), as (T,)."""
+        """Return minus the pressure in the body [Pa] at the times `t_s` (T,), as (T,), with the
+        pressure's own factor, offset and lag.
+        """
         if not self.lag_s:
             return super().energy_amplitude_at(t_s)
         pressure_pa = (
             self._lagging_pressure(ca.DM(t_s), ca.DM(self.lag_s)).full().ravel()
         )
-        return self.energy_amplitude(pressure_pa, self.factor, self.loss_pa)
+        return self.energy_amplitude(
+            pressure_pa, self.factor, offset=self.loss_pa
+        )
 
     def _lagging_pressure(self, t_s: Any, lag_s: Any) -> Any:
-        """Return the solution of τ dp/dt = stated pressure − p at the times, for τ = `lag_s`.
+        """Return the solution p [Pa] of τ dp/dt = stated pressure − p at the times `t_s`, for τ =
+        `lag_s`; CasADi expressions or numbers.
 
-        The stated pressure is a sum of ramps, one for each change of its slope; the response to a
-        ramp that begins at zero is t − τ (1 − exp(−t/τ)).
+        It is the first stated pressure until the first time; after the last time the stated
+        pressure stays. The stated pressure is a sum of ramps, one for each change of its slope; the
+        response to a ramp that begins at zero is t − τ (1 − exp(−t/τ)).
         """
         assert self.t_s is not None
         slopes = np.diff(self.pressure_pa) / np.diff(self.t_s)
@@ -209,7 +226,8 @@ class Pressure(Actuator[EnclosedVolume]):
     def with_fixed_rim(
         self, is_prescribed: NDArray[np.bool_], prescribed_m: Array
     ) -> Pressure:
-        """Return the pressure with a volume that does not depend on the motion of a held rim.
+        """Return the pressure with a volume that does not depend on the motion of a held rim; self
+        if the faces are closed.
 
         The volume of an open patch is that of the cones over its faces from an apex. The pressure
         does the work p dV if the rim is held, or slides in planes, such as planes of symmetry, that
@@ -225,7 +243,7 @@ class Pressure(Actuator[EnclosedVolume]):
         Raises
         ------
         InputError
-            If the rim moves otherwise.
+            If the rim moves otherwise, or the pressure is on no body yet.
         """
         placed = self.body_measure
         volume = self.measure

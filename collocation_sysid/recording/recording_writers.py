@@ -23,7 +23,9 @@ _DIGITS = "%.12g"
 
 
 def write_poses_csv(path: str | Path, poses: PoseSequence) -> None:
-    """Write poses as `read_poses` reads them; the file is replaced only when it is complete."""
+    """Write poses as `read_poses` reads them, without their interpolation; the file is replaced
+    only when it is complete.
+    """
     values = np.column_stack(
         [poses.t_s, poses.positions_m, poses.quaternions_xyzw]
     )
@@ -36,8 +38,17 @@ def write_markers_csv(
     names: Sequence[str],
     positions_m: ArrayLike,
 ) -> None:
-    """Write marker tracks (T, M, 3) [m] as `read_markers` reads them; NaN becomes a blank cell."""
-    table = MarkerTable(np.asarray(t_s), tuple(names), np.asarray(positions_m))
+    """Write marker tracks (T, M, 3) [m] as `read_markers` reads them; a sample with a coordinate
+    that is not finite becomes three blank cells.
+
+    Raises
+    ------
+    InputError
+        If shapes disagree or time does not increase.
+    """
+    table = MarkerTable(
+        np.asarray(t_s), tuple(names), positions_m=np.asarray(positions_m)
+    )
     header = [
         "t_s",
         *(f"{name}_{axis}" for name in table.names for axis in "xyz"),
@@ -49,10 +60,10 @@ def write_markers_csv(
 def write_wrench_csv(
     path: str | Path, t_s: ArrayLike, values: ArrayLike
 ) -> None:
-    """Write wrenches (S, 3) or (S, 6) [N, N m] as `read_wrench` reads them; NaN becomes a blank
-    cell.
+    """Write wrenches (S, 3) or (S, 6) [N, N m] at times (S,) [s] as `read_wrench` reads them; NaN
+    becomes a blank cell.
 
-    Components without any value are left out.
+    Components without any finite value are left out.
     """
     rows = np.asarray(values, dtype=float)
     there = np.flatnonzero(np.isfinite(rows).any(axis=0))
@@ -78,8 +89,8 @@ def write_columns_csv(
 def write_gauge_csv(
     path: str | Path, t_s: ArrayLike, names: Sequence[str], values: ArrayLike
 ) -> None:
-    """Write values (S, m) of a custom sensor as `read_custom_sensor` reads them; NaN becomes a
-    blank cell.
+    """Write values (S, m) of a custom sensor at times (S,) [s], with one name per column, as
+    `read_custom_sensor` reads them; NaN becomes a blank cell.
     """
     _write_csv(
         path,
@@ -89,8 +100,8 @@ def write_gauge_csv(
 
 
 def _write_csv(path: str | Path, header: Sequence[str], values: Array) -> None:
-    """Write a header and rows of numbers; NaN becomes a blank cell. The file is replaced when
-    complete.
+    """Write a header and rows of numbers (rows, columns) with 12 digits; NaN becomes a blank cell.
+    The file is replaced only when it is complete.
     """
     with (
         replaced_file(path) as draft,

@@ -55,12 +55,12 @@ class RigidFit:
         """Return the poses at the times `t_s` (T,) of the frames.
 
         Missing frames between others are interpolated smoothly; those before the first and after
-        the last pose are left out.
+        the last pose are left out. A single pose is constant.
 
         Raises
         ------
         InputError
-            If there is no pose at all.
+            If there is no pose at all, or times do not increase.
         """
         times = np.asarray(t_s, dtype=np.float64)
         there = np.flatnonzero(~self.missing)
@@ -69,14 +69,18 @@ class RigidFit:
                 "no frame contains three markers of the grasp that are not on one line"
             )
         known = PoseSequence(
-            times[there], self.positions_m[there], self.quaternions_xyzw[there]
+            times[there],
+            self.positions_m[there],
+            quaternions_xyzw=self.quaternions_xyzw[there],
         )
         if len(there) == 1:
             return known
         within = times[there[0] : there[-1] + 1]
         rotations, positions = known.at(within)
         return PoseSequence(
-            within, positions, Rotation.from_matrix(rotations).as_quat()
+            within,
+            positions,
+            quaternions_xyzw=Rotation.from_matrix(rotations).as_quat(),
         )
 
 
@@ -85,7 +89,7 @@ def fit_poses(
     tracks_m: ArrayLike,
     weights: ArrayLike | None = None,
 ) -> RigidFit:
-    """Fit the rigid motion of markers at every frame.
+    """Fit the rigid motion x = R X + p of markers at every frame, by weighted least squares.
 
     Where the visible markers of positive weight do not determine a rotation, the pose is NaN and
     the frame is counted as missing.
@@ -97,7 +101,7 @@ def fit_poses(
     tracks_m : (T, B, 3) array
         Measured positions, NaN where missing.
     weights : (B,) array, optional
-        At least 0; all 1 by default.
+        At least 0; all 1 by default. A marker of weight 0 has no influence, but has a residual.
 
     Raises
     ------
@@ -157,9 +161,13 @@ class TemplateFit(NamedTuple):
     residual_m: Array
 
     def apply(self, table: MarkerTable) -> MarkerTable:
-        """Return all markers of a table in the new frame."""
+        """Return all markers of a table in the new frame, with their notes; the
+        table is unchanged.
+        """
         positions_m = table.positions_m @ self.rotation.T + self.translation_m
-        return MarkerTable(table.t_s, table.names, positions_m, table.notes)
+        return MarkerTable(
+            table.t_s, table.names, positions_m=positions_m, notes=table.notes
+        )
 
 
 def align_to_template(
@@ -168,6 +176,9 @@ def align_to_template(
     window_s: tuple[float, float],
 ) -> TemplateFit:
     """Fit the change from the camera's frame to the body's, from mean marker positions in a window.
+
+    The mean is over the present samples of each marker; every marker with a sample has the same
+    weight.
 
     Parameters
     ----------
@@ -222,19 +233,23 @@ def align_to_template(
     )
     moved = means @ rotations[0].T + translations[0]
     return TemplateFit(
-        rotations[0], translations[0], np.linalg.norm(moved - places, axis=1)
+        rotations[0],
+        translations[0],
+        residual_m=np.linalg.norm(moved - places, axis=1),
     )
 
 
 def least_rigid_marker(reference_m: Array, positions_m: Array) -> int:
-    """Return the index of the marker whose distances to the others differ most between two
-    configurations, (B, 3) each; distances to NaN are ignored.
+    """Return the index, from 0, of the marker whose distances to the others differ most in sum
+    between two configurations, the places `reference_m` and `positions_m`, (B, 3) each; distances
+    to NaN are ignored.
 
     The frames of the configurations need not agree, as distances do not depend on them. A rigid fit
     would distribute one marker's motion over all of them.
     """
 
     def distances(points: Array) -> Array:
+        """Return the distances (B, B) between points (B, 3)."""
         return np.linalg.norm(points[:, None] - points[None], axis=2)
 
     change = np.abs(distances(positions_m) - distances(reference_m))
@@ -242,13 +257,15 @@ def least_rigid_marker(reference_m: Array, positions_m: Array) -> int:
 
 
 def _fixes_rotation(points: Array, weight: Array) -> NDArray[np.bool_]:
-    """Return whether the points (B, 3) of each frame are not on one line, as (T,) bool.
+    """Return whether the points (B, 3) of each frame determine a rotation, as (T,) bool: at least
+    two of them, whose second singular value about the mean exceeds `_LEAST_RELATIVE_SPREAD` times
+    the first.
 
     Parameters
     ----------
     points : (T, B, 3) array
     weight : (T, B) array
-        Points with a weight above 0 are used.
+        Points with a weight above 0 are used, all alike.
     """
     used = (weight > 0).astype(np.float64)
     centred = (points - _mean(points, used)[:, None]) * used[:, :, None]
@@ -263,8 +280,8 @@ def _fixes_rotation(points: Array, weight: Array) -> NDArray[np.bool_]:
 
 
 def _mean(points: Array, weight: Array) -> Array:
-    """Weighted mean (T, 3) of points (T, B, 3) with weights (T, B); 0 if all weights of a frame are
-    0.
+    """Return the weighted mean (T, 3) of points (T, B, 3) with weights (T, B); 0 if all weights of
+    a frame are 0. Points of weight zero may be NaN.
     """
     total = np.maximum(weight.sum(axis=1), np.finfo(float).tiny)
     present = np.where(weight[:, :, None] > 0, points, 0.0)

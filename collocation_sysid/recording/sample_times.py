@@ -24,9 +24,10 @@ _PRINTED_DECIMALS = range(10)
 def sample_interval_s(
     t_s: ArrayLike, what: str, source: str | Path | None = None
 ) -> float:
-    """Return the time between samples, which must be the same throughout.
+    """Return the mean time between samples, which must be the same throughout.
 
-    Steps may differ by 1 %, and by the rounding of times to the decimals in the file.
+    Steps may differ from the mean by `STEP_TOLERANCE` of it, and by the rounding of times to the
+    decimals in the file.
 
     Parameters
     ----------
@@ -40,8 +41,8 @@ def sample_interval_s(
     Raises
     ------
     InputError
-        If there are fewer than two samples, or the spacing is uneven; the row is named, counting
-        from 1.
+        If there are fewer than two samples, time does not increase, or the spacing is uneven; the
+        row is named, counting from 1.
     """
     times = np.asarray(t_s, dtype=np.float64)
     if times.ndim != 1 or len(times) < 2:
@@ -72,7 +73,7 @@ def sample_interval_s(
 
 
 def first_unordered_time(t_s: Array) -> tuple[int, str] | None:
-    """Return the index of the first time that is not at least `SHORTEST_STEP_S` after its
+    """Return the index, from 0, of the first time that is not more than `SHORTEST_STEP_S` after its
     predecessor, and a message; None if all times increase. NaN counts as not increasing.
     """
     faulty = np.flatnonzero(~(np.diff(t_s) > SHORTEST_STEP_S))
@@ -86,7 +87,9 @@ def first_unordered_time(t_s: Array) -> tuple[int, str] | None:
 
 
 def evenly_spaced_s(t_s: Array) -> Array:
-    """Return evenly spaced times with the same first and last time and number as `t_s`."""
+    """Return evenly spaced times with the same first and last time and number
+    as `t_s` (T,), T > 0.
+    """
     return np.linspace(t_s[0], t_s[-1], len(t_s))
 
 
@@ -94,7 +97,8 @@ def printed_rounding_s(t_s: Array) -> float:
     """Return the unit of the last decimal [s] if rounding to it made even times uneven, else 0.
 
     Times of 30 Hz printed as 0.033, 0.067, 0.1 give 0.001; times 0.01, 0.02, 0.03 are even without
-    rounding and give 0. The result is limited to a fraction of the mean step.
+    rounding and give 0, as do times that need more than 9 decimals. The result is limited to
+    `_ROUNDING_LIMIT` mean steps.
     """
     mean_s = float(t_s[-1] - t_s[0]) / max(len(t_s) - 1, 1)
     if np.abs(t_s - evenly_spaced_s(t_s)).max() <= 1e-6 * mean_s:
@@ -107,7 +111,7 @@ def printed_rounding_s(t_s: Array) -> float:
 
 def unrounded_s(t_s: Array) -> Array:
     """Return evenly spaced times if rounding to the printed decimals explains all unevenness of
-    `t_s`.
+    `t_s` (T,).
 
     Other times are returned unchanged.
     """

@@ -116,6 +116,8 @@ class SolidSection(Section):
 
 
 def solid_from_section(section: SolidSection) -> Solid:
-    """Return the solid that a `SolidSection` states."""
+    """Return the solid that a `SolidSection` states by its only key; errors of the solid name that
+    key.
+    """
     ((name, own),) = ((name, own) for name, own in section if own is not None)
     return KINDS[name](**declared_in(own, KINDS[name], where=name))

@@ -127,6 +127,9 @@ class Specimen:
     area_m2: float | None = key(Positive, default=None)
 
     def __post_init__(self) -> None:
+        """Check the measurements, and number the rows in seconds from 0 where no times are given,
+        in place.
+        """
         if self.test not in DEFORMATIONS:
             raise InputError(
                 f"found {self.test!r}; expected one of {', '.join(TESTS)}",
@@ -173,7 +176,9 @@ class Specimen:
                 )
 
     def _require_measurements_of_test(self) -> None:
-        """Raise an `InputError` if a measurement is missing, or not one of the test's."""
+        """Raise an `InputError` unless there is a second strain exactly if the test is biaxial; or
+        if there is a second stress or lateral stretch that the test does not have.
+        """
         of = f"a {self.test} test"
         if (self.second_strain is None) == bool(self.deformation.second):
             fault = (
@@ -226,21 +231,26 @@ class Specimen:
         validation: bool = False,
         body: Body | None = None,
     ) -> Experiment:
-        """Return the test as a static experiment of a homogeneous cell.
+        """Return the test as a static experiment of a homogeneous cell, without gravity and air.
 
         Parameters
         ----------
         material : str, Material or callable
-            As of `Body`.
+            As of `Body`; not used if `body` is given.
         name : str
             Name of the experiment.
         prony : sequence of str or Prony
-            Branches of the material's memory, as of `Body`.
+            Branches of the material's memory, as of `Body`; not used if `body` is given.
         validation : bool
             Whether the test is only predicted, not fitted.
         body : Body, optional
             Cell that another specimen of the same kind of test has; made of `material` and `prony`
             by default.
+
+        Raises
+        ------
+        InputError
+            If the law cannot be evaluated at the largest strains, see `require_evaluable_law`.
         """
         cell = (
             cell_body(self.test, material, prony=prony)
@@ -258,7 +268,7 @@ class Specimen:
         return Experiment(
             cell,
             self.t_s,
-            self._grasps(),
+            grasps=self._grasps(),
             gravity_m_s2=(0.0, 0.0, 0.0),
             name=name,
             kind="static",
@@ -270,7 +280,9 @@ class Specimen:
         )
 
     def _grasps(self) -> list[Grasp]:
-        """Return the prescribed displacements of the nodes of the cell."""
+        """Return a grasp for each of the four nodes of the cell, in their order: at rest, or with
+        the displacements of the test at `t_s`.
+        """
         assert self.t_s is not None
         moving = self.deformation.displaced_nodes()
         second = (
@@ -288,14 +300,19 @@ class Specimen:
                 )
                 no_rotation = np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1))
                 poses = PoseSequence(
-                    self.t_s, shifts_m, no_rotation, interpolation="linear"
+                    self.t_s,
+                    shifts_m,
+                    quaternions_xyzw=no_rotation,
+                    interpolation="linear",
                 )
             axes = self.deformation.prescribed_axes(node)
             grasps.append(Grasp(np.array([node]), poses, axes=axes))
         return grasps
 
     def _sensors(self) -> list[Gauge]:
-        """Return the sensors of stresses and of the lateral stretch."""
+        """Return the sensors of the first stress, of the second stress and of the lateral stretch,
+        as far as they are measured; a stress without a finite value has no sensor.
+        """
         assert self.t_s is not None
         sensors = []
         for name, component, values in (
@@ -318,8 +335,8 @@ class Specimen:
                 Gauge(
                     LATERAL_NAME,
                     LateralStretch(axis),
-                    self.t_s,
-                    self.lateral_stretch,
+                    t_s=self.t_s,
+                    values=self.lateral_stretch,
                     sigma=self.lateral_sigma,
                     points_m=[point_m],
                     unit="1",
@@ -328,8 +345,15 @@ class Specimen:
         return sensors
 
     def _stress_sensor(self, name: str, component: str, values: Array) -> Gauge:
-        """Return the sensor of one component of the nominal stress: its direction, then the
-        normal.
+        """Return the sensor of one component of the nominal stress.
+
+        Parameters
+        ----------
+        name : str
+        component : str
+            Axis of the stress, then axis of the normal, such as "xz".
+        values : (T,) array
+            Measured stresses [Pa]; NaN where missing.
         """
         deviations = {
             "area_error": self.area_error,
@@ -340,8 +364,8 @@ class Specimen:
         return Gauge(
             name,
             NominalStress(direction),
-            self.t_s,
-            values,
+            t_s=self.t_s,
+            values=values,
             sigma=self.sigma_pa,
             grasp=2 + normal,
             frame="world",
@@ -370,25 +394,38 @@ class NominalStress:
         area_error: ca.SX | float = 0.0,
         stress_zero_pa: ca.SX | float = 0.0,
     ) -> ca.SX:
-        """Return the measured stress [Pa] if the area is larger than stated by a share."""
+        """Return the measured stress P (1 + `area_error`) + `stress_zero_pa` [Pa], with the nominal
+        stress P from the force on a node of the cell.
+
+        Parameters
+        ----------
+        at : Look
+            Has the force [N].
+        area_error : SX or float
+            Relative error of the area: stated smaller than it is by this share.
+        stress_zero_pa : SX or float
+            Offset of the measured stresses [Pa].
+        """
         stress_pa = STRESS_PER_FORCE * at.force_n[self.direction]
         return stress_pa * (1 + area_error) + stress_zero_pa
 
 
 class LateralStretch:
-    """Expression of the stretch along a free axis.
+    """Expression of the stretch along a free axis, by the position of the cell's node on that axis.
 
     Attributes
     ----------
     axis : int
-        Index of the axis.
+        Index of the axis, from 0.
     """
 
     def __init__(self, axis: int) -> None:
         self.axis = axis
 
     def __call__(self, at: Look) -> ca.SX:
-        """Return the stretch."""
+        """Return the stretch along the axis: the coordinate of the first point of `at` over the
+        size of the cell.
+        """
         return at.position_m[self.axis, 0] / CELL_SIZE_M
 
 
@@ -400,7 +437,8 @@ def cell_body(
 ) -> Body:
     """Return the homogeneous cell of a kind of test, one of `TESTS`; other arguments as of `Body`.
 
-    The damping law has no effect on equilibria.
+    The cell has an additional node inside if the test prescribes all others. The damping law has no
+    effect on equilibria.
     """
     mesh = cell_mesh(with_inner_node=DEFORMATIONS[test].needs_inner_node)
     return Body(

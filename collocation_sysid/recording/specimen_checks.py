@@ -44,7 +44,13 @@ NOISE_SIGMAS = 4.0
 
 
 def require_plausible_specimen(specimen: Specimen) -> None:
-    """Raise an `InputError` if strains or stresses of a specimen are impossible as described."""
+    """Raise an `InputError` if strains or stresses of a specimen are impossible as described.
+
+    Refused are strains above `LARGEST_STRAIN`, strains that look like stretches, a correlation of
+    strain and stress below `AGAINST`, and "confined" or "volumetric" tests whose largest strain is
+    positive. The last two are not checked with fewer than `FEWEST_SAMPLES` stresses, or if strain
+    or stress is constant.
+    """
     strain = specimen.strain
     stress_pa = specimen.stress_pa
     largest = float(np.abs(strain).max())
@@ -79,7 +85,9 @@ def require_plausible_specimen(specimen: Specimen) -> None:
 
 
 def _require_strains(specimen: Specimen) -> None:
-    """Raise an `InputError` if the strains look like stretches, which are 1 without load."""
+    """Raise an `InputError` if the strains look like stretches, which are 1 without load: all above
+    `STRETCH_LIKE`, and hardly any stress at the smallest.
+    """
     stress_pa = np.abs(np.nan_to_num(specimen.stress_pa, nan=np.inf))
     first = int(np.argmin(specimen.strain))
     finite = stress_pa[np.isfinite(stress_pa)]
@@ -95,10 +103,12 @@ def _require_strains(specimen: Specimen) -> None:
 
 
 def initial_young_pa(specimen: Specimen) -> float:
-    """Return Young's modulus of an incompressible material with the initial slope of the stress
-    [Pa].
+    """Return Young's modulus [Pa] of an incompressible material with the initial slope of the
+    stress.
 
-    NaN if the test does not determine it, or has too few samples.
+    The slope is that of a line through the origin, fitted to the measured stresses up to
+    `INITIAL_SHARE` of the largest strain. NaN if the test does not determine the modulus, or there
+    is no such sample with a strain.
     """
     ratio = DEFORMATIONS[specimen.test].young_ratio
     strain = specimen.strain
@@ -115,7 +125,9 @@ def initial_young_pa(specimen: Specimen) -> float:
 
 
 def require_equal_units(specimens: Mapping[str, Specimen]) -> None:
-    """Raise an `InputError` if initial slopes of specimens of one material differ by a unit.
+    """Raise an `InputError` if the initial slope of a specimen is not that of a soft solid
+    (`YOUNG_PA`), or the slopes of specimens of one material differ by more than `UNIT_FACTOR`;
+    slopes that are NaN or not positive are ignored.
 
     Parameters
     ----------
@@ -146,7 +158,10 @@ def require_equal_units(specimens: Mapping[str, Specimen]) -> None:
 
 
 def order_warnings(specimen: Specimen) -> Iterator[str]:
-    """Yield warnings about rows that are not in the order of time."""
+    """Yield warnings about rows that are not in the order of time: a jump of the strain where most
+    changes are small, or sorted strains with a stress that jumps up and down. Tables of fewer than
+    `FEWEST_ORDERED` rows yield none.
+    """
     strain = specimen.strain
     span = float(np.ptp(strain))
     if len(strain) < FEWEST_ORDERED or not span:
@@ -167,7 +182,9 @@ def order_warnings(specimen: Specimen) -> Iterator[str]:
 
 
 def _reversal_share(specimen: Specimen) -> float:
-    """Return the share of rows in which the change of the stress reverses beyond the noise."""
+    """Return the share of pairs of successive changes of the stress with opposite signs, both
+    larger than `NOISE_SIGMAS` standard deviations; changes from or to NaN are none.
+    """
     changes = np.diff(specimen.stress_pa)
     limit = NOISE_SIGMAS * specimen.sigma_pa
     reverses = (changes[1:] * changes[:-1] < 0) & (
@@ -181,8 +198,10 @@ HYSTERESIS = 0.1
 
 
 def cycle_starts(strain: Array) -> list[int]:
-    """Return the indices of the rows at which loading cycles begin: of the smallest magnitude of
-    the strain between two of its peaks; the first is 0.
+    """Return the indices, from 0, of the rows at which loading cycles begin: of the smallest
+    magnitude of the strain between two of its peaks; the first is 0.
+
+    Changes below `HYSTERESIS` times the range of the magnitude do not end a cycle.
     """
     size = np.abs(strain)
     limit = HYSTERESIS * float(np.ptp(size))
@@ -206,12 +225,12 @@ def cycle_starts(strain: Array) -> list[int]:
 
 
 def rows_after_cycles(strain: Array, count: int) -> slice:
-    """Return the rows after the first `count` loading cycles.
+    """Return the rows after the first `count` loading cycles as a slice; all rows for 0.
 
     Raises
     ------
     InputError
-        If there are not more cycles.
+        If there are not more cycles than `count`.
     """
     starts = cycle_starts(strain)
     if count >= len(starts):

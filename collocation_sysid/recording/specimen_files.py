@@ -34,9 +34,11 @@ from .formats.columns import (
     VOLUME_RATIO,
     Quantity,
     QuantityTable,
+    name_and_unit,
     read_columns,
 )
 from .formats.text import names_file_in_errors
+from .formats.units import si_factor
 from .homogeneous_deformation import AXES, CELL_SIZE_M
 from .specimen import LATERAL_NAME, SECOND_STRESS_NAME, STRESS_NAME
 
@@ -78,7 +80,13 @@ class SpecimenLayout:
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """Quantities that the table of this kind of test may have."""
+        """Quantities that the table of this kind of test may have.
+
+        All have strain, stress, displacement and force, and all but simple shear stretch;
+        "volumetric" tests have volume ratio, stretch, strain, pressure and stress only. The second
+        axis of "biaxial" and "planar" tests and a lateral stretch or strain are added where the
+        test has them, true stress if `stress` is "true".
+        """
         stresses = (
             (STRESS,) if self.stress == "engineering" else (STRESS, TRUE_STRESS)
         )
@@ -105,8 +113,9 @@ class SpecimenTable:
     t_s : (T,) array
         Times; the number of the row in seconds if the table has none.
     strain, stress_pa : (T,) array
+        Strain without NaN; stress NaN where the cell is blank.
     second_strain, second_stress_pa, lateral_stretch : (T,) array or None
-        None if the table has no such column.
+        None if the table has no such column; stress and stretch NaN where the cell is blank.
     is_incompressible : bool
         Whether true stresses were converted as those of an incompressible specimen.
     is_displacement : bool
@@ -123,7 +132,9 @@ class SpecimenTable:
     is_displacement: bool
 
     def rows(self, chosen: Index) -> dict[str, Array | None]:
-        """Return the arrays at chosen rows, by their indices, as arguments of `Specimen`."""
+        """Return the arrays at the rows `chosen`, indices from 0, by the names of the arguments of
+        `Specimen`; None for quantities without a column.
+        """
         arrays = {
             "t_s": self.t_s,
             "strain": self.strain,
@@ -140,13 +151,21 @@ class SpecimenTable:
 
 @names_file_in_errors
 def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
-    """Read the table of a material test.
+    """Read the table of a material test, and convert it to engineering stresses, positive in
+    tension.
+
+    Parameters
+    ----------
+    path : str or Path
+    layout : SpecimenLayout
+        Meaning of the columns.
 
     Raises
     ------
     InputError
-        If a column is missing, repeated or in an unknown unit, a cell is not a number, time does
-        not increase, or length or area of the specimen are needed; the line is named.
+        If a column is missing, repeated or in an unknown unit, a cell is not a number, a strain is
+        blank or not possible, time does not increase, or length or area of the specimen are needed;
+        file and line are named.
     """
     if layout.test == "simple-shear" and "stretch" in layout.columns:
         raise InputError(
@@ -155,7 +174,7 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
     table = read_columns(
         path,
         layout.quantities,
-        layout.columns,
+        column_names=layout.columns,
         blank_allowed=True,
         requires_times=layout.requires_times,
     )
@@ -193,28 +212,39 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
 def _one_of(
     table: QuantityTable, quantities: tuple[Quantity, ...], what: str
 ) -> Quantity:
-    """Return the only quantity of several that a table has.
+    """Return the only one of several quantities that a table has.
+
+    Parameters
+    ----------
+    table : QuantityTable
+    quantities : tuple of Quantity
+        Alternatives.
+    what : str
+        Common name of the alternatives, for the message.
 
     Raises
     ------
     InputError
-        If it has none or more than one.
+        If the table has none or more than one.
     """
     there = [
         quantity for quantity in quantities if quantity.key in table.values
     ]
     if len(there) != 1:
-        found = " and ".join(quantity.key for quantity in there) or "no column"
+        present = " and ".join(quantity.key for quantity in there)
         expected = ", ".join(quantity.column for quantity in quantities)
         raise table.grid.error_at(
-            f"the columns are {', '.join(table.grid.columns)}; found {found} of the {what}, "
+            f"the columns are {', '.join(table.grid.columns)}; found "
+            f"{present or 'no column'} of the {what}, "
             f"expected exactly one of {expected}, in these or other units"
         )
     return there[0]
 
 
 def _complete(table: QuantityTable, quantity: Quantity) -> Array:
-    """Return the values (T,) of a column; raise `InputError` if a cell is blank."""
+    """Return the values (T,) of the column of a quantity; raise an `InputError` with the line if a
+    cell is blank.
+    """
     values = table.values[quantity.key]
     if (blank := np.isnan(values)).any():
         raise table.grid.error_at(
@@ -225,7 +255,17 @@ def _complete(table: QuantityTable, quantity: Quantity) -> Array:
 
 
 def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
-    """Return the strain (T,) of the test."""
+    """Return the strain (T,) of the test, as `Specimen` defines it.
+
+    `strain_sign` applies to strains and displacements, not to stretches and volume ratios. A strain
+    of a volumetric test is that of the volume, J − 1.
+
+    Raises
+    ------
+    InputError
+        If not exactly one kind of deformation is there, a cell is blank, a displacement has no
+        `length_m`, or a size is not positive (not tested in simple shear).
+    """
     known = (STRETCH, STRAIN, DISPLACEMENT, VOLUME_RATIO)
     possible = tuple(
         quantity for quantity in known if quantity in layout.quantities
@@ -259,7 +299,9 @@ def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
 def _require_positive(
     table: QuantityTable, quantity: Quantity, ratio: Array
 ) -> None:
-    """Raise an `InputError` if a ratio (T,) of deformed to undeformed size is not positive."""
+    """Raise an `InputError` if a ratio (T,) of deformed to undeformed size is not positive
+    everywhere; it names the first such row and the likely cause for `quantity`.
+    """
     if (ratio > 0).all():
         return
     row = int(np.argmax(ratio <= 0))
@@ -278,7 +320,14 @@ def _require_positive(
 def _second_strain(
     table: QuantityTable, layout: SpecimenLayout
 ) -> Array | None:
-    """Return the strain (T,) along the second axis; None unless the test is biaxial."""
+    """Return the strain (T,) along the second axis; None unless the test is biaxial.
+
+    Raises
+    ------
+    InputError
+        If there is not exactly one of second stretch and second strain, a cell is blank, or a
+        stretch is not positive.
+    """
     if layout.test != "biaxial":
         return None
     quantity = _one_of(
@@ -299,7 +348,9 @@ def _second_strain(
 def _lateral_stretch(
     table: QuantityTable, layout: SpecimenLayout
 ) -> Array | None:
-    """Return the lateral stretch (T,); None if the table has none."""
+    """Return the lateral stretch (T,), from the stretch or else from 1 plus the signed strain, NaN
+    where blank; None if the table has neither.
+    """
     if LATERAL_STRETCH.key in table.values:
         return table.values[LATERAL_STRETCH.key]
     if LATERAL_STRAIN.key in table.values:
@@ -308,7 +359,17 @@ def _lateral_stretch(
 
 
 def _stress_pa(table: QuantityTable, layout: SpecimenLayout) -> Array:
-    """Return the stress (T,) as the table has it, positive in tension [Pa]."""
+    """Return the stress (T,) as the table has it, positive in tension [Pa]: engineering or true, a
+    force over `area_m2`, or minus the pressure; NaN where blank.
+
+    `stress_sign` applies to all but pressures.
+
+    Raises
+    ------
+    InputError
+        If not exactly one kind of load is there, or a force has no area or is stated as true
+        stress.
+    """
     known = (STRESS, TRUE_STRESS, FORCE, PRESSURE)
     possible = tuple(
         quantity for quantity in known if quantity in layout.quantities
@@ -336,8 +397,12 @@ def _area_ratios(
     second_strain: Array | None,
     lateral: Array | None,
 ) -> tuple[Array, Array]:
-    """Return the deformed over the undeformed area (T,) of the faces of the first and of the
-    second stress.
+    """Return the deformed over the undeformed area (T,) of the faces of the first and of the second
+    stress.
+
+    Both are 1 in "confined", "simple-shear" and "volumetric" tests. Otherwise they follow from the
+    strains (T,) and the lateral stretch (T,); where `lateral` is None, from that of an
+    incompressible specimen. `second_strain` is None unless the test is biaxial.
     """
     stretch = 1 + strain
     if layout.test in ("confined", "simple-shear", "volumetric"):
@@ -355,8 +420,8 @@ def _area_ratios(
 
 
 def specimen_strains(experiment: Experiment) -> tuple[Array, Array]:
-    """Return the first and the second strain (T,) of the experiment of a specimen; the second is
-    zero unless the test is biaxial.
+    """Return the first and the second strain (T,) of the experiment of a specimen, from the poses
+    of its grasps; the second is zero unless the test is biaxial.
     """
     deformation = experiment.specimen
     assert deformation is not None
@@ -376,39 +441,91 @@ def specimen_columns(
 ) -> dict[str, Array]:
     """Return the columns (T,) of the table of a specimen by name, as `read_specimen` reads them.
 
+    The columns are those that `layout` names, in the units of their names. If it names none but the
+    time, deformations are written as stretches, those of simple shear as strains and of volumetric
+    tests as volume ratios with pressures, under standard names. Stresses are true or engineering,
+    and signs are as `layout` states.
+
     Parameters
     ----------
     experiment : Experiment
         Experiment of a specimen.
     values : mapping of str to (T,) array
-        Values of its sensors by name.
+        Values of its sensors by name, at the sample times; a quantity that does not follow from
+        them has no column.
     layout : SpecimenLayout
-        Meaning of the columns, with the names that the user gives them.
+        Meaning of the columns.
+    """
+    quantities = _specimen_quantities(experiment, values, layout=layout)
+    named = [key for key in layout.columns if key != TIME.key]
+    usual = [quantity.key for quantity in _usual_quantities(layout)]
+    columns = {}
+    for key in (TIME.key, *(named or usual)):
+        for quantity, column in quantities.items():
+            if quantity.key == key:
+                name = layout.columns.get(key, quantity.column)
+                unit = name_and_unit(name)[1] or quantity.unit
+                factor = si_factor(unit, quantity.dimension) or 1.0
+                columns[name] = column / factor
+    return columns
+
+
+def _usual_quantities(layout: SpecimenLayout) -> tuple[Quantity, ...]:
+    """Return the quantities that are written for a test if the layout names no columns."""
+    if layout.test == "volumetric":
+        return VOLUME_RATIO, PRESSURE
+    deformation = STRAIN if layout.test == "simple-shear" else STRETCH
+    return (
+        deformation,
+        SECOND_STRETCH,
+        STRESS,
+        SECOND_STRESS,
+        LATERAL_STRETCH,
+    )
+
+
+def _specimen_quantities(
+    experiment: Experiment, values: Mapping[str, Array], layout: SpecimenLayout
+) -> dict[Quantity, Array]:
+    """Return every quantity (T,) that follows from the strains of a specimen and the values of its
+    sensors, in SI units and with the signs of `layout`; arguments as of `specimen_columns`.
     """
     strain, second_strain = specimen_strains(experiment)
+    stretch = 1 + strain
     lateral = values.get(LATERAL_NAME)
     areas = _area_ratios(
         layout, strain, second_strain=second_strain, lateral=lateral
     )
     is_true = layout.stress == "true"
-    columns: dict[Quantity, Array] = {TIME: experiment.t_s}
-    if layout.test == "volumetric":
-        columns[VOLUME_RATIO] = (1 + strain) ** 3
-        columns[PRESSURE] = -values[STRESS_NAME] / (1 + strain) ** 2
-    else:
-        if layout.test == "simple-shear":
-            columns[STRAIN] = layout.strain_sign * strain
-        else:
-            columns[STRETCH] = 1 + strain
-        if layout.test == "biaxial":
-            columns[SECOND_STRETCH] = 1 + second_strain
-        for name, quantity, area in (
-            (STRESS_NAME, STRESS, areas[0]),
-            (SECOND_STRESS_NAME, SECOND_STRESS, areas[1]),
-        ):
-            if name in values:
-                stress_pa = values[name] / area if is_true else values[name]
-                columns[quantity] = layout.stress_sign * stress_pa
-        if lateral is not None:
-            columns[LATERAL_STRETCH] = lateral
-    return {quantity.column: column for quantity, column in columns.items()}
+    is_volumetric = layout.test == "volumetric"
+    table_strain = stretch**3 - 1 if is_volumetric else strain
+    quantities = {
+        TIME: experiment.t_s,
+        STRETCH: stretch,
+        STRAIN: layout.strain_sign * table_strain,
+        VOLUME_RATIO: stretch**3,
+    }
+    if layout.length_m is not None:
+        quantities[DISPLACEMENT] = layout.strain_sign * strain * layout.length_m
+    if layout.test == "biaxial":
+        quantities[SECOND_STRETCH] = 1 + second_strain
+        quantities[SECOND_STRAIN] = layout.strain_sign * second_strain
+    if lateral is not None:
+        quantities[LATERAL_STRETCH] = lateral
+        quantities[LATERAL_STRAIN] = layout.strain_sign * (lateral - 1)
+    if STRESS_NAME in values:
+        stress_pa = values[STRESS_NAME]
+        if is_volumetric:
+            stress_pa = stress_pa / stretch**2
+        elif is_true:
+            stress_pa = stress_pa / areas[0]
+        quantities[PRESSURE] = -stress_pa
+        quantities[STRESS] = layout.stress_sign * stress_pa
+        quantities[TRUE_STRESS] = quantities[STRESS]
+        if layout.area_m2 is not None:
+            quantities[FORCE] = quantities[STRESS] * layout.area_m2
+    if SECOND_STRESS_NAME in values:
+        second_pa = values[SECOND_STRESS_NAME]
+        second_pa = second_pa / areas[1] if is_true else second_pa
+        quantities[SECOND_STRESS] = layout.stress_sign * second_pa
+    return quantities

@@ -18,7 +18,9 @@ def require_evaluable_law(
 ) -> None:
     """Raise an `InputError` if stretches leave the range in which the law is evaluated accurately.
 
-    Laws in powers of the stretches integrate over invariants, see `fem.laws.power_traces`.
+    Only laws in powers of the stretches are checked, which integrate over invariants, see
+    `fem.laws.power_traces`: no principal stretch without change of volume may be below
+    `SMALLEST_POWER_STRETCH`.
 
     Parameters
     ----------
@@ -53,7 +55,8 @@ def require_evaluable_law(
 def isochoric_stretches(
     test: str, strain: Array, second_strain: Array | None
 ) -> Array:
-    """Return the principal stretches (T, 3) without their change of volume.
+    """Return the principal stretches (T, 3) without their change of volume, so that their product
+    is 1, not sorted.
 
     Free stretches are those of an incompressible material.
 

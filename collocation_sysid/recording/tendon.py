@@ -68,6 +68,14 @@ class Tendon(Actuator[PolylineLength]):
     offset_field: ClassVar[str] = "loss_n"
 
     def __post_init__(self) -> None:
+        """Check points and tension, and store the tension as `declared_values`, in place.
+
+        Raises
+        ------
+        InputError
+            If there are fewer than two points, two successive points coincide, or a tension is
+            negative.
+        """
         points = self.points_m
         name = self.name
         if len(points) < 2:
@@ -103,9 +111,9 @@ class Tendon(Actuator[PolylineLength]):
         """
         shape = LocatedBody(body.nodes_m, body)
         embedded = [shape.weights_at_point(point) for point in self.points_m]
-        nodes, weights, distances = (
-            np.array(part) for part in zip(*embedded, strict=True)
-        )
+        nodes = np.array([each.nodes for each in embedded])
+        weights = np.array([each.weights for each in embedded])
+        distances = np.array([each.distance_m for each in embedded])
         worst = int(distances.argmax())
         if distances[worst] > FARTHEST_POINT_EDGES * shape.mean_edge_m:
             raise InputError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +118,7 @@ def _read_limited(
     return table.t_s, values
 
 
-# Of a grasp, as a robot or a test bench tells it --------------------------------------------------
+# Wrenches and displacements of a grasp ------------------------------------------------------------
 
 
 def read_wrench(
@@ -162,7 +163,11 @@ def read_wrench(
     """
     quantities = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
     table = read_columns(
-        path, quantities, columns, blank_allowed=True, requires_times=timed
+        path,
+        quantities,
+        column_names=columns,
+        blank_allowed=True,
+        requires_times=timed,
     )
     factor = sign * (area_m2 or 1.0) / symmetry
     return _without_rounding(table.t_s), factor * _axis_components(
@@ -216,7 +221,9 @@ def read_displacement(
         * np.nan_to_num(_axis_components(table, DISPLACEMENTS, axis=axis))
     )
     return PoseSequence(
-        table.t_s, shifts_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1))
+        table.t_s,
+        shifts_m,
+        quaternions_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1)),
     )
 
 
@@ -226,8 +233,10 @@ def displaced_axes(
     axis: str = "z",
     length_m: float | None = None,
 ) -> str:
-    """Return the axes along which a file has displacements, such as "z"; empty if it has none.
-    Arguments and errors are those of `read_displacement`.
+    """Return the axes along which a file has displacements, such as "z" or "xy"; empty if it has
+    none, and without regard to their values.
+
+    Arguments and errors are those of `read_displacement`; times are not required.
     """
     shifts = _axis_components(
         _read_displacements(path, columns, length_m=length_m, timed=False),
@@ -266,13 +275,16 @@ def _read_displacements(
     quantities = (
         (*DISPLACEMENTS, DISPLACEMENT) if length_m is None else (STRAIN,)
     )
-    return read_columns(path, quantities, columns, requires_times=timed)
+    return read_columns(
+        path, quantities, column_names=columns, requires_times=timed
+    )
 
 
 def _axis_components(
     table: QuantityTable, quantities: Sequence[Quantity], axis: str
 ) -> Array:
-    """Return the values (T, n) of n quantities, one for each axis; NaN where missing.
+    """Return the values (T, n) of n quantities of a table, one for each axis, in the order of
+    `quantities`; NaN where missing.
 
     A machine's quantity, whose name contains no axis, becomes the component along `axis` ("x", "y"
     or "z").
@@ -289,13 +301,31 @@ def _without_rounding(t_s: Array) -> Array:
     return unrounded_s(t_s) if len(t_s) > 2 else t_s
 
 
-# Of an instrument ---------------------------------------------------------------------------------
+# Custom sensors -----------------------------------------------------------------------------------
+
+
+class CustomSensorTable(NamedTuple):
+    """Values of a custom sensor over time.
+
+    Attributes
+    ----------
+    t_s : (S,) array
+        Sample times [s].
+    values : (S, m) array
+        Values in their own units; NaN where a cell is blank.
+    columns : list of str
+        Names of the m columns of the values.
+    """
+
+    t_s: Array
+    values: Array
+    columns: list[str]
 
 
 @names_file_in_errors
 def read_custom_sensor(
     path: str | Path, columns: Sequence[str] = ()
-) -> tuple[Array, Array, list[str]]:
+) -> CustomSensorTable:
     """Read the values of a custom sensor over time.
 
     Parameters
@@ -303,14 +333,6 @@ def read_custom_sensor(
     path : str or Path
     columns : sequence of str
         Columns of the values; all besides t_s by default.
-
-    Returns
-    -------
-    t_s : (S,) array
-    values : (S, m) array
-        NaN where a cell is blank.
-    columns : list of str
-        Names of the columns of the values.
 
     Raises
     ------
@@ -334,13 +356,15 @@ def read_custom_sensor(
     values = numeric_cells(
         grid, [grid.columns.index(name) for name in names], blank_allowed=True
     )
-    return _without_rounding(t_s), np.asarray(values), names
+    return CustomSensorTable(
+        _without_rounding(t_s), np.asarray(values), columns=names
+    )
 
 
 def is_within_experiment(
     sample_times_s: Array, t_s: Array, name: str, is_static: bool
 ) -> NDArray[np.bool_]:
-    """Return which samples lie within an experiment's times, as (S,) bool.
+    """Return which samples lie within an experiment's times, as (S,) bool; its ends are included.
 
     Parameters
     ----------

@@ -13,6 +13,13 @@ from scipy.optimize import brentq
 import collocation_sysid as cs
 from collocation_sysid.program.simulation import with_readings
 from collocation_sysid.recording.homogeneous_deformation import TESTS
+from collocation_sysid.recording.recording_writers import write_columns_csv
+from collocation_sysid.recording.specimen_files import (
+    SpecimenLayout,
+    read_specimen,
+    specimen_columns,
+    specimen_strains,
+)
 from collocation_sysid.result.replay import read_run
 from collocation_sysid.result.synthesis import Recipe, write_data
 from collocation_sysid.runs.numerical_error import finer_mesh
@@ -492,6 +499,65 @@ def test_simulate_writes_the_table_that_the_problem_reads(tmp_path):
     (twin / "problem.toml").write_text(PROBLEM)
     run = cs.run(cs.Problem.read(twin / "problem.toml"))
     assert run.parameters["young_pa"] == pytest.approx(2 * YOUNG_PA, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("header", "factors", "keys"),
+    [
+        (
+            "Kanal 1 (%),Kanal 2 (kPa)",
+            (-100.0, 1e-3),
+            "strain_sign = -1\n"
+            'columns = { strain = "Kanal 1 (%)", stress = "Kanal 2 (kPa)" }\n',
+        ),
+        (
+            "Kanal 1 (mm),Kanal 2 (N)",
+            (20.0, 4e-6),
+            "length_m = 0.02\narea_m2 = 4e-6\n"
+            'columns = { displacement = "Kanal 1 (mm)", force = "Kanal 2 (N)" }\n',
+        ),
+    ],
+)
+def test_a_simulated_table_has_the_columns_that_the_problem_names(
+    tmp_path, header, factors, keys
+):
+    strain = np.linspace(0.05, 0.8, 12)
+    stress_pa = simulated("uniaxial", strain)["stress"]
+    rows = np.column_stack([strain, stress_pa]) * factors
+    path = written(tmp_path, PROBLEM + keys, header, rows)
+    twin = tmp_path / "twin"
+    value = f"parameters.young_pa.guess={2 * YOUNG_PA}"
+    outcome = run_command("simulate", path, "--out", twin, "--set", value)
+    assert outcome.code == 0, outcome.err
+    (twin / "problem.toml").write_text(PROBLEM + keys)
+    (experiment,) = cs.Problem.read(twin / "problem.toml").experiments
+    assert experiment.readings[0].measured_values[:, 0] == pytest.approx(
+        2 * stress_pa, rel=1e-8
+    )
+    strains = specimen_strains(experiment)[0]
+    assert strains == pytest.approx(strain, rel=1e-8)
+
+
+@pytest.mark.parametrize("test", TESTS)
+def test_columns_of_every_test_are_read_back(tmp_path, test):
+    second = -0.5 * STRAIN if test == "biaxial" else None
+    strain = -0.5 * STRAIN if test in ("confined", "volumetric") else STRAIN
+    twin = specimen(test, strain, second_strain=second)
+    stress_pa = 1e3 * np.arange(1.0, len(strain) + 1)
+    values = {"stress": stress_pa}
+    if test in ("biaxial", "planar"):
+        values["second stress"] = 2 * stress_pa
+    for stress in ("engineering", "true"):
+        layout = SpecimenLayout(test=test, columns={}, stress=stress)
+        columns = specimen_columns(twin.experiment(), values, layout=layout)
+        write_columns_csv(tmp_path / "table.csv", columns)
+        table = read_specimen(tmp_path / "table.csv", layout)
+        assert table.strain == pytest.approx(strain, rel=1e-8)
+        assert table.stress_pa == pytest.approx(stress_pa, rel=1e-8)
+        if "second stress" in values:
+            assert table.second_stress_pa == pytest.approx(
+                2 * stress_pa, rel=1e-8
+            )
 
 
 def test_specimens_and_a_motion_share_the_parameters(tmp_path):

@@ -81,7 +81,8 @@ class CasadiSolver(Options):
         watch: Watch | None = None,
         start: Array | None = None,
     ) -> Solution:
-        """Solve the NLP, see `Method`.
+        """Solve the NLP from `start`, by default from a simulation at the guess; `watch` is called
+        with every entry of the history. See `Method`.
 
         Raises
         ------
@@ -122,7 +123,9 @@ class CasadiSolver(Options):
         return settings
 
     def _plugin_settings(self) -> dict[str, Any]:
-        """Return the options of the plugin that follow from those of the method."""
+        """Return the options of the plugin that follow from those of the method; each subclass
+        defines them.
+        """
         raise NotImplementedError
 
 
@@ -147,6 +150,7 @@ class SqpMethod(CasadiSolver):
     hessian: Hessian = "gauss-newton"
 
     def _plugin_settings(self) -> dict[str, Any]:
+        """Return the tolerances and the limit of iterations, with PIQP as silent QP solver."""
         return {
             "qpsol": "piqp",
             "qpsol_options": {"error_on_fail": False},
@@ -182,6 +186,7 @@ class Sleqp(CasadiSolver):
     }
 
     def _plugin_settings(self) -> dict[str, Any]:
+        """Return the tolerances and the limits of iterations and time, without printing."""
         return {
             "max_iter": self.max_iterations,
             "max_wall_time": self.max_time_s,
@@ -216,9 +221,10 @@ REFUSED: dict[str, str] = {
 
 
 def refusal_reason(name: str) -> str | None:
-    """Return the reason why a solver of CasADi is not offered.
+    """Return the reason why a solver of CasADi is not offered, with those that are.
 
-    None for names that do not begin with "casadi:" and for solvers that are offered.
+    None for names that do not begin with "casadi:" and for solvers that are offered. For an unknown
+    solver the reason contains the most similar name.
     """
     if not name.startswith(PREFIX) or name.removeprefix(PREFIX) in PLUGINS:
         return None
@@ -234,9 +240,20 @@ def refusal_reason(name: str) -> str | None:
 def _judge(
     collocation: Collocation, status: Status, z: Array, multipliers: Array
 ) -> Status:
-    """Return the status of a solution after a check of its constraints and optimality: a converged
-    one that violates constraints is infeasible, and one that stalled is acceptable if it is nearly
-    optimal.
+    """Return the status of a solution after a check of its constraints and optimality at z.
+
+    A converged one that violates constraints by more than `FEASIBLE` is infeasible; one that
+    stalled or failed numerically is acceptable if the optimality conditions hold within
+    `ACCEPTABLE`; other statuses are returned unchanged.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Given problem.
+    status : Status
+        Status by the solver.
+    z : (variables,) array
+    multipliers : (constraints,) array
     """
     if status.converged:
         violation = np.abs(collocation.constraint_values(z)).max(initial=0.0)
@@ -255,8 +272,12 @@ def _hessian_values(
     """
 
     def values(z: Array, weight: float, multipliers: Array, out: Array) -> None:
+        """Write the Hessian's values of weight · f + multipliers · g at z to `out`, in place."""
         collocation.hessian_values(
-            z, weight, multipliers if hessian == "exact" else None, out
+            z,
+            weight,
+            multipliers=multipliers if hessian == "exact" else None,
+            out=out,
         )
 
     return values

@@ -125,7 +125,9 @@ class CgResult:
     iterations, evaluations : int
         Numbers of iterations, and of evaluations of the gradient.
     ending : str
-        Reason for the end.
+        Reason for the end: "converged"; "iteration-limit"; "stopped" by the callback;
+        "line-search", if no step satisfied the Wolfe conditions; or "not-finite", if the function
+        is not finite at the start.
     """
 
     x: Array
@@ -176,7 +178,9 @@ def minimise_cg_descent(
     f, g = counted(x)
 
     def result(ending: Ending, iterations: int) -> CgResult:
-        """Return the last iterate as the result."""
+        """Return the last iterate as the result, with the reason for the end and the number of
+        iterations.
+        """
         return CgResult(
             x,
             f,
@@ -192,6 +196,20 @@ def minimise_cg_descent(
     step = 0.0
     change = np.inf
     average = _AverageValue(options)
+
+    def line_search_in(direction: Array) -> _LineSearch:
+        """Return a line search from the last iterate along a direction (n,)."""
+        return _LineSearch(
+            counted,
+            x,
+            value=f,
+            gradient=g,
+            direction=direction,
+            error=average.error,
+            approximate=average.approximate,
+            options=options,
+        )
+
     if callback is not None and callback(
         CgState(0, x, value=f, gradient=g, direction=d, slope=0.0, step=0.0)
     ):
@@ -200,35 +218,17 @@ def minimise_cg_descent(
         if np.abs(g).max(initial=0.0) <= options.tolerance:
             return result("converged", k)
         average.add(f)
-        line = _LineSearch(
-            counted,
-            x,
-            value=f,
-            gradient=g,
-            direction=d,
-            error=average.error,
-            approximate=average.approximate,
-            options=options,
-        )
-        trial = line.search(
+        line = line_search_in(d)
+        first_step = (
             _initial_step(x, f, g=g)
             if k == 0
             else _initial_step_after(line, step, change=change)
         )
-        if trial is None and line.slope > -float(g @ g) * (
-            1 - 1e-12
-        ):  # once down the gradient
+        trial = line.search(first_step)
+        is_deflected = line.slope > -float(g @ g) * (1 - 1e-12)
+        if trial is None and is_deflected:
             d = -g
-            line = _LineSearch(
-                counted,
-                x,
-                value=f,
-                gradient=g,
-                direction=d,
-                error=average.error,
-                approximate=average.approximate,
-                options=options,
-            )
+            line = line_search_in(d)
             trial = line.search(_initial_step(x, f, g=g))
         if trial is None:
             return result("line-search", k)
@@ -287,8 +287,9 @@ def _next_direction(
 
 
 def _initial_step(x: Array, f: float, g: Array) -> float:
-    """Return the step size of the first line search at x with the value f and the gradient g, rule
-    I0.
+    """Return the step size of the first line search at x with the value f and the gradient g ≠ 0,
+    rule I0: `FIRST` times the size of x over that of g; without x, of |f| over ‖g‖²; 1 if both are
+    zero.
     """
     steepest = float(np.abs(g).max())
     if x.any():
@@ -319,7 +320,15 @@ def _initial_step_after(line: _LineSearch, last: float, change: float) -> float:
 
 
 class _CountedFunction:
-    """Function with a count of the evaluations of its gradient."""
+    """Function with a count of the evaluations of its gradient.
+
+    Parameters
+    ----------
+    fun_and_grad : callable
+        Returns value and gradient (n,) at x.
+    value : callable or None
+        Returns the value alone; None to use `fun_and_grad`.
+    """
 
     def __init__(
         self,
@@ -336,7 +345,7 @@ class _CountedFunction:
         return self._fun_and_grad(x)
 
     def value(self, x: Array) -> float:
-        """Return the value at x."""
+        """Return the value at x (n,); it is counted only if the gradient is evaluated, too."""
         return self(x)[0] if self._value is None else self._value(x)
 
 
@@ -346,6 +355,11 @@ class _AverageValue:
 
     Attributes
     ----------
+    options : CgDescentOptions
+    weight : float
+        Weight of the values so far.
+    size : float
+        Average size C.
     approximate : bool
         Whether only the approximate Wolfe conditions count.
     """
@@ -361,7 +375,9 @@ class _AverageValue:
         self.size += (abs(value) - self.size) / self.weight
 
     def note_change(self, change: float) -> None:
-        """Switch to the approximate Wolfe conditions after a small change of the value."""
+        """Count only the approximate Wolfe conditions from now on if a change of the value is at
+        most `switch` times the average size.
+        """
         if change <= self.options.switch * self.size:
             self.approximate = True
 
@@ -394,7 +410,23 @@ class _TrialsExhausted(Exception):
 
 
 class _LineSearch:
-    """Line search along one direction."""
+    """Line search along one direction.
+
+    Parameters
+    ----------
+    function : _CountedFunction
+    x : (n,) array
+        Start of the line.
+    value, gradient
+        Value and gradient (n,) at x.
+    direction : (n,) array
+        Direction of the line, along which the value decreases.
+    error : float
+        Rounding error of the value; values up to it above `value` count as equal.
+    approximate : bool
+        Whether only the approximate Wolfe conditions count.
+    options : CgDescentOptions
+    """
 
     def __init__(
         self,
@@ -419,7 +451,7 @@ class _LineSearch:
         self.trials = 0
 
     def value_at(self, step: float) -> float:
-        """Return the value at a step size."""
+        """Return the value at a step size, which is no counted trial."""
         return self.function.value(self.x + step * self.direction)
 
     def search(self, step: float) -> _LineTrial | None:
@@ -473,7 +505,9 @@ class _LineSearch:
         return trial
 
     def _satisfies_wolfe(self, trial: _LineTrial) -> bool:
-        """Return whether a trial satisfies the Wolfe conditions T1 or T2."""
+        """Return whether a trial satisfies the Wolfe conditions: T2, the approximate ones with a
+        value up to `limit`, or, unless only these count, T1.
+        """
         decrease = self.options.decrease
         curvature = self.options.curvature
         if not trial.slope >= curvature * self.slope:
@@ -549,7 +583,9 @@ class _LineSearch:
 
 
 def _secant(a: _LineTrial, b: _LineTrial) -> float:
-    """Return the zero of the linear interpolation of both slopes; NaN if they are equal."""
+    """Return the step size at which the linear interpolation of the slopes of two trials is zero;
+    NaN if the slopes are equal.
+    """
     if a.slope == b.slope:
         return np.nan
     return (a.step * b.slope - b.step * a.slope) / (b.slope - a.slope)

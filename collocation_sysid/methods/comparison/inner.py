@@ -9,7 +9,7 @@ smoothly, z = middle + half · sin(s).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.optimize import Bounds, OptimizeResult
@@ -111,8 +111,40 @@ def minimise_merit(
     return follow.converged
 
 
+class _MeritEvaluation(NamedTuple):
+    """Merit function at one point.
+
+    Attributes
+    ----------
+    z : (variables,) array
+        Variables.
+    value : float
+        Merit m; infinite if an element is inverted.
+    gradient : (variables,) array
+        ∂m/∂z; NaN if an element is inverted.
+    """
+
+    z: Array
+    value: float
+    gradient: Array
+
+
 class _ConvergenceCheck:
-    """Callback that reports iterates of the scaled problem and checks convergence."""
+    """Callback that reports iterates of the scaled problem and checks convergence.
+
+    Parameters
+    ----------
+    scaled : _ScaledMerit
+    tolerance : float
+        Largest entry of the projected gradient ∂m/∂z.
+    report : callable
+        Receives z, value and projected gradient of each iterate.
+
+    Attributes
+    ----------
+    converged : bool
+        Whether the last iterate was within the tolerance.
+    """
 
     def __init__(
         self, scaled: _ScaledMerit, tolerance: float, report: Report
@@ -123,13 +155,17 @@ class _ConvergenceCheck:
         self.converged = False
 
     def __call__(self, s: Array) -> bool:
-        """Report the iterate s (free variables,), and return whether its gradient is within
-        the tolerance.
+        """Report the iterate s (free variables,), and return whether its gradient is within the
+        tolerance.
+
+        `converged` and the replacement value of the scaled problem are updated.
         """
-        z, value, gradient = self.scaled.evaluate_at(s)
-        self.scaled.replacement_value = STEEP * abs(value) + 1e-300
-        projected = self.scaled.project_gradient(s, z, gradient)
-        self.report(z, value, projected)
+        point = self.scaled.evaluate_at(s)
+        self.scaled.replacement_value = STEEP * abs(point.value) + 1e-300
+        projected = self.scaled.project_gradient(
+            s, point.z, gradient=point.gradient
+        )
+        self.report(point.z, point.value, projected)
         self.converged = bool(
             np.abs(projected).max(initial=0.0) <= self.tolerance
         )
@@ -139,8 +175,26 @@ class _ConvergenceCheck:
 class _ScaledMerit:
     """Merit function of the scaled free variables s, without bounds if they are mapped smoothly.
 
+    Parameters
+    ----------
+    merit : MeritFunction
+    z : (variables,) array
+        Initial variables, s = 0.
+    smooth : bool
+        Whether variables with a bound are mapped smoothly, z = middle + half · sin(angle);
+        otherwise `bounds` apply.
+
     Attributes
     ----------
+    free : (free,) int array
+        Indices of the free variables in z.
+    unit : (free,) array
+        Change of each variable for a unit of s.
+    mapped : int array
+        Indices, among the free variables, of those that are mapped.
+    middle, half, angle : arrays
+        Constants of the map of each mapped variable; the angle is that of the start, which is moved
+        slightly inside its bounds.
     start : (free,) array
         Initial s, zeros.
     bounds : Bounds
@@ -156,7 +210,7 @@ class _ScaledMerit:
         self.free = np.flatnonzero(problem.is_free)
         _, jacobian = problem.constraints_and_jacobian(z)
         loss = problem.nlp.hessian(
-            z, 1.0, np.zeros(problem.nlp.constraint_count)
+            z, 1.0, multipliers=np.zeros(problem.nlp.constraint_count)
         ).diagonal()
         diagonal = loss + merit.rho * (jacobian.power(2).sum(axis=0))
         diagonal = diagonal[self.free]
@@ -182,7 +236,7 @@ class _ScaledMerit:
         self.angle = np.arcsin(share)
         self.start = np.zeros(len(self.free))
         self.replacement_value = np.inf
-        self._last: tuple[Array, Array, float, Array] | None = None
+        self._last: tuple[Array, _MeritEvaluation] | None = None
 
     def to_variables(self, s: Array) -> Array:
         """Return all variables (variables,) from s (free,); constant ones have their initial
@@ -197,7 +251,7 @@ class _ScaledMerit:
         return z
 
     def _angles(self, s: Array) -> Array:
-        """Return the angles of the sine map at s."""
+        """Return the angles of the sine map of the mapped variables at s (free,)."""
         return self.angle + (self.unit * s)[self.mapped] / (
             self.half * np.cos(self.angle)
         )
@@ -210,23 +264,28 @@ class _ScaledMerit:
         slopes[self.mapped] = np.cos(self._angles(s)) / np.cos(self.angle)
         return slopes
 
-    def evaluate_at(self, s: Array) -> tuple[Array, float, Array]:
-        """Return z (variables,), m and ∇m (variables,) at s (free,); a repeated call with the same
-        s does not evaluate again.
+    def evaluate_at(self, s: Array) -> _MeritEvaluation:
+        """Return the merit function at s (free,); a call with the same s as the last one does not
+        evaluate again.
         """
         if self._last is None or not np.array_equal(self._last[0], s):
             z = self.to_variables(s)
-            self._last = (s.copy(), z, *self.merit.value_and_gradient(z))
-        return self._last[1:]
+            value, gradient = self.merit.value_and_gradient(z)
+            point = _MeritEvaluation(z, value, gradient=gradient)
+            self._last = s.copy(), point
+        return self._last[1]
 
     def value(self, s: Array) -> float:
-        """Return the merit function m at the variables s."""
+        """Return the merit function m at s (free,), without its gradient; infinite if an element is
+        inverted.
+        """
         return self.merit.value(self.to_variables(s))
 
     def value_and_gradient(self, s: Array) -> tuple[float, Array]:
         """Return m and ∂m/∂s (free,) at s."""
-        _, value, gradient = self.evaluate_at(s)
-        return value, gradient[self.free] * self.unit * self._slopes(s)
+        point = self.evaluate_at(s)
+        scale = self.unit * self._slopes(s)
+        return point.value, point.gradient[self.free] * scale
 
     def finite_value_and_gradient(self, s: Array) -> tuple[float, Array]:
         """Return m and ∂m/∂s (free,) at s; `replacement_value` and zeros if the merit is
@@ -240,8 +299,9 @@ class _ScaledMerit:
         )
 
     def project_gradient(self, s: Array, z: Array, gradient: Array) -> Array:
-        """Return ∂m/∂z (variables,) with zeros at active bounds; derivatives by mapped variables
-        decrease towards their bounds.
+        """Return ∂m/∂z (variables,) at s (free,) and its z, from the `gradient` there, with zeros
+        at active bounds; derivatives by mapped variables are multiplied by the slope of the map, at
+        most 1, so that they decrease towards the bounds.
         """
         projected = self.merit.problem.project_gradient(z, gradient)
         projected[self.free] *= np.minimum(np.abs(self._slopes(s)), 1.0)

@@ -164,7 +164,7 @@ class _MeritPoint:
         The Jacobian of the point that was evaluated before is overwritten.
         """
         rows, jacobian = merit.problem.constraints_and_jacobian(z)
-        gradient = merit.gradient(z, rows, jacobian)
+        gradient = merit.gradient(z, rows, jacobian=jacobian)
         projected = merit.problem.project_gradient(z, gradient)
         return cls(
             z,
@@ -203,7 +203,7 @@ def _quadratic_model(
         else np.zeros_like(point.rows)
     )
     with merit.problem.stopwatch.evaluating():
-        hessian = merit.problem.nlp.hessian(point.z, 1.0, weights)
+        hessian = merit.problem.nlp.hessian(point.z, 1.0, multipliers=weights)
     return _QuadraticModel(
         merit.problem,
         point.z,
@@ -220,8 +220,23 @@ def _quadratic_model(
 class _QuadraticModel:
     """Quadratic model of a merit function at z.
 
-    `order` is an empty list until the order of the band's columns is computed; it is shared by all
-    models.
+    Attributes
+    ----------
+    problem : PenaltyProblem
+    z : (variables,) array
+    rho : float
+        Penalty parameter ρ.
+    jacobian : sparse array (constraints, variables)
+        ∂g/∂z; it must not be overwritten while the model is used.
+    hessian : sparse array (variables, variables)
+        Hessian H of the loss or of the Lagrangian.
+    gradient : (variables,) array
+        ∂m/∂z.
+    exact : bool
+        Whether H is that of the Lagrangian.
+    order : list of int array
+        Order of the band's columns, shared by all models: empty until the first model computes and
+        appends it.
     """
 
     problem: PenaltyProblem
@@ -242,8 +257,8 @@ class _QuadraticModel:
         return -float(self.gradient @ step) - curvature / 2
 
     def step(self, damping: float) -> Array | None:
-        """Return the damped step (variables,); None if the damped matrix is not positive
-        definite.
+        """Return the damped step (variables,), within the bounds of the parameters and zero for
+        constant variables; None if the damped matrix is not positive definite.
         """
         with self.problem.stopwatch.solving(), one_blas_thread():
             return self._step(damping)

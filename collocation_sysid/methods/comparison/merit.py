@@ -75,14 +75,18 @@ class PenaltyProblem:
         self.parameter_indices: Index = np.flatnonzero(of_p & self.is_free)
 
     def constraints_and_jacobian(self, z: Array) -> tuple[Array, sp.csc_array]:
-        """Return g (constraints,) and ∂g/∂z; the matrix is overwritten by the next call."""
+        """Return g (constraints,) and ∂g/∂z at z (variables,); the matrix is overwritten by the
+        next call, which counts in `evaluations`.
+        """
         self.evaluations += 1
         with self.stopwatch.evaluating():
             rows, _ = self.nlp.constraints_and_jacobian(z, self._entries)
         return rows, self._jacobian
 
     def constraint_values(self, z: Array) -> Array:
-        """Return the scaled constraints g (constraints,)."""
+        """Return the scaled constraints g (constraints,) at z (variables,); the call counts in
+        `evaluations`.
+        """
         self.evaluations += 1
         with self.stopwatch.evaluating():
             return self.nlp.constraint_values(z)
@@ -101,16 +105,18 @@ class PenaltyProblem:
         return True
 
     def project_gradient(self, z: Array, slope: Array) -> Array:
-        """Return a gradient (variables,) with zeros for constant variables and at active bounds."""
+        """Return a gradient (variables,) at z with zeros for constant variables, and at bounds
+        across which the objective would decrease; the given gradient is unchanged.
+        """
         slope = np.where(self.is_free, slope, 0.0)
         slope[(z <= self.lower) & (slope > 0)] = 0
         slope[(z >= self.upper) & (slope < 0)] = 0
         return slope
 
-    # Answering for the collocation given ------------------------------------------------------
+    # Conversion to and from the given problem -------------------------------------------------
 
     def from_original(self, z: Array) -> Array:
-        """Return variables from those of the given problem."""
+        """Return the variables of `nlp` from those of the given problem."""
         return convert_variables(z, self.original, target=self.nlp)
 
     def to_original(self, z: Array) -> Array:
@@ -132,7 +138,9 @@ class PenaltyProblem:
         )
 
     def to_original_multipliers(self, multipliers: Array) -> Array:
-        """Return multipliers of the given problem from those of all constraints (constraints,)."""
+        """Return multipliers of the given problem from those of all constraints (constraints,);
+        those of prescribed displacements are left out if the given problem has no such constraints.
+        """
         pairs = zip(
             self.original.transcriptions, self.nlp.transcriptions, strict=True
         )
@@ -182,12 +190,12 @@ class MeritFunction:
             return np.inf, np.full(len(z), np.nan)
         rows, jacobian = self.problem.constraints_and_jacobian(z)
         return self.value_from_constraints(z, rows), self.gradient(
-            z, rows, jacobian
+            z, rows, jacobian=jacobian
         )
 
     def gradient(self, z: Array, rows: Array, jacobian: sp.csc_array) -> Array:
-        """Return ∇m (variables,) from the constraints g (`rows`) and their Jacobian at z, zero for
-        constant variables.
+        """Return ∇m (variables,) at z from the constraints g (`rows`) and `jacobian`, ∂g/∂z, there;
+        zero for constant variables.
         """
         slope = self.problem.nlp.gradient(
             z

@@ -144,6 +144,7 @@ class PenaltyOptions(Options):
     max_time_s: Positive = 1e6
 
     def __post_init__(self) -> None:
+        """Raise an `InputError` if an option is invalid, or the last ρ is below the first."""
         super().__post_init__()
         if self.last_rho < self.rho:
             finding = f"found {self.rho_max:g} with rho = {self.rho:g}"
@@ -157,7 +158,8 @@ class PenaltyOptions(Options):
         watch: Watch | None = None,
         start: Array | None = None,
     ) -> Solution:
-        """Solve the NLP, see `Method`; entries of the history count inner iterations.
+        """Solve the NLP from `start`, by default from a simulation at the guess; see `Method`.
+        Entries of the history, with which `watch` is called, count inner iterations.
 
         Grasped nodes of the solution have their prescribed positions, where its violation is
         evaluated.
@@ -179,12 +181,12 @@ class PenaltyOptions(Options):
 
     @property
     def last_rho(self) -> float:
-        """Largest ρ of the solve."""
+        """Largest ρ of the solve, `rho_max`."""
         return self.rho_max
 
     @property
     def first_gradient(self) -> float:
-        """Tolerance of the first stage."""
+        """Tolerance of the first stage: largest entry of the merit's projected gradient."""
         return self.tolerance
 
     def next_stage(
@@ -230,14 +232,14 @@ class Penalty(PenaltyOptions):
 
     @property
     def last_rho(self) -> float:
-        """Largest ρ of the solve."""
+        """Largest ρ of the solve: `rho` for a constant schedule, else `rho_max`."""
         return self.rho if self.schedule == "constant" else self.rho_max
 
     def next_stage(
-        self, stage: Stage, before: ConstraintViolation, z: Array
+        self, stage: Stage, previous_violation: ConstraintViolation, z: Array
     ) -> Stage:
-        """Return the next stage, with a larger ρ if the schedule says so; see
-        `PenaltyOptions.next_stage` for the arguments.
+        """Return the next stage, with a larger ρ if an increase is due by the schedule, or the
+        stage reached its minimum; see `PenaltyOptions.next_stage` for the arguments.
 
         Raises
         ------
@@ -247,7 +249,7 @@ class Penalty(PenaltyOptions):
         rho = stage.merit.rho
         is_increase_due = (
             self.schedule != "progress"
-            or stage.violation.relative > FALL * before.relative
+            or stage.violation.relative > FALL * previous_violation.relative
         )
         if is_increase_due and rho >= self.last_rho:
             if stage.is_minimum:
@@ -274,11 +276,11 @@ class AugmentedLagrangian(PenaltyOptions):
 
     @property
     def first_gradient(self) -> float:
-        """Tolerance of the first stage."""
+        """Tolerance of the first stage: `FIRST_GRADIENT`, or that of the last if it is larger."""
         return max(FIRST_GRADIENT, self.tolerance)
 
     def next_stage(
-        self, stage: Stage, before: ConstraintViolation, z: Array
+        self, stage: Stage, previous_violation: ConstraintViolation, z: Array
     ) -> Stage:
         """Return the next stage with updated multipliers, and a larger ρ if much violation remains;
         see `PenaltyOptions.next_stage` for the arguments.
@@ -296,7 +298,7 @@ class AugmentedLagrangian(PenaltyOptions):
         if (
             is_last
             and tolerance <= self.tolerance
-            and slack.scaled > STUCK * before.scaled
+            and slack.scaled > STUCK * previous_violation.scaled
         ):
             if stage.is_minimum:
                 raise SearchEnded(
@@ -309,7 +311,7 @@ class AugmentedLagrangian(PenaltyOptions):
                 f"The last stage ended with a gradient of {stage.gradient:.2g}, above its "
                 f"tolerance {tolerance:.2g}; another inner solver may get farther.",
             )
-        if not is_feasible and slack.scaled > FALL * before.scaled:
+        if not is_feasible and slack.scaled > FALL * previous_violation.scaled:
             rho = min(self.rho_factor * rho, self.rho_max)
         rows = stage.merit.problem.constraint_values(z)
         merit = replace(
@@ -324,8 +326,31 @@ class AugmentedLagrangian(PenaltyOptions):
 
 
 class _PenaltySolve:
-    """State of a solve in stages: last iterate, which is the best as the merit decreases,
-    and counts.
+    """State of a solve in stages: last iterate, which is the best as the merit decreases, and
+    counts.
+
+    Parameters
+    ----------
+    options : PenaltyOptions
+    recorder : Recorder
+    start : (variables,) array or None
+        Initial variables of the given problem; None for a simulation at the guess.
+
+    Attributes
+    ----------
+    variables : (variables,) array
+        Last iterate of `problem`, within its bounds.
+    stage : Stage
+        Present stage.
+    iterations : int
+        Number of inner iterations of all stages.
+    gradient : float
+        Largest entry of the projected gradient at the last iterate.
+
+    Raises
+    ------
+    InputError
+        If elements are inverted at the start.
     """
 
     def __init__(
@@ -346,7 +371,9 @@ class _PenaltySolve:
         self.stage = Stage(merit, options.first_gradient)
         self.iterations = 0
         self.gradient = np.inf
-        curvature = nlp.hessian(self.variables, 1.0, no_weights).diagonal()
+        curvature = nlp.hessian(
+            self.variables, 1.0, multipliers=no_weights
+        ).diagonal()
         self._curvature = float(curvature.max(initial=0.0))
         self._every = (
             EVERY_OF_FIRST_ORDER if options.inner in FIRST_ORDER else EVERY
@@ -361,7 +388,7 @@ class _PenaltySolve:
             If no further progress is possible or a limit is reached.
         """
         options = self.options
-        before = ConstraintViolation()
+        previous_violation = ConstraintViolation()
         while True:
             ended_stage = self._minimise()
             is_feasible = ended_stage.violation.relative <= options.violation
@@ -374,11 +401,15 @@ class _PenaltySolve:
                     "Converged: gradient and slack are within their tolerances."
                 )
                 return Status.CONVERGED, message
-            self.stage = options.next_stage(ended_stage, before, self.variables)
-            before = ended_stage.violation
+            self.stage = options.next_stage(
+                ended_stage, previous_violation, z=self.variables
+            )
+            previous_violation = ended_stage.violation
 
     def solution(self, status: Status, reason: str) -> Solution:
-        """Return the last iterate as a solution of the given problem."""
+        """Return the last iterate as a solution of the given problem; `reason` is the first
+        sentence of its message.
+        """
         merit = self.stage.merit
         estimate = merit.multiplier_estimate(
             self.problem.constraint_values(self.variables)
@@ -387,10 +418,10 @@ class _PenaltySolve:
             status,
             f"{reason} Remaining violation of the equations of motion at ρ = {merit.rho:.3g}: "
             f"{self._violation()}.",
-            self.problem.to_original(self.variables),
-            self.problem.to_original_multipliers(estimate),
-            self.iterations,
-            self.problem.evaluations,
+            z=self.problem.to_original(self.variables),
+            multipliers=self.problem.to_original_multipliers(estimate),
+            iterations=self.iterations,
+            evaluations=self.problem.evaluations,
         )
 
     def _minimise(self) -> Stage:
@@ -417,7 +448,9 @@ class _PenaltySolve:
         done = 0
 
         def report(z: Array, value: float, projected: Array) -> None:
-            """Store an iterate, add it to the history now and then, and check the limits."""
+            """Store an iterate z with its projected gradient, add it to the history now and then,
+            and check the limits; its merit `value` is not used.
+            """
             nonlocal done
             self.variables = z
             self.gradient = float(np.abs(projected).max(initial=0.0))
@@ -456,12 +489,12 @@ class _PenaltySolve:
         nlp = self.problem.original
         z = self.problem.to_original(self.variables)
         self.recorder.add_variables(
-            self.iterations, z, nlp.objective(z) / nlp.loss_scale
+            self.iterations, z, loss=nlp.objective(z) / nlp.loss_scale
         )
 
     def _violation(self) -> ConstraintViolation:
-        """Return the violation at the last iterate, with grasped nodes at their prescribed
-        positions.
+        """Return the violation at the last iterate: residuals [N] with grasped nodes at their
+        prescribed positions, and constraints without this change.
         """
         nlp = self.problem.original
         z = self.problem.to_original(self.variables)

@@ -73,11 +73,11 @@ class Shooting(Options):
         watch: Watch | None = None,
         start: Array | None = None,
     ) -> Solution:
-        """Solve the NLP, see `Method`; entries of the history are simulations better than all
-        before.
+        """Solve the NLP, see `Method`; entries of the history, with which `watch` is called, are
+        simulations better than all before.
 
-        Only the parameters of `start` are used. If their simulation fails, the status says so and
-        the positions are those of a rigid motion with the grasp.
+        Only the parameters of `start` are used, by default the guess. If their simulation fails,
+        the status says so and the positions are those of a rigid motion with the grasp.
         """
         recorder = Recorder(
             self.name, collocation, watch=watch, max_time_s=self.max_time_s
@@ -97,7 +97,14 @@ class Shooting(Options):
             recorder.notes.append(
                 f"{failed}; each time the search continued with a shorter step"
             )
-        return recorder.solution(status, message, z, multipliers, shots, shots)
+        return recorder.solution(
+            status,
+            message,
+            z=z,
+            multipliers=multipliers,
+            iterations=shots,
+            evaluations=shots,
+        )
 
 
 def simulate_variables(
@@ -155,6 +162,12 @@ class _SimulatedPoint:
 
     Attributes
     ----------
+    p : (np,) array
+        Parameters (q, φ).
+    z : (variables,) array
+        Variables with the simulated positions.
+    objective : float
+        Loss L in the scaling of the NLP.
     residual : (m,) array
         Residuals in standard deviations; empty with adjoint gradients.
     slope : array
@@ -254,13 +267,19 @@ class _ShootingSearch:
         )
 
     def _residual_slope(self, step: Array) -> Array:
-        """Return the derivatives of the residuals after a step from the first parameters."""
+        """Return the derivatives (m, np) of the residuals after a step (np,) from the first
+        parameters, at which the simulation must succeed.
+        """
         shot = self._try(self.first + step)
         assert shot is not None  # SciPy asks where the residuals were finite
         return shot.slope
 
     def _quasi_newton(self) -> tuple[Status, str]:
-        """Minimise by SciPy's L-BFGS-B; return the status and a sentence with SciPy's message."""
+        """Minimise by SciPy's L-BFGS-B; return the status and a sentence with SciPy's message.
+
+        Without success by SciPy's criteria the status is acceptable if the projected gradient is
+        within `LEAST_GRADIENT_TOLERANCE`, and stalled otherwise.
+        """
         result = minimize(
             self._objective,
             self.first,
@@ -289,8 +308,11 @@ class _ShootingSearch:
         return status, f"{status.sentence} (SciPy: {result.message})"
 
     def _objective(self, p: Array) -> tuple[float, Array]:
-        """Return the objective and its gradient at p; those of a steep parabola if the
-        simulation fails.
+        """Return the objective and its gradient (np,) at p.
+
+        If the simulation fails they are those of a parabola along the step from the best
+        simulation, above the best objective and with its minimum at a quarter of the step, so that
+        the line search returns there.
         """
         shot = self._try(p)
         if shot is not None:
@@ -371,6 +393,8 @@ class _ShootingSearch:
         if self.best is None or shot.objective < self.best.objective:
             self.best = shot
             self.recorder.add_variables(
-                self.simulations, z, shot.objective / collocation.loss_scale
+                self.simulations,
+                z,
+                loss=shot.objective / collocation.loss_scale,
             )
         return shot

@@ -101,12 +101,14 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
 
 
 def _header_counts(content: bytes) -> tuple[int, int | None]:
-    """Return the numbers of points and frames in the header; None frames if the counter overflowed.
+    """Return the numbers of points and frames in the header; None for the frames if their counter
+    overflowed.
 
     Raises
     ------
     InputError
-        If the file is shorter than these numbers require: ezc3d would silently return the rest.
+        If the header is incomplete or states no points or frames, or the file is shorter than these
+        numbers require: ezc3d would silently return the rest.
     """
     start = _BLOCK * (content[0] - 1)
     if len(content) < max(start + 4, _BLOCK):
@@ -119,7 +121,8 @@ def _header_counts(content: bytes) -> tuple[int, int | None]:
     frames = last - first + 1
     (scale,) = struct.unpack_from(f"{order}f", content, 12)
     (data_block,) = struct.unpack_from(f"{order}H", content, 16)
-    # A negative scale says floats, else integers; DEC has its sign elsewhere, so take the least.
+    # A negative scale means floats, else integers; DEC stores the sign elsewhere, so the smaller
+    # size is assumed.
     width = 4 if scale < 0 and processor != _DEC else 2
     size = _BLOCK * (data_block - 1) + frames * (4 * points + analog) * width
     if len(content) < size:

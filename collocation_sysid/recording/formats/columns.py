@@ -144,7 +144,7 @@ _NAMED = re.compile(
 )
 # Strains and stresses of the deformed specimen, which neither its length nor its area multiplies.
 _DEFORMED = {"true", "wahre", "cauchy", "logarithmic"}
-# Words of a name by what they make of a quantity: it is another one with them.
+# Words in the name of a column that distinguish quantities with the same other words, by key.
 QUALIFIERS = {
     "deformed": _DEFORMED,
     "second": {"second", "zweite"},
@@ -229,7 +229,7 @@ def read_columns(
     return QuantityTable(grid, t_s, values=values)
 
 
-# Which column -------------------------------------------------------------------------------------
+# Choice of columns --------------------------------------------------------------------------------
 
 
 def _find_columns(
@@ -314,12 +314,12 @@ def find_column(
     grid: TextTable, quantity: Quantity
 ) -> tuple[int, float] | None:
     """Return index and factor to SI of the column whose name and unit fit a quantity; None if no
-    name fits.
+    name fits. Of several columns with a fitting name, those with another unit are ignored.
 
     Raises
     ------
     InputError
-        If several columns fit, or a name fits but its unit does not.
+        If several columns fit, or names fit but no unit does.
     """
     units = {
         k: name_and_unit(column)[1]
@@ -351,8 +351,9 @@ def find_column(
 
 
 def _name_fits(column: str, quantity: Quantity) -> bool:
-    """Return whether the name of a column, without its unit, is the key of a quantity or contains
-    one of its words; columns of deformed sizes (true stress) never fit by a word.
+    """Return whether the name of a column, without its unit, is the key of a quantity, or contains
+    one of its words and exactly the quantity's qualifier: "true stress" fits `TRUE_STRESS`, not
+    `STRESS`.
     """
     name, _ = name_and_unit(column)
     words = _words(name)
@@ -364,7 +365,7 @@ def _name_fits(column: str, quantity: Quantity) -> bool:
 
 def name_and_unit(column: str) -> tuple[str, str | None]:
     """Return the parts of a column's name: ("Load", "kN") of "Load (kN)"; the unit is None without
-    one.
+    one, or if the brackets are empty.
     """
     parts = _NAMED.fullmatch(column)
     if parts is None:
@@ -373,11 +374,11 @@ def name_and_unit(column: str) -> tuple[str, str | None]:
 
 
 def _words(name: str) -> set[str]:
-    """Return the lower-case words of a name."""
+    """Return the words of a name in lower case: its longest sequences of letters."""
     return set(re.findall(r"[^\W\d_]+", name.lower()))
 
 
-# Refusals -----------------------------------------------------------------------------------------
+# Errors -------------------------------------------------------------------------------------------
 
 
 def _require_known_columns(
@@ -436,7 +437,7 @@ def _unit_error(
     grid: TextTable, column: str, unit: str | None, quantity: Quantity
 ) -> InputError:
     """Return the error for a column without a unit (`unit` is None), or with a unit of another
-    dimension.
+    dimension than `quantity` has.
     """
     has = f"has the unit {unit}" if unit else "names no unit"
     remedy = f"call it {quantity.column}, or {column.split('_')[0]} ({quantity.unit})"

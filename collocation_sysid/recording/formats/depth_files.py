@@ -76,8 +76,17 @@ class DepthFileContent:
 
 @dataclass(frozen=True, eq=False)
 class _LazyImages(Sequence[Array]):
-    """Images of messages, decoded when they are accessed, as all of them may not fit into
+    """Images [m] of messages, decoded when they are accessed, as all of them may not fit into
     memory.
+
+    Attributes
+    ----------
+    messages : sequence
+        Image messages.
+    count_m : float or None
+        Depth of one count of an integer image; None for a millimetre.
+    path : Path
+        File, for messages.
     """
 
     messages: Sequence[Any]
@@ -88,6 +97,9 @@ class _LazyImages(Sequence[Array]):
         return len(self.messages)
 
     def __getitem__(self, place: Any) -> Any:
+        """Return the image (rows, columns) [m] at an index, not a slice; an `InputError` if it
+        cannot be decoded.
+        """
         with located(self.path):
             return _in_metres(decode_image(self.messages[place]), self.count_m)
 
@@ -103,17 +115,20 @@ def read_depth(
     Parameters
     ----------
     path : Path
+        A path with `#` and a topic behind that of a log, see `TopicAddress`.
     count_m : float, optional
-        Depth of one count of an integer image; by default as stated in the file, or a millimetre.
+        Depth of one count of an integer image; by default a millimetre. Archives (.npz) state their
+        own.
     length_m : float
-        Unit of clouds.
+        Unit of clouds [m]; those of archives (.npz) are in metres.
     known_camera_fields : container of str
         "matrix" and "distortion" if they are known otherwise; they are then not read from a log.
 
     Raises
     ------
     InputError
-        If it is none of these, is damaged, or a package that reads it is missing.
+        If it is none of these, is damaged, contains a length above `LARGEST_LENGTH_M`, or a package
+        that reads it is missing.
     """
     if (address := TopicAddress.from_path(path)) is not None:
         with located(path):
@@ -200,7 +215,7 @@ def _read_topic(
             for each in messages
         ]
         return DepthFileContent([], clouds, t_s=t_s)
-    images = _LazyImages(messages, count_m, path)
+    images = _LazyImages(messages, count_m, path=path)
     matrix = None
     distortion = None
     if camera is not None:
@@ -218,8 +233,8 @@ def _read_topic(
 
 
 def _camera_of_topic(log: Log, topic: str) -> tuple[str, Any] | None:
-    """Return topic and first message of the camera_info in a topic's namespace or above; None
-    without it.
+    """Return topic and first message of the nearest camera_info in a topic's namespace or above;
+    None without it, or if the message is no camera model.
     """
     above = [str(each) for each in PurePosixPath(topic).parents]
     names = [f"{each.rstrip('/')}/{CAMERA}" for each in above]
@@ -284,12 +299,12 @@ def _read_folder(
 
 def _in_metres(image: Array, count_m: float | None) -> Array:
     """Return depths [m] of an image (rows, columns) of integer counts, each `count_m` [m] or a
-    millimetre if None, or of floats in metres.
+    millimetre if None, or of floats in metres; 0 and NaN stay.
 
     Raises
     ------
     InputError
-        If the image has several channels.
+        If the image has several channels, or a float is beyond `LARGEST_LENGTH_M`.
     """
     if image.ndim != 2:
         raise InputError(
@@ -303,12 +318,8 @@ def _in_metres(image: Array, count_m: float | None) -> Array:
 
 
 def _require_possible_lengths(values_m: Array) -> None:
-    """Refuse lengths [m] beyond `LARGEST_LENGTH_M`; values that are not finite are not compared.
-
-    Raises
-    ------
-    InputError
-        With the largest length, which no camera can have measured.
+    """Raise an `InputError` if a length [m] is beyond `LARGEST_LENGTH_M` in magnitude, which no
+    camera can have measured; values that are not finite are not compared.
     """
     largest_m = np.max(
         np.abs(values_m), initial=0.0, where=np.isfinite(values_m)
@@ -329,11 +340,13 @@ def _scaled_cloud(points: Array, path: Path, length_m: float) -> Array:
         Points in the unit `length_m` [m].
     path : Path
         File, for messages.
+    length_m : float
+        Factor from the unit of the points to metres.
 
     Raises
     ------
     InputError
-        For another shape.
+        For another shape, or a length beyond `LARGEST_LENGTH_M`.
     """
     with np.errstate(
         invalid="ignore"
@@ -393,7 +406,9 @@ def _read_npz(path: Path) -> DepthFileContent:
 
 @contextmanager
 def _standard_error_silenced() -> Iterator[None]:
-    """Discard what compiled code writes to the standard error of this process."""
+    """Discard what compiled code writes to the standard error of this process in a ``with`` block;
+    do nothing if it is closed.
+    """
     try:
         saved_descriptor = os.dup(2)
     except OSError:  # it is closed
@@ -409,13 +424,13 @@ def _standard_error_silenced() -> Iterator[None]:
 
 
 def _read_exr(path: Path) -> Array:
-    """Read the depths (rows, columns) [m] of an OpenEXR image: the channel Z, R, Y or V, else the
-    first.
+    """Read the depths (rows, columns) of an OpenEXR image in its own unit: the channel Z, else R,
+    else Y, else V, else the first.
 
     Raises
     ------
     InputError
-        If the package OpenEXR is not installed.
+        If the package OpenEXR is not installed. Exceptions of the package are not converted.
     """
     try:
         library = import_module("OpenEXR")
@@ -451,7 +466,9 @@ def _points_from_columns(columns: Mapping[str, Array]) -> Array:
 
 
 def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
-    """Append the columns of normals to points (P, 3), if there are any."""
+    """Return points (P, 3) with the columns of normals appended (P, 6), or unchanged if there are
+    none.
+    """
     for names in NORMALS:
         if set(names) <= set(columns):
             return np.column_stack([points, *(columns[name] for name in names)])
@@ -459,12 +476,13 @@ def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
 
 
 def _read_pcd(path: Path) -> Array:
-    """Read the points (P, 3) or (P, 6) of a PCD file, ascii or binary.
+    """Read the points (P, 3) or (P, 6) of a PCD file, ascii or binary, in its own unit.
 
     Raises
     ------
     InputError
-        If the file has no header, is compressed, or lacks a coordinate.
+        If the file has no header, is compressed, or lacks a coordinate. Other damage raises
+        exceptions of Python and NumPy.
     """
     raw = path.read_bytes()
     head = dict[str, list[str]]()

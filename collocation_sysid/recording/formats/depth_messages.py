@@ -53,7 +53,9 @@ def depth_kind(message: Any) -> str:
 
 
 def is_camera_model(message: Any) -> bool:
-    """Return whether a message holds a camera model."""
+    """Return whether a message holds a camera model: fields k (of 9 numbers), p and d; false for
+    None.
+    """
     return (
         all(_field(message, name) is not None for name in "kpd")
         and len(_field(message, "k")) == 9
@@ -69,7 +71,8 @@ def camera_matrix(
     ----------
     message : message
     rectified : bool
-        Whether the images are rectified; then the projection matrix is taken.
+        Whether the images are rectified; then the matrix is that of the projection p, unless p is
+        missing or zero.
     shape : (int, int)
         Rows and columns of the images.
 
@@ -96,7 +99,8 @@ def camera_matrix(
 
 
 def distortion_coefficients(message: Any, rectified: bool) -> Array:
-    """Return the distortion coefficients of the camera model; empty for rectified images.
+    """Return the distortion coefficients of the camera model; empty for rectified images, or if all
+    are zero.
 
     Raises
     ------
@@ -126,10 +130,13 @@ def decode_image(message: Any) -> Any:
     """Return the pixels (rows, columns) of an image message: integer counts of a depth unit, or
     floats in metres.
 
+    The message must be one for which `depth_kind` is an image.
+
     Raises
     ------
     InputError
-        If a compressed image cannot be decoded.
+        If a compressed image cannot be decoded, or the message has another number of bytes than its
+        size states.
     """
     if not hasattr(message, "encoding"):
         return _decode_compressed(str(message.format), _message_data(message))
@@ -139,7 +146,8 @@ def decode_image(message: Any) -> Any:
 
 
 def _decode_compressed(kind: str, data: bytes) -> Any:
-    """Return the pixels of a compressed image: counts, or metres for compressed 32FC1.
+    """Return the pixels of a compressed image: counts, or metres for compressed 32FC1, NaN where
+    there is no depth.
 
     Parameters
     ----------
@@ -150,7 +158,7 @@ def _decode_compressed(kind: str, data: bytes) -> Any:
     Raises
     ------
     InputError
-        If it is no PNG.
+        If it is no PNG of 16 bits.
     """
     packed = "compressedDepth" in kind
     try:

@@ -57,8 +57,8 @@ class TopicAddress:
 
     @classmethod
     def from_path(cls, path: str | Path) -> TopicAddress | None:
-        """Return the address that a path states; None for the path of an existing file or without a
-        log.
+        """Return the address that a path states, ``LOG#TOPIC`` and further parts behind a ``#``
+        each; None for a path without ``#``, of an existing file, or whose log does not exist.
 
         Raises
         ------
@@ -89,7 +89,10 @@ class TopicAddress:
 
 
 def stored_files(path: str | Path) -> list[Path]:
-    """Return the files on disk that a path refers to: those of the log if it names a topic."""
+    """Return the files on disk that a path refers to: those of the log, also within its folder, if
+    the path names a topic; else the file itself. Empty for other folders and for what does not
+    exist.
+    """
     address = TopicAddress.from_path(path)
     place = Path(path) if address is None else address.log
     if address is not None and place.is_dir():
@@ -115,19 +118,21 @@ class Log(Protocol):
     unit: str | None
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yield the time of recording [ns] and the message, whose fields are attributes."""
+        """Yield the time of recording [ns] and the message, whose fields are attributes, of each
+        message of a topic.
+        """
         ...
 
 
 @contextmanager
 def open_log(path: Path, episode: int | None = None) -> Iterator[Log]:
-    """Open a log, whose format is recognised by its content, for a ``with`` block.
+    """Open a log, whose format is recognised by its ending and its files, for a ``with`` block.
 
     Parameters
     ----------
     path : Path
     episode : int, optional
-        Episode of a dataset; the only one by default.
+        Episode of a dataset, from 0; the only one by default. Ignored for other logs.
 
     Raises
     ------
@@ -169,7 +174,9 @@ def require_topic(log: Log, topic: str) -> None:
 
 
 def require_packages(*modules: str) -> None:
-    """Raise an `InputError` with installation instructions if a package is missing."""
+    """Raise an `InputError` with installation instructions if a package is missing; packages are
+    not imported.
+    """
     for module in modules:
         if find_spec(module) is None:
             raise InputError(_NEEDS.format(module))
@@ -185,11 +192,12 @@ class _Bag:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
 
-        # Older bags do not hold what their messages are made of.
+        # Older bags do not contain the definitions of their messages.
         store = get_typestore(Stores.ROS2_HUMBLE)
         self._reader = AnyReader([path], default_typestore=store)
 
     def __enter__(self) -> Log:
+        """Open the bag; return self, with topics and start."""
         self._reader.open()
         self.topics = {
             name: (str(info.msgtype), info.msgcount)
@@ -199,9 +207,11 @@ class _Bag:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Close the bag."""
         self._reader.close()
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Yield time of recording [ns] and message, see `Log.messages`."""
         chosen = [
             each for each in self._reader.connections if each.topic == topic
         ]
@@ -219,6 +229,9 @@ class _Mcap:
         self._path = path
 
     def __enter__(self) -> Log:
+        """Open the file; return self, with topics and start. Raise an `InputError` if it has no
+        summary.
+        """
         from mcap.reader import make_reader
         from mcap_protobuf.decoder import DecoderFactory as Protobuf
         from mcap_ros2.decoder import DecoderFactory as Ros2
@@ -242,9 +255,11 @@ class _Mcap:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Close the file."""
         self._file.close()
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Yield time of recording [ns] and message, see `Log.messages`."""
         for _, _, message, content in self._reader.iter_decoded_messages(
             topics=[topic]
         ):
@@ -255,6 +270,9 @@ class _Json:
     """Decodes JSON messages of MCAP files."""
 
     def decoder_for(self, message_encoding: str, schema: Any) -> Any:
+        """Return the function that decodes a message to objects with attributes; None for another
+        encoding than "json". The schema is not used.
+        """
         if message_encoding != "json":
             return None
         return partial(
@@ -281,10 +299,13 @@ class _Dataset:
     episode: int | None = None
     topics: dict[str, tuple[str, int]] = field(default_factory=dict)
     start_ns: int = 0
-    unit: str | None = None  # what a robot's makers chose
+    unit: str | None = None  # not prescribed by the format
     names: dict[str, list[str]] = field(default_factory=dict)
 
     def __enter__(self) -> Log:
+        """Read the names of the features; return self. Features that are indices or not numbers,
+        and the timestamp, are no topics.
+        """
         require_packages("pyarrow")
         info = json.loads(
             (self.path / "meta" / "info.json").read_text(encoding="utf-8")
@@ -300,9 +321,18 @@ class _Dataset:
         self.topics.pop("timestamp", None)
         return self
 
-    def __exit__(self, *_: object) -> None: ...
+    def __exit__(self, *_: object) -> None:
+        """Do nothing: no file is open."""
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Yield time [ns] and values of each frame of the episode, as objects with `name` and
+        `position` like joint states.
+
+        Raises
+        ------
+        InputError
+            If no episode is stated and there are several, or the episode does not exist.
+        """
         from pyarrow import dataset
 
         if self.episode is None and self._episodes > 1:
@@ -331,7 +361,10 @@ class _Dataset:
 
 
 def _component_names(feature: Any, name: str) -> list[str]:
-    """Return the names of the numbers of a feature; older datasets nest them in a dictionary."""
+    """Return the names of the numbers of a feature; older datasets nest them in a dictionary.
+
+    Without one name for each number they are `name`, or, of several numbers, `name` with _0, _1, ….
+    """
     names = feature.get("names")
     while isinstance(names, dict):
         names = next(iter(names.values()), None)

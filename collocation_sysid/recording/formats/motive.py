@@ -32,12 +32,14 @@ class _MarkerColumns:
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
     """Read a Motive CSV file; `choose` returns the indices of the markers to read from their
-    labels.
+    labels, with those that begin with "Unlabeled" excluded. A note names each marker that was not
+    measured but fitted by Motive.
 
     Raises
     ------
     InputError
-        If the text is no such file, or a cell is not a number.
+        If the text is no such file, a cell is not a number, or the number of frames differs from
+        the header's.
     """
     rows = separated_rows(text, ",")
     first = rows[0]
@@ -65,7 +67,9 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
         f"{name} {quantity} {axis}".strip() for _, name, quantity, axis in heads
     ]
     table = table_of_rows(titles, rows[top + 1 :])
-    header.require_count("Total Exported Frames", len(table.rows), "frames")
+    header.require_count(
+        "Total Exported Frames", len(table.rows), what="frames"
+    )
     rate_key = next((key for key in _RATES if header.number(key)), _RATES[0])
     (unit, _) = header.entries.get("Length Units", ("", 0))
     raw = tracks_of_table(
@@ -94,9 +98,11 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
 def _column_headings(
     above: Sequence[Row], axes: Row
 ) -> list[tuple[str, str, str, str]]:
-    """Return type, name, quantity and axis of every column.
+    """Return type, name, quantity and axis of every column, from the rows of the header `above` and
+    the row of the axes.
 
-    Older files do not label the rows of the header; the first two are then types and names.
+    Older files do not label the rows of the header; the first two are then types and names. The
+    quantities are in the last one. Missing cells are blank.
     """
     width = len(axes.cells)
     padded = [(row.cells + [""] * width)[:width] for row in above]
@@ -109,13 +115,20 @@ def _column_headings(
 def _marker_columns(
     heads: Sequence[tuple[str, str, str, str]], line: int
 ) -> dict[str, _MarkerColumns]:
-    """Return the columns of every marker by its name; measured columns have priority over fitted
-    ones.
+    """Return the columns of every marker by its name, in the order of the columns; measured columns
+    have priority over fitted ones.
+
+    Parameters
+    ----------
+    heads : sequence of (str, str, str, str)
+        Type, name, quantity and axis of every column.
+    line : int
+        Line of the axes, for messages.
 
     Raises
     ------
     InputError
-        If two markers have one name, or a marker lacks an axis.
+        If two markers of one type have one name, or a marker lacks an axis.
     """
     by_kind: dict[tuple[str, str], dict[str, int]] = {}
     for column, (kind, name, quantity, axis) in enumerate(heads):

@@ -19,7 +19,15 @@ from .units import METRES_PER_UNIT
 
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
-    """Read a plain CSV file, wide or long; `choose` picks the markers."""
+    """Read a plain CSV file, wide or long (with a column "marker"); `choose` returns the indices of
+    the markers to read from their labels.
+
+    Raises
+    ------
+    InputError
+        If columns are missing or unknown, a cell is neither blank nor a number, or time does not
+        increase.
+    """
     table = read_table(text)
     return (_read_long if "marker" in table.columns else _read_wide)(
         table, choose
@@ -27,8 +35,9 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
 
 
 def _read_wide(table: TextTable, choose: LabelChooser) -> RawTracks:
-    """Read a table with three columns for each marker; `choose` returns the indices of the markers
-    to read from their labels.
+    """Read a table with three columns for each marker, in metres unless the user states another
+    unit; `choose` returns the indices of the markers to read from their labels. Errors as of
+    `_wide_labels` and `tracks_of_table`.
     """
     labels = _wide_labels(table)
     place = {column: k for k, column in enumerate(table.columns)}
@@ -45,7 +54,7 @@ def _read_wide(table: TextTable, choose: LabelChooser) -> RawTracks:
 
 
 def _wide_labels(table: TextTable) -> list[str]:
-    """Names of the markers in the file, in the order of their first columns.
+    """Return the names of the markers in the file, in the order of their first columns.
 
     Raises
     ------
@@ -90,10 +99,13 @@ def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
     """Read a table with one row for each marker and time; `choose` returns the indices of the
     markers to read from their labels.
 
+    The times of the result are those of all rows, sorted. Only rows of chosen markers are checked.
+
     Raises
     ------
     InputError
-        If a name is blank, a column is missing, or the times of a marker do not increase.
+        If a name is blank, a column is missing, a cell is not a number, or the times of a marker do
+        not increase.
     """
     axes, unit = _long_columns(table)
     of_row = [row.cells[table.columns.index("marker")] for row in table.rows]

@@ -37,7 +37,7 @@ def read_columns(path: Path) -> Mapping[str, Array]:
     Raises
     ------
     InputError
-        If the file is damaged. The path is not named.
+        If the file is damaged; the path is not always named.
     """
     content = path.read_bytes()
     columns = _plain_columns(content)
@@ -56,7 +56,14 @@ def read_columns(path: Path) -> Mapping[str, Array]:
 
 
 def _plain_columns(content: bytes) -> Mapping[str, Array] | None:
-    """Columns of a file whose first element is `vertex` with numbers only; None for any other."""
+    """Return the columns (P,) by name of a file whose first element is `vertex` with numbers only;
+    None for any other.
+
+    Raises
+    ------
+    InputError
+        If the file has fewer points than its header states.
+    """
     header, end, body = content[:LONGEST_HEADER].partition(b"end_header\n")
     lines = [
         line.split() for line in header.decode("ascii", "replace").splitlines()
@@ -111,6 +118,7 @@ def _plain_columns(content: bytes) -> Mapping[str, Array] | None:
 
 
 def _refuse_short(expected: int, count: int) -> None:
+    """Raise an `InputError` that a file has `count` points instead of the `expected` ones."""
     raise InputError(
         f"has {count} points; expected {expected}, as its header states: is the file truncated?"
     )

@@ -18,12 +18,13 @@ _KEY = re.compile(r"(?!NAN$)[A-Z][A-Z0-9_]*")
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
     """Read a Qualisys TSV file; `choose` returns the indices of the markers to read from their
-    labels.
+    labels. The result has no unit, and times only if the file has them.
 
     Raises
     ------
     InputError
-        If the text is no such file, or a cell is not a number.
+        If the text is no such file, a cell is not a number, or numbers of frames or markers differ
+        from the header's.
     """
     rows = tab_rows(text)
     count = next(
@@ -40,7 +41,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
         key: ("".join(row.cells[1:2]), row.line) for key, row in above.items()
     }
     header = Header(header_values)
-    header.require_count("NO_OF_MARKERS", len(labels), "marker names")
+    header.require_count("NO_OF_MARKERS", len(labels), what="marker names")
     frames = rows[count:]
     leading = _leading_columns(frames, 3 * len(labels))
     if frames and _has_column_names(frames[0]):
@@ -58,7 +59,9 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
 
 
 def _has_column_names(row: Row) -> bool:
-    """Return whether a row holds column names instead of numbers."""
+    """Return whether a row holds column names instead of numbers: one of its first three cells
+    begins with a letter and is not "nan".
+    """
     return any(
         re.match(r"[A-Za-z]", cell) and cell.lower() != "nan"
         for cell in row.cells[:3]

@@ -87,14 +87,20 @@ def tracks_of_table(
     ----------
     table : TextTable
     labels : sequence of str
+        Labels of all markers of the table.
     coordinate_columns : sequence of (int, int, int)
         Indices of the columns of x, y and z, by marker.
     chosen : sequence of int
-        Indices of the markers to read.
+        Indices of the markers to read; cells of others are not read.
     time : int or None
-        Index of the column of times, if there is one.
+        Index of the column of times [s], if there is one.
     **fields
         Further fields of `RawTracks`.
+
+    Raises
+    ------
+    InputError
+        If a cell of a chosen marker is neither blank nor a number, or time does not increase.
     """
     cells = numeric_cells(
         table,
@@ -126,7 +132,7 @@ class Header:
         Raises
         ------
         InputError
-            If it is no number above 0.
+            If it is no finite number above 0.
         """
         text, line = self.entries.get(key, ("", 0))
         if not text:
@@ -200,7 +206,7 @@ def tracks_of_frames(
         [*leading, *(f"{label} {axis}" for label in labels for axis in "XYZ")],
         frames,
     )
-    header.require_count(count_key, len(frames), "frames")
+    header.require_count(count_key, len(frames), what="frames")
     places = [
         range(k, k + 3) for k in range(len(leading), len(table.columns), 3)
     ]

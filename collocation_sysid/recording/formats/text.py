@@ -58,8 +58,8 @@ class TextTable:
     names_line: int = 1
 
     def error_at(self, message: str, row: int | None = None) -> InputError:
-        """Return an `InputError` about a row, by its index, or about the column names if `row` is
-        None.
+        """Return an `InputError` about a row, by its index from 0, or about the column names if
+        `row` is None; the error names the line.
         """
         line = self.names_line if row is None else self.rows[row].line
         return InputError(message, where=f"line {line}")
@@ -74,6 +74,7 @@ def names_file_in_errors(
 
     @wraps(read)
     def reader(path: Any, *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call the reader; its `InputError`s name `path`."""
         with located(path):
             return read(path, *args, **kwargs)
 
@@ -86,7 +87,7 @@ def read_bytes(path: str | Path) -> bytes:
     Raises
     ------
     InputError
-        If it cannot be read.
+        If it cannot be read; see `topic_as_csv` for topics. The path is not named.
     """
     if (address := TopicAddress.from_path(path)) is not None:
         return topic_as_csv(address)
@@ -98,12 +99,12 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def decode(content: bytes) -> str:
-    """Decode text in UTF-8, UTF-16 with a byte order mark, or Windows-1252.
+    """Return the text of bytes in UTF-8, UTF-16 with a byte order mark, or Windows-1252.
 
     Raises
     ------
     InputError
-        If it is empty, or not text.
+        If it is empty or blank, or not text.
     """
     text = next(
         filter(None, (_decoded(content, encoding) for encoding in _ENCODINGS)),
@@ -119,7 +120,11 @@ def decode(content: bytes) -> str:
 
 
 def _decoded(content: bytes, encoding: str) -> str | None:
-    """Decode text in an encoding; None if it is not text in that encoding."""
+    """Return the text of bytes in an encoding; None if it is not text in that encoding.
+
+    Text with a NUL character is none. Other encodings than UTF-8, which decode anything, must also
+    have a separator of cells and no control characters; UTF-16 needs a byte order mark.
+    """
     if encoding == "utf-16" and not content.startswith(
         (b"\xff\xfe", b"\xfe\xff")
     ):
@@ -186,7 +191,9 @@ def separated_rows(text: str, separator: str | None = None) -> list[Row]:
 
 
 def tab_rows(text: str) -> list[Row]:
-    """Rows of a tab-separated file; lines without any character are skipped."""
+    """Return the rows of a tab-separated file, with stripped cells; lines without any character are
+    skipped.
+    """
     lines = enumerate(re.split("\r\n|\r|\n", text), start=1)
     return [
         Row(k, [cell.strip() for cell in line.split("\t")])
@@ -262,7 +269,9 @@ def read_table(text: str) -> TextTable:
 
 
 def _is_unit(cell: str) -> bool:
-    """Return whether a cell may be a unit: blank, in brackets, or a known unit."""
+    """Return whether a cell may be a unit: blank, in round or square brackets, or a known unit of
+    any dimension.
+    """
     bare = cell.strip("()[]")
     bracketed = cell in (f"({bare})", f"[{bare}]")
     return (
@@ -286,12 +295,13 @@ def numeric_cells(
     columns : sequence of int
         Indices of the columns.
     blank_allowed : bool
-        Whether cells may be blank.
+        Whether cells may be blank; "nan" counts as blank.
 
     Raises
     ------
     InputError
-        If a cell is not a finite number; its line and column are named.
+        If a cell is not a number up to `LARGEST_NUMBER` in magnitude; its line and column are
+        named.
     """
     values = np.empty((len(grid.rows), len(columns)))
     for i, row in enumerate(grid.rows):
@@ -317,7 +327,7 @@ def numeric_cells(
 
 
 def times_in_column(grid: TextTable, column: int, factor: float = 1.0) -> Array:
-    """Return the times (rows,) in a column.
+    """Return the times (rows,) [s] in a column.
 
     Parameters
     ----------
@@ -330,7 +340,7 @@ def times_in_column(grid: TextTable, column: int, factor: float = 1.0) -> Array:
     Raises
     ------
     InputError
-        If a cell is not a number, or time does not increase; the line is named.
+        If a cell is blank or not a number, or time does not increase; the line is named.
     """
     t_s = factor * numeric_cells(grid, [column], blank_allowed=False)[:, 0]
     if fault := first_unordered_time(t_s):
@@ -339,12 +349,14 @@ def times_in_column(grid: TextTable, column: int, factor: float = 1.0) -> Array:
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell is a plain number."""
+    """Return whether a cell is a plain number: digits with a sign, decimal point and exponent; not
+    "nan", "inf" or blank.
+    """
     return _NUMBER.fullmatch(cell) is not None
 
 
 def number_from_text(text: str) -> float:
-    """Return the number in a text.
+    """Return the number in a text; "nan" and "inf" are accepted.
 
     Raises
     ------

@@ -91,7 +91,7 @@ class LogTopic:
 
 
 def list_topics(path: str | Path) -> list[LogTopic]:
-    """Return the topics of a log.
+    """Return the topics of a log; of a dataset, with the rates of its episode 0.
 
     Raises
     ------
@@ -106,13 +106,15 @@ def list_topics(path: str | Path) -> list[LogTopic]:
 
 def topic_as_csv(address: TopicAddress) -> bytes:
     """Return the content of a CSV file equivalent to a topic; times count from the log's first
-    message.
+    message, see `measurement_time_s`.
+
+    Numbers that a message does not have are blank cells.
 
     Raises
     ------
     InputError
-        If the topic does not exist or holds no known data, or if frames or a robot's description
-        are needed and missing.
+        If the topic does not exist, has no messages, holds depth data or no known data, or if
+        frames or a robot's description are needed and missing.
     """
     with open_log(address.log, address.episode) as log:
         require_topic(log, address.topic)
@@ -242,8 +244,8 @@ def _possible_uses(columns: set[str], message: Any) -> str:
 def sort_by_time(
     messages: list[tuple[int, Any]], start_ns: int
 ) -> tuple[Array, list[Any]]:
-    """Return the times (S,) [s] of messages, and the messages in this order; duplicates in time are
-    cut.
+    """Return the times (S,) [s] of messages, ascending, and the messages in this order; of messages
+    with the same time the first is kept.
 
     Parameters
     ----------
@@ -263,9 +265,11 @@ def sort_by_time(
 
 
 def measurement_time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
-    """Return the time of measurement of a message [s], or of its recording if it has no stamp.
+    """Return the time of measurement of a message [s], or of its recording if it has no stamp or
+    the stamp is zero.
 
-    The time counts from the log's first message, or is absolute if the stamp is of another clock.
+    The time counts from the log's first message; it is absolute if the stamp differs by more than
+    `SAME_CLOCK_NS` from the recording, as it is then of another clock.
 
     Parameters
     ----------
@@ -292,7 +296,7 @@ def measurement_time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
 
 def _nanoseconds(stamp: Any) -> int:
     """Return a stamp of seconds and nanoseconds, under any of the usual field names, in
-    nanoseconds.
+    nanoseconds; a missing field counts as 0.
     """
     counted = {
         10**9: ("sec", "seconds", "secs"),
@@ -315,8 +319,8 @@ def _nanoseconds(stamp: Any) -> int:
 
 
 def _message_values(message: Any, *, by_namespace: bool) -> Row:
-    """Return the numbers of a message by their columns: a wrench, joint positions, a pose, points,
-    or other numbers; empty if it has none.
+    """Return the numbers of a message by their columns, of the first kind that it has: a wrench,
+    joint positions, a pose, points, a single number or a list of numbers; empty if it has none.
 
     With `by_namespace` the names of markers begin with their namespace.
     """
@@ -351,7 +355,9 @@ def _message_values(message: Any, *, by_namespace: bool) -> Row:
 
 
 def _pose_of_message(message: Any) -> tuple[float, ...] | None:
-    """Return position and quaternion (x, y, z, w) of a message; None if it has no pose."""
+    """Return position (x, y, z) and quaternion (x, y, z, w) of a message, in the first fields of
+    `_POSES` that it has; None if it has no quaternion.
+    """
     for position, rotation in _POSES:
         if hasattr(turned := _nested_field(message, rotation), "w"):
             return (
@@ -365,8 +371,10 @@ def _pose_of_message(message: Any) -> tuple[float, ...] | None:
 def _points_of_message(
     message: Any, *, by_namespace: bool
 ) -> dict[str, tuple[float, ...]]:
-    """Return positions by name: of a single point, or of the items of the first list that has
-    some.
+    """Return positions (x, y, z) by name: of a single point, or of those items of the first list
+    that have a position; empty if there are none.
+
+    A single point is named by its frame, else "point"; for items see `_item_name`.
     """
     if _is_vector(one := _nested_field(message, "point")):
         return {
@@ -381,7 +389,7 @@ def _points_of_message(
 
 
 def _first_list(message: Any) -> Any:
-    """Return the first list in a message whose items may have positions; empty if there is none."""
+    """Return the first list of `_LISTS` in a message that is not empty; empty if there is none."""
     lists = (_nested_field(message, name) for name in _LISTS)
     return next((each for each in lists if each is not None and len(each)), ())
 
@@ -401,7 +409,9 @@ def _position_of_item(item: Any) -> tuple[float, ...] | None:
 
 
 def _item_name(item: Any, index: int, *, by_namespace: bool) -> str:
-    """Return the name of an item of a list; its number, counted from 1, if it has none."""
+    """Return the name of an item of a list; its number, `index` + 1, if it has none. With
+    `by_namespace` its namespace and a slash are put before it, if it has one.
+    """
     names = (_nested_field(item, name) for name in _NAMES)
     name = str(
         next((name for name in names if name not in (None, "")), index + 1)
@@ -431,7 +441,9 @@ def has_namespaces(messages: Iterable[Any]) -> bool:
 
 
 def _nested_field(message: Any, path: str) -> Any:
-    """Return the nested field at a dotted path; None if it does not exist."""
+    """Return the nested field at a path of names with dots between them; None
+    if it does not exist.
+    """
     for name in path.split("."):
         message = getattr(message, name, None)
     return message
@@ -451,7 +463,9 @@ def _vector(value: Any) -> tuple[float, ...]:
 
 
 def _is_transforms(message: Any) -> bool:
-    """Return whether a message places one frame in another."""
+    """Return whether a message places frames in others: it has a list of transforms, or is a
+    transform itself.
+    """
     return (
         _nested_field(message, "transforms") is not None
         or _transform_frames(message) is not None
@@ -459,7 +473,9 @@ def _is_transforms(message: Any) -> bool:
 
 
 def _transform_frames(transform: Any) -> tuple[str, str] | None:
-    """Return the parent and the child frame of a transform; None if the message is no transform."""
+    """Return the parent and the child frame of a transform, without a leading slash; None if the
+    message is no transform. Odometry, which has a twist, is none.
+    """
     child = _nested_field(transform, "child_frame_id")
     parent = _nested_field(transform, "parent_frame_id") or _nested_field(
         transform, "header.frame_id"
@@ -476,9 +492,10 @@ def _transform_frames(transform: Any) -> tuple[str, str] | None:
 def _poses_of_transforms(
     messages: Iterable[tuple[int, Any]], start_ns: int
 ) -> Edges:
-    """Return poses of child frames in their parents, by (parent, child) and time [s].
+    """Return poses of child frames in their parents, by (parent, child) and time [s], from messages
+    with their times of recording [ns]; times count from `start_ns` [ns].
 
-    Of several poses at a time the first is kept.
+    Of several poses at a time the first is kept; messages without transforms are ignored.
     """
     edges: Edges = {}
     for at_ns, message in messages:
@@ -498,6 +515,8 @@ def _all_transforms(
 ) -> Edges:
     """Return the poses of a topic's transforms `moving` and of the fixed transforms in its static
     topic, which have the time 0, by (parent, child) and time [s].
+
+    Of a pair of frames in both topics the moving transforms are kept.
     """
     still = (
         log.messages(topic + STATIC_TOPIC_SUFFIX)
@@ -514,7 +533,8 @@ def _all_transforms(
 def moving_chains(edges: Edges) -> list[tuple[str, str]]:
     """Return pairs of a root frame and each frame that moves in it; leaf frames come first.
 
-    A root is a frame that has no parent.
+    A root is a frame that has no parent. A frame moves if an edge between it and the root has
+    several poses.
     """
     above = {child: parent for parent, child in edges}
     moving = {child for (_, child), poses in edges.items() if len(poses) > 1}
@@ -604,7 +624,7 @@ def _requested_frames(
     Raises
     ------
     InputError
-        If a frame does not exist, or none are stated and there are several transforms.
+        If a frame does not exist, or none are stated and there is more than one transform.
     """
     frames = list(dict.fromkeys(frame for edge in edges for frame in edge))
     if address.frames is None:
@@ -626,16 +646,17 @@ def _frame_path(
     edges: Mapping[tuple[str, str], Any], parent: str, child: str
 ) -> list[tuple[str, str]]:
     """Return the edges (parent, child) on the path from one frame through the common ancestor to
-    the other.
+    the other, those above `child` first.
 
     Raises
     ------
     InputError
-        If the frames are not connected.
+        If the frames are not connected, or are the same.
     """
     above = {child: (parent, child) for parent, child in edges}
 
     def up(frame: str) -> list[tuple[str, str]]:
+        """Return the edges from a frame to its root, or to a repeated edge in a loop."""
         passed: list[tuple[str, str]] = []
         while frame in above and above[frame] not in passed:
             passed.append(above[frame])
@@ -659,17 +680,25 @@ def _frame_path(
 def _poses_from_joints(
     columns: list[str], values: Array, address: TopicAddress, unit: str | None
 ) -> Array:
-    """Return poses (T, 7) of a robot's link from joint positions (T, joints), by its URDF file.
+    """Return poses (T, 7) of a robot's link from joint positions (T, joints), by its URDF file:
+    position [m], then quaternion (x, y, z, w).
 
     Parameters
     ----------
     columns : list of str
-        Names of the joints.
+        Names of the joints; those that the robot does not have are ignored.
     values : (T, joints) array
         Positions; angles in `unit`, displacements in metres.
     address : TopicAddress
+        States the URDF file, and the two links.
     unit : {"rad", "deg"} or None
         None raises an `InputError`.
+
+    Raises
+    ------
+    InputError
+        If the file is no URDF, a link or all joints are missing, frames or unit are not stated, or
+        a joint is beyond its limits.
     """
     require_packages("pytransform3d")
     from pytransform3d.transformations import pq_from_transform
@@ -735,7 +764,10 @@ def _has_joint(robot: Any, name: str) -> bool:
 def _require_joint_limits(
     name: str, angle: float, limits: tuple[float, float], address: TopicAddress
 ) -> None:
-    """Raise an `InputError` if a joint is beyond its limits: the library would silently clip it."""
+    """Raise an `InputError` if a joint is at an angle or displacement beyond its limits [rad or m]
+    by more than `JOINT_LIMIT_SLACK`: the library would silently clip it. The message names the
+    robot of `address`.
+    """
     if (
         not limits[0] - JOINT_LIMIT_SLACK
         <= angle
@@ -753,7 +785,9 @@ def _require_joint_limits(
 
 
 def _csv_content(columns: Any, t_s: Array, values: Array) -> bytes:
-    """Return a table as CSV text; NaN becomes a blank cell."""
+    """Return times (T,) and values (T, columns) as the bytes of a CSV file with a row of names; NaN
+    becomes a blank cell.
+    """
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("t_s", *columns))

@@ -17,11 +17,13 @@ _KEYS = ("DataRate", "NumFrames", "NumMarkers", "Units")
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
     """Read a TRC file; `choose` returns the indices of the markers to read from their labels.
+    Samples at (0, 0, 0) count as missing.
 
     Raises
     ------
     InputError
-        If the text is no such file, or a cell is not a number.
+        If the text is no such file, a cell is not a number, or numbers of frames or markers differ
+        from the header's.
     """
     rows = [row for row in tab_rows(text) if any(row.cells)]
     if len(rows) < 5:
@@ -48,7 +50,9 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
             "names of the markers, and X1, Y1, Z1 … below them",
             where=f"line {names.line}",
         )
-    header.require_count("NumMarkers", len(labels), "marker names", names.line)
+    header.require_count(
+        "NumMarkers", len(labels), what="marker names", line=names.line
+    )
     return tracks_of_frames(
         header,
         "NumFrames",

@@ -6,8 +6,8 @@ from ...errors import InputError
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 
-# What a unit is times SI, by what is measured. Letters may be small, as in fz_kn, but where that
-# would be another unit.
+# Factors from units to SI, by dimension. A unit may be written in lower case, as in fz_kn, unless
+# that is another unit.
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "min": 60.0},
     "length": {**METRES_PER_UNIT, "µm": 1e-6, "um": 1e-6, '"': 0.0254},
@@ -55,6 +55,9 @@ _SPELLINGS = {word: unit for unit, words in _WORDS.items() for word in words}
 def si_factor(unit_text: str, dimension: str) -> float | None:
     """Return the factor from a unit to SI; None if it is no unit of that dimension, a key of
     `UNITS`.
+
+    Blanks, "·" and "*" in the unit are ignored. Capitals matter only where they distinguish two
+    units, such as "MN" and "mn" or "mPa" and "mpa".
     """
     bare = (
         unit_text.replace("·", "")
@@ -69,7 +72,9 @@ def si_factor(unit_text: str, dimension: str) -> float | None:
 
 
 def expected_units(unit: str, dimension: str) -> str:
-    """Return the expected units of a dimension as text, for messages about another unit."""
+    """Return the expected units of a dimension as text, for messages about another unit; where a
+    force is meant and `unit` is one of mass, the text says so.
+    """
     mass = dimension == "force" and unit.lower() in _MASSES
     return f"{'a unit of force, ' if mass else ''}one of {', '.join(UNITS[dimension])}"
 
