@@ -22,7 +22,7 @@ class Topic:
     Attributes
     ----------
     title : str
-        Title.
+        Title of the topic for headings.
     page : str
         Topic of the page with more information, see `pages`.
     remedy : str
@@ -439,8 +439,23 @@ TOPICS: Mapping[str, Topic] = {
 def message_of(code: str, data: Mapping[str, Any]) -> str:
     """Return the message of a code with its data.
 
-    If the data contain "of", the message begins with that subject; if they contain "nearer", the
-    factor by which the misfit decreases is appended.
+    If the data contain a non-empty "of", the message begins with that subject; only then, and if
+    they
+    contain "nearer", the factor by which the misfit decreases is appended. Lists and tuples are
+    joined to
+    a phrase; data without a placeholder are ignored.
+
+    Parameters
+    ----------
+    code : str
+        Topic and the rest of the code, such as "noise/larger".
+    data : mapping of str to value
+        Values of the placeholders.
+
+    Raises
+    ------
+    KeyError
+        If the code is unknown or a placeholder has no value.
     """
     topic, _, rest = code.partition("/")
     shown = {
@@ -467,7 +482,7 @@ class Concern:
     code : str
         Topic and kind, such as "noise/larger"; stable when messages are reworded.
     grade : {"check", "doubtful"}
-        Severity.
+        Severity: "doubtful" is graver.
     data : mapping of str to value
         Values of the placeholders in the message.
     """
@@ -501,5 +516,5 @@ def concern_if(
 
 
 def topics_of(concerns: Iterable[Concern]) -> dict[str, Topic]:
-    """Return the topics of several concerns by key, each once."""
+    """Return the topics of several concerns by key, each once, in the order of their first concern."""
     return {concern.topic: TOPICS[concern.topic] for concern in concerns}

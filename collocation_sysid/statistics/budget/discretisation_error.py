@@ -76,7 +76,9 @@ class DiscretisationError:
 
 
 def known_kinds(errors: Iterable[DiscretisationError]) -> tuple[str, ...]:
-    """Return which discretisation errors are known for some estimate: "step", "mesh"."""
+    """Return which discretisation errors are known for at least one estimate: "step", "mesh", both
+    in this order, or none.
+    """
     known = tuple(errors)
     of_step = any(error.step is not None for error in known)
     of_mesh = any(error.mesh is not None for error in known)
@@ -149,6 +151,13 @@ class Refinement:
         std_errors : mapping of str to float or None, optional
             Standard errors to compare with; the statistical ones of `estimates` by default.
             Estimates without one are left out.
+
+        Returns
+        -------
+        (str, float)
+            Name, and the absolute correction over the standard error. Of equal ratios the first in
+            `errors` counts. An error whose
+            name is missing in `std_errors`, or has None or 0 there, is left out.
         """
         if std_errors is None:
             std_errors = {
@@ -177,6 +186,11 @@ class Refinement:
             Estimates before the correction.
         order : float
             Order of the scheme.
+
+        Notes
+        -----
+        Small means at most `LITTLE` statistical standard errors. Without a correction the number is
+        1.
         """
         many = self.largest_correction(estimates)[1]
         return max(1, ceil(min((many / LITTLE) ** (1 / order), MOST_SUBSTEPS)))
@@ -271,6 +285,13 @@ def discretisation_error(
         Order of the scheme.
     linear : bool
         Whether the parameter is its own coordinate.
+
+    Notes
+    -----
+    The order of the mesh is `MESH_ORDER`. All values are compared in one coordinate, which is
+    linear if any of them is not
+    positive. `step` and `mesh` of the result are the changes of the value itself with the first
+    halving.
     """
     known = (
         estimate.value,
@@ -344,14 +365,15 @@ def discretisation_errors(
 def change_in_observations(
     fit: LinearisedFit, residual_changes: Sequence[Array]
 ) -> Array:
-    """Return the change (p,) of the parameters, to first order, if the residuals change.
+    """Return the change (p,) of all parameters, to first order, if the residuals change; parameters
+    at a bound do not change.
 
     Parameters
     ----------
     fit : LinearisedFit
         The fit.
     residual_changes : sequence of (T, M, 3) arrays
-        Changes of the residuals of each block, in units of σ.
+        Changes of the residuals of each block, in units of σ, without Huber's weights.
     """
     return estimate_changes(
         fit, [each[..., None] for each in residual_changes]
@@ -368,7 +390,7 @@ def estimate_changes(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
         The fit.
     changes : sequence of (T, M, 3, a) arrays
         Changes of the residuals of each block, in units of σ; where nothing is measured they are
-        ignored.
+        ignored. Huber's weights are applied here.
     """
     free = np.flatnonzero(~fit.at_bound)
     count = changes[0].shape[-1] if changes else 0
