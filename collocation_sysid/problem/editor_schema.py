@@ -37,6 +37,11 @@ def with_schema_reference(text: str, reference: str) -> str:
         A first line that names another schema is replaced.
     reference : str
         Address of the schema, or its path relative to the TOML file.
+
+    Returns
+    -------
+    str
+        The text with the first line ``#:schema REFERENCE`` inserted, or replaced.
     """
     first, newline, rest = text.partition("\n")
     body = rest if first.startswith(SCHEMA_DIRECTIVE) and newline else text

@@ -37,6 +37,7 @@ from ..recording import (
     read_poses,
     read_wrench,
 )
+from ..recording.alignment import AlignedRecording
 from ..recording.checked_arrays import point_text
 from ..recording.depth_camera import points_from_image, samples_with_outlines
 from ..recording.formats.depth_files import DepthFileContent, read_depth
@@ -118,20 +119,25 @@ class RecordingReader:
     say: Say | None = None
 
     def read(self) -> Experiment:
-        """Return the experiment.
+        """Read all files of the experiment and return it; notes are added to `notes`.
+
+        Unless the problem is simulated, markers that cannot belong to the body are refused, see
+        `require_plausible_markers`.
 
         Raises
         ------
         InputError
-            Names the file and line, or the key within the experiment's table.
+            Names the file and line, or the key within the experiment's table. Also if all nodes are
+            grasped, or if the problem exceeds this machine's memory.
         """
         section = self.section
-        t_s, poses, table = self._align(
+        aligned = self._align(
             [*map(self._poses, range(len(section.moved_sections)))]
         )
+        t_s = aligned.t_s
         grasps = [
             self._grasp(k, sequence, t_s=t_s)
-            for k, sequence in enumerate(poses)
+            for k, sequence in enumerate(aligned.poses)
         ]
         if len(prescribed_dofs(grasps)) == 3 * (n := len(self.body.nodes_m)):
             message = (
@@ -156,7 +162,7 @@ class RecordingReader:
                 for k, each in enumerate(section.reading)
             ],
             depths=[self._depth(k, t_s) for k in range(len(section.depth))],
-            markers=self._markers(t_s, table),
+            markers=self._markers(t_s, aligned.table),
             nuisance=nuisance_from_section(
                 section.nuisance, self.code.nuisance_row
             ),
@@ -176,7 +182,7 @@ class RecordingReader:
         return self.section.kind == "static"
 
     def _add_notes(self, *notes: str) -> None:
-        """Add notes, which begin with the experiment's name."""
+        """Add notes to `notes`, in place, each with the experiment's name in front."""
         self.notes += [
             f"experiment '{self.section.name}': {note}" for note in notes
         ]
@@ -184,7 +190,9 @@ class RecordingReader:
     # Files ----------------------------------------------------------------------------------------
 
     def _must_read(self, name: str | None) -> bool:
-        """Return whether a file must be read: in a solve always, in a simulation if it exists."""
+        """Whether a file must be read: in a solve always, also without a name (None); in a
+        simulation if it is named and exists.
+        """
         return not self.simulation or bool(
             name and stored_files(self.folder / name)
         )
@@ -192,14 +200,22 @@ class RecordingReader:
     def _require_existing(
         self, name: str | None, key: str, what: str = "a file"
     ) -> Path:
-        """Return the path of a file; raise `InputError` if none is named or it does not exist."""
+        """Return the path of a file; raise `InputError` at `key` if none is named (None) or it does
+        not exist. `what` is the expected kind of file, for the message.
+        """
         if name is None:
             raise InputError(f"missing; expected {what}", where=key)
         return existing_file(self.folder, name, key=key)
 
     def _table_file(self, table: TableSection, key: str) -> Path:
-        """Return the existing file of a displacement or a wrench: its own, else that of the
-        experiment; raise `InputError` at `key` if there is none.
+        """Return the path of the existing file of a displacement or a wrench: its own, else that of
+        the experiment.
+
+        Raises
+        ------
+        InputError
+            If there is none, or it does not exist: at `key`, or at "file" if the experiment's file
+            is meant.
         """
         key = "file" if table.file is None and self.section.file else key
         return self._require_existing(
@@ -218,6 +234,9 @@ class RecordingReader:
     def _grasp_key(self, k: int, key: str = "") -> str:
         """Return the key of the grasp or obstacle with index k for messages, followed by `key`
         unless that is empty.
+
+        The grasps have the first indices, from 0, the obstacles follow. A single grasp is "grasp"
+        without an index.
         """
         grasps = len(self.section.grasp_list)
         one = f"grasp.{k}" if grasps > 1 else "grasp"
@@ -225,10 +244,16 @@ class RecordingReader:
         return f"{one}.{key}" if key else one
 
     def _poses(self, k: int) -> PoseSequence:
-        """Return the poses of the grasp or obstacle with index k.
+        """Return the poses of the grasp or obstacle with index k (grasps first), at their own
+        times.
 
         They come from its markers, its displacement table or its file; without any of these they
-        are constant.
+        are constant. `gripper_to_body` and the interpolation of the section are applied.
+
+        Raises
+        ------
+        InputError
+            If a file is missing or unusable.
         """
         grasp = self.section.moved_sections[k]
         if grasp.markers is not None:
@@ -285,8 +310,23 @@ class RecordingReader:
         return poses
 
     def _grasp(self, k: int, poses: PoseSequence, t_s: Array) -> Grasp:
-        """Return the grasp or obstacle with index k, with its wrench within the times t_s; a grasp
-        is placed on the nodes of the body.
+        """Return the grasp or obstacle with index k (grasps first), with its wrench within the
+        times t_s.
+
+        A grasp is placed on the nodes of the body; obstacles without a name are numbered from 1.
+
+        Parameters
+        ----------
+        k : int
+        poses : PoseSequence
+            Its poses on the clock of the experiment.
+        t_s : (N,) array
+            Times of the experiment [s].
+
+        Raises
+        ------
+        InputError
+            If a file or key is invalid, or the grasp selects no nodes.
         """
         section = self.section.moved_sections[k]
         zero = ""
@@ -318,7 +358,9 @@ class RecordingReader:
     def _read_wrench(
         self, section: WrenchSection, key: str
     ) -> tuple[Array, Array]:
-        """Return times (S,) [s] and values (S, 6) of a wrench's file."""
+        """Return times (S,) [s] and values (S, 6) [N, N m] of a wrench's file, divided by the
+        section's `symmetry`; `key` is that of the section, for messages.
+        """
         file = self._table_file(section, f"{key}.file")
         layout = section.layout
         return read_wrench(
@@ -383,6 +425,12 @@ class RecordingReader:
         how many samples are used.
 
         If a simulation has no file, the values are None and the times are t_s.
+
+        Raises
+        ------
+        InputError
+            If the code may not be run, the file is missing in a solve or unusable, or there is no
+            such grasp.
         """
         key = f"reading.{k}"
         arguments: dict[str, Any] = {
@@ -454,7 +502,15 @@ class RecordingReader:
 
     def _depth(self, k: int, t_s: Array) -> Depth:
         """Return the measurements of the depth camera with index k within the times t_s of the
-        experiment [s].
+        experiment [s], and note how many images are used.
+
+        Images are converted to clouds of points. What the section states about the camera replaces
+        what the file contains.
+
+        Raises
+        ------
+        InputError
+            See `_depth_images`; also if the camera is incomplete or no image is within the times.
         """
         section = self.section.depth[k]
         where = f"depth.{k}"
@@ -714,12 +770,16 @@ class RecordingReader:
         names = tuple(table.names[k] for k in indices)
         return MarkerTable(table.t_s, names, table.positions_m[:, indices])
 
-    def _align(
-        self, poses: list[PoseSequence]
-    ) -> tuple[Array, tuple[PoseSequence, ...], MarkerTable]:
-        """Return times [s], poses and tracks on one clock and time grid, and add notes.
+    def _align(self, poses: list[PoseSequence]) -> AlignedRecording:
+        """Return times, poses and tracks on one clock and time grid, and add notes.
 
-        The window, `resample_hz` and `every` are applied.
+        The window, `resample_hz` and `every` are applied (not `every` in a simulation, whose files
+        have been thinned already).
+
+        Parameters
+        ----------
+        poses : list of PoseSequence
+            Poses of the grasps, then of the obstacles, at their own times.
 
         Raises
         ------
@@ -800,7 +860,7 @@ class RecordingReader:
                 "resample_hz is above the markers' own rate; interpolated samples are treated as "
                 "measured, so that error bars are too small"
             )
-        return aligned.t_s, aligned.poses, aligned.table
+        return aligned
 
     def _markers(self, t_s: Array, table: MarkerTable) -> Markers:
         """Return the markers at the times t_s; positions on the body are NaN where they are to be
@@ -855,7 +915,7 @@ def _by_marker(
     values: Mapping[str, float] | float, names: Sequence[str], default: float
 ) -> Array:
     """Return the values (M,) of the markers with these names: one number for all, or the number of
-    each name, `default` where the mapping has none.
+    each name, `default` where the mapping has none; entries of other names are ignored.
     """
     by_name = (
         values if isinstance(values, Mapping) else dict.fromkeys(names, values)
@@ -866,7 +926,9 @@ def _by_marker(
 def _require_known_markers(
     requested: Iterable[str], names: Sequence[str], key: str
 ) -> None:
-    """Raise `InputError` at `key` if a requested name is not among `names`."""
+    """Raise `InputError` at `key` for the first requested name that is not among `names`; without
+    requested names nothing is checked.
+    """
     present = set(names)
     for name in requested:
         if name not in present:
@@ -888,7 +950,7 @@ def require_plausible_markers(
     experiment : Experiment
         Experiment with markers.
     constants : mapping of str to float
-        Physical values by name, to find the likely cause.
+        Physical values by name, to find the likely cause, which the message then names.
     """
     if (message := _implausible_markers(experiment)) is None:
         return
@@ -940,5 +1002,5 @@ def _implausible_markers(experiment: Experiment) -> str | None:
 
 
 def _diagonal(points_m: Array) -> float:
-    """Return the diagonal [m] of the box that contains points (n, 3)."""
+    """Return the diagonal [m] of the box along the axes that contains points (n, 3), n ≥ 1."""
     return float(np.linalg.norm(np.ptp(points_m, axis=0)))

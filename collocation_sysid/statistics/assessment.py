@@ -159,8 +159,7 @@ def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
     """Return a concern for each likely misspecification, in the same order.
 
     It is "doubtful" if the misfit decreases by more than a factor of two (`CERTAIN`) without the
-    misspecification, else
-    "check"; its message begins with "likely: ". No hypothesis is left out.
+    misspecification, else "check"; its message begins with "likely: ". No hypothesis is left out.
     """
     return [
         replace(cause, subject=f"likely: {cause.subject}").concern(
@@ -175,15 +174,12 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     disagreement of recordings.
 
     Correlation counts only if the error bars use autocorrelated errors: "residuals/persist" in time
-    ("doubtful" if the
-    residuals are also more than `GROSS_MISFIT` times σ), else "residuals/shared". Residuals more
-    than `MISFIT` times σ are
-    "doubtful" above `GROSS_MISFIT` if they are also correlated, or if nothing is known about their
-    correlation in time.
-    Residuals less than 1/`MISFIT` of σ are "check" unless they are exactly zero or correlated. All
-    need significance at
-    `RARE`. One concern for each outlier, for noisy markers, and for parameters on which recordings
-    disagree is added.
+    ("doubtful" if the residuals are also more than `GROSS_MISFIT` times σ), else
+    "residuals/shared". Residuals more than `MISFIT` times σ are "doubtful" above `GROSS_MISFIT` if
+    they are also correlated, or if nothing is known about their correlation in time. Residuals less
+    than 1/`MISFIT` of σ are "check" unless they are exactly zero or correlated. All need
+    significance at `RARE`. One concern for each outlier, for noisy markers, and for parameters on
+    which recordings disagree is added.
 
     Parameters
     ----------
@@ -258,8 +254,8 @@ def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
     """Return one concern, as a list, if markers are much noisier than the others; else empty.
 
     Noisy are markers whose residuals exceed `MARKER_MISFIT` times the median of all markers, and
-    `MARKER_MISFIT` times σ. Nothing is
-    reported unless the test for unequal variances is significant at `RARE`.
+    `MARKER_MISFIT` times σ. Nothing is reported unless the test for unequal variances is
+    significant at `RARE`.
     """
     if not level.unequal_p < RARE:
         return []
@@ -286,9 +282,8 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     standard error.
 
     Several parameters at bounds are one concern, "doubtful"; a single one is "check". Parameters
-    without standard error are one
-    concern, "doubtful" if it is all of the estimated parameters, else "check". Mode coefficients of
-    fields do not count.
+    without standard error are one concern, "doubtful" if it is all of the estimated parameters,
+    else "check". Mode coefficients of fields do not count.
     """
     known = uncertainty.estimates
     estimates = {
@@ -369,8 +364,7 @@ def probe_concerns(
     estimates without it; empty if `is_alarming` is false for every probe.
 
     Other alarming assumptions, which explain the data less well, are named in the same concern,
-    because
-    relaxing one is mostly a substitute for relaxing another. The grade is "check".
+    because relaxing one is mostly a substitute for relaxing another. The grade is "check".
 
     Parameters
     ----------
@@ -409,9 +403,8 @@ def probe_concerns(
 
 def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
     """Return the estimate of a parameter by a probe that relaxes an assumption, multiplied by a
-    correction, as text.
-    The value is multiplied by the correction, the standard error is not; a parameter without an
-    estimate is "not determined".
+    correction, as text. The value is multiplied by the correction, the standard error is not; a
+    parameter without an estimate is "not determined".
     """
     move = probe.moves.get(name)
     if move is None:
@@ -459,9 +452,8 @@ def nuisance_concerns(
     Notes
     -----
     At a limit (within 0.001 standard deviations) the concern is "doubtful". Else it is "check"
-    beyond `LARGEST_OFFSET` standard
-    deviations, or more if there are many parameters (Bonferroni), and "doubtful" beyond `ABSURD`.
-    Limits may be infinite.
+    beyond `LARGEST_OFFSET` standard deviations, or more if there are many parameters (Bonferroni),
+    and "doubtful" beyond `ABSURD`. Limits may be infinite.
     """
     items = [*zip(names, deviations, low, high, strict=True)]
     limit = (
@@ -574,10 +566,8 @@ def forward_simulation_concerns(
     the fit; else empty.
 
     With the larger of `fit_rms_m` and `noise_rms_m` as unit: a fitted experiment is "check" where
-    √(rms² − fit²) exceeds
-    `ROLLOUT` and "doubtful" above `GROSS_ROLLOUT`; a prediction where `rms_m` exceeds `PREDICTION`
-    and
-    `GROSS_PREDICTION`.
+    √(rms² − fit²) exceeds `ROLLOUT` and "doubtful" above `GROSS_ROLLOUT`; a prediction where
+    `rms_m` exceeds `PREDICTION` and `GROSS_PREDICTION`.
 
     Parameters
     ----------
@@ -693,10 +683,9 @@ def contact_concerns(
     Notes
     -----
     An obstacle that is never touched is "doubtful" for an answer and "check" at the guess; all
-    others are "check". One concern is
-    returned for each code and name of an obstacle: that of the experiment with the fewest faces in
-    contact, with the number of
-    the other experiments in its message.
+    others are "check". One concern is returned for each code and name of an obstacle: that of the
+    experiment with the fewest faces in contact, with the number of the other experiments in its
+    message.
     """
     concerns: dict[tuple[str, str], list[Concern]] = {}
     for each in sorted(summaries, key=lambda touch: touch.face_count):
@@ -776,10 +765,8 @@ def scheme_concerns(
     one about damping and one about the period.
 
     Added damping is "check" above `DAMPING_SHARE` of the mode's and above `LITTLE_DAMPING`, and
-    "doubtful" above
-    `GROSS_DAMPING_SHARE`; negative added damping is no concern. A change of the period of either
-    sign is "check" above
-    `PERIOD_ERROR`, "doubtful" above `GROSS_PERIOD_ERROR`.
+    "doubtful" above `GROSS_DAMPING_SHARE`; negative added damping is no concern. A change of the
+    period of either sign is "check" above `PERIOD_ERROR`, "doubtful" above `GROSS_PERIOD_ERROR`.
 
     Parameters
     ----------

@@ -440,10 +440,8 @@ def message_of(code: str, data: Mapping[str, Any]) -> str:
     """Return the message of a code with its data.
 
     If the data contain a non-empty "of", the message begins with that subject; only then, and if
-    they
-    contain "nearer", the factor by which the misfit decreases is appended. Lists and tuples are
-    joined to
-    a phrase; data without a placeholder are ignored.
+    they contain "nearer", the factor by which the misfit decreases is appended. Lists and tuples
+    are joined to a phrase; data without a placeholder are ignored.
 
     Parameters
     ----------

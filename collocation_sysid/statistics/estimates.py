@@ -166,19 +166,15 @@ def user_estimates(
     -------
     dict of str to Estimate
         In the order of `Parameters.values`. Fixed parameters have their value alone; those tied to
-        another
-        its estimate times the ratio. An estimate has an interval but no standard error if the
-        interval
-        covers the range between its bounds, spans more than `WIDE_FACTOR` (of Poisson's ratio
-        `WIDE_POISSON`), or if the correlation with another parameter exceeds `CONFOUNDED` at a
-        relative
-        deviation above `CONFOUNDED_DEVIATION`.
+        another its estimate times the ratio. An estimate has an interval but no standard error if
+        the interval covers the range between its bounds, spans more than `WIDE_FACTOR` (of
+        Poisson's ratio `WIDE_POISSON`), or if the correlation with another parameter exceeds
+        `CONFOUNDED` at a relative deviation above `CONFOUNDED_DEVIATION`.
 
     Notes
     -----
     Infinite or NaN variances in `covariance_q` mean that the data do not determine the parameter.
-    The argument arrays are not
-    modified.
+    The argument arrays are not modified.
     """
     values = parameters.values(q).items()
     estimates = {
@@ -275,8 +271,7 @@ def derived_estimates(
     Notes
     -----
     A modulus that does not depend on q, or is not positive, has its value alone; others are taken
-    as log-normal, with the largest
-    quantile of the parameters that they depend on.
+    as log-normal, with the largest quantile of the parameters that they depend on.
     """
     estimates = {}
     for name, value in derived.values.items():
@@ -309,9 +304,8 @@ def _parameter_estimate(
     coordinate.
 
     Logarithmic parameters and positive Poisson's ratios are treated by `_logarithmic_estimate`.
-    Others have a
-    symmetric interval, cut off at the least value of the constant; with a deviation of q above
-    `UNDETERMINED`, or NaN, only a value and a reason.
+    Others have a symmetric interval, cut off at the least value of the constant; with a deviation
+    of q above `UNDETERMINED`, or NaN, only a value and a reason.
 
     Parameters
     ----------
@@ -381,8 +375,7 @@ def _logarithmic_estimate(
     """Return the estimate of a positive value from the standard deviation of its logarithm.
 
     For Poisson's ratio the interval is symmetric in ln ν/(½ − ν). An interval that is too wide
-    (`WIDE_FACTOR`,
-    `WIDE_POISSON`) remains, but there is no standard error.
+    (`WIDE_FACTOR`, `WIDE_POISSON`) remains, but there is no standard error.
 
     Parameters
     ----------
@@ -392,8 +385,7 @@ def _logarithmic_estimate(
         Estimated value, above 0.
     deviation : float
         Standard deviation of the logarithm; NaN or above `UNDETERMINED` if it is not determined,
-        and then
-        the estimate has neither interval nor standard error.
+        and then the estimate has neither interval nor standard error.
     quantile : float
         Half width of the interval in standard deviations.
     """
@@ -426,8 +418,7 @@ def parameter_notes(
     """Return notes on free parameters at a bound, not determined, or not identifiable.
 
     Notes on bounds and undetermined parameters come first, in the order of the parameters, then
-    those of
-    `_unidentifiable_notes`. Parameters without an entry in `estimates` are left out.
+    those of `_unidentifiable_notes`. Parameters without an entry in `estimates` are left out.
     """
     notes = []
     reasons = {}
@@ -468,8 +459,7 @@ def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:
     ----------
     reasons : mapping of str to str
         Reason by the name of each parameter without a standard error; "confounded with NAME " at
-        its
-        beginning names another parameter.
+        its beginning names another parameter.
     """
     notes = []
     mentioned = set()
@@ -497,8 +487,7 @@ def memory_notes(
     """Return notes on memory branches, at most one for each.
 
     A branch gets a note if its share ended at its bound zero, if the interval of the share contains
-    zero, or if its relaxation time
-    exceeds the longest recording.
+    zero, or if its relaxation time exceeds the longest recording.
 
     Parameters
     ----------
@@ -557,8 +546,7 @@ def noise_notes(
     -------
     list of str
         Empty, or one note. Empty if the noise was requested as "estimated", if tests find that the
-        residuals
-        agree with σ, or if they differ from it by less than a factor of `NOTEWORTHY`.
+        residuals agree with σ, or if they differ from it by less than a factor of `NOTEWORTHY`.
     """
     if requested == "estimated" or level.suggested_noise == "given":
         return []

@@ -268,8 +268,7 @@ class FieldEstimate:
         that the data contradict.
 
         The amplitude is reported if the best of `AMPLITUDES` is larger than the stated one and its
-        log-evidence ratio exceeds `LIKELIER`, the
-        length if that of half the length does.
+        log-evidence ratio exceeds `LIKELIER`, the length if that of half the length does.
         """
         if self.phases is not None:
             return phase_concerns(self.phases, self.name)
@@ -330,8 +329,7 @@ def field_estimates(
     Notes
     -----
     Parameters with a variance of NaN, such as those at a bound, count as known. The deviation
-    contains that of
-    the modes that are left out.
+    contains that of the modes that are left out.
     """
     size = len(q)
     names = [item.name for item in parameters.free]
@@ -403,10 +401,8 @@ def _with_phases(
     """Return the estimate of a two-phase field with intervals from its samples.
 
     Intervals are quantiles of the samples, widened to contain the value, so that an element at the
-    boundary has an interval from
-    one phase to the other. Without samples, or without error bars, the phases count as known, and
-    the estimate
-    is returned unchanged.
+    boundary has an interval from one phase to the other. Without samples, or without error bars,
+    the phases count as known, and the estimate is returned unchanged.
 
     Parameters
     ----------
@@ -551,8 +547,7 @@ def _mean_logarithm(
     Notes
     -----
     For a field of all moduli of a part the mean is Young's modulus, for other fields the first
-    constant that the field scales.
-    The ratio of a density that is not estimated is 1.
+    constant that the field scales. The ratio of a density that is not estimated is 1.
     """
     body = constants.body
     part = constants.body.parts[part_index]

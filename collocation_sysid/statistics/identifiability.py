@@ -37,10 +37,8 @@ def identifiability_sentences(uncertainty: Uncertainty) -> tuple[str, ...]:
     -------
     tuple of str
         First the determined parameters, then confounded combinations, then the moduli of the other
-        elastic convention
-        (only if a combination or one of the following is reported), then the notes of `uncertainty`
-        that begin with
-        a parameter's name. Empty if nothing can be said.
+        elastic convention (only if a combination or one of the following is reported), then the
+        notes of `uncertainty` that begin with a parameter's name. Empty if nothing can be said.
     """
     open_ends = [
         note
@@ -93,8 +91,7 @@ def _combination_sentences(uncertainty: Uncertainty) -> list[str]:
     with an eigenvalue up to 1 − `CONFOUNDED`.
 
     Mode coefficients and parameters without a finite, positive variance are left out, and
-    combinations of three or more parameters
-    that are all well determined.
+    combinations of three or more parameters that are all well determined.
     """
     deviations = np.sqrt(np.diag(uncertainty.covariance))
     modes = np.array(

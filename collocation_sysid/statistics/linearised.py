@@ -73,16 +73,16 @@ def observable_responses(
     """Return the changes of the observables of each experiment with its parameters, computed in
     parallel.
 
-    Raises
-    ------
-    SimulationError
-        If the equations of a step are singular.
-
     Parameters
     ----------
     collocation : Collocation
     z : (variables,) array
         Variables that satisfy the equations of motion.
+
+    Raises
+    ------
+    SimulationError
+        If the equations of a step are singular.
     """
 
     def of(iterate: ExperimentIterate) -> ObservableResponse:
@@ -403,8 +403,7 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     Notes
     -----
     Residuals of user-defined sensors and wrenches are padded or grouped to three components. The
-    fit has no `disturbances`, see
-    `pose_noise.with_pose_noise`.
+    fit has no `disturbances`, see `pose_noise.with_pose_noise`.
     """
     p = collocation.parameters_from(z)
     blocks = []

@@ -81,8 +81,7 @@ def estimate_pose_noise(poses: PoseSequence) -> tuple[float, float]:
     poses, from differences of fifth order, in which a smooth motion hardly shows.
 
     Robust: the median of the absolute differences decides. Zero for a noise below `LEAST_M` or
-    `LEAST_RAD`, which rounding of a
-    file explains, and for fewer than 20 poses.
+    `LEAST_RAD`, which rounding of a file explains, and for fewer than 20 poses.
     """
     if len(poses.t_s) < 4 * ORDER:
         return 0.0, 0.0
@@ -123,8 +122,7 @@ def with_pose_noise(
     -------
     (LinearisedFit, tuple of PoseNoise)
         The fit with `disturbances` for all measurements of the experiments in which the RMS effect
-        on a
-        measurement is at least `NEGLIGIBLE` σ, else None; and the noise of the grasps of these
+        on a measurement is at least `NEGLIGIBLE` σ, else None; and the noise of the grasps of these
         experiments, without those of zero noise.
     """
     draws: list[Array | None] = []
@@ -227,8 +225,7 @@ def _pose_samples(
 ) -> tuple[Array, Array]:
     """Return `count` samples of translation [m] and rotation [rad] errors of the poses of a grasp
     at the N grid times, (N, count, 3) each; zero while the grasp does not hold, and for a single
-    pose.
-    Noise is white at the times of the poses and interpolated to the grid as the poses are.
+    pose. Noise is white at the times of the poses and interpolated to the grid as the poses are.
     """
     t_s = iterate.segment.dynamics.t_s
     samples = np.zeros((2, len(t_s), count, 3))

@@ -165,8 +165,7 @@ def _common_scaling(
         Derivatives of θ by q.
     includes_declared : bool
         Whether stated densities, which do not depend on q, count as multiplied too: they are then
-        left out of
-        the change. If false, a part whose density is not estimated gives None.
+        left out of the change. If false, a part whose density is not estimated gives None.
     """
     if not includes_declared and not all(
         part.has_free_density for part in body.parts
@@ -194,9 +193,8 @@ def is_motionless(experiment: Experiment) -> bool:
     the markers.
 
     False if a grasp begins or ends within the recording. Markers count as motionless unless a χ²
-    test at the level `RARE` finds
-    their deviations from their means larger than σ; grasped nodes may move by `LEAST_RESTRAINT`
-    times the median σ.
+    test at the level `RARE` finds their deviations from their means larger than σ; grasped nodes
+    may move by `LEAST_RESTRAINT` times the median σ.
     """
     markers = experiment.markers
     t_s = experiment.t_s
@@ -231,8 +229,7 @@ def static_concerns(
     recordings, so that damping cannot be determined; else empty.
 
     The code is "information/static" if all recordings are static tests, else "information/still".
-    Experiments for validation
-    are ignored.
+    Experiments for validation are ignored.
     """
     fitted = [
         experiment for experiment in experiments if not experiment.validation

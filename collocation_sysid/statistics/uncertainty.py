@@ -69,6 +69,7 @@ from .residuals.noise_level import (
 )
 from .residuals.recording_scatter import (
     RecordingComparison,
+    RecordingEstimate,
     blocks_by_recording,
     compare_recordings,
     single_fits,
@@ -252,8 +253,8 @@ def uncertainty_from_fit(
     Notes
     -----
     If several recordings are fitted, each is also linearised alone, with the same assumptions, to
-    compare them. Covariances of a two-phase
-    field's phases are added after the choice of the error model.
+    compare them. Covariances of a two-phase field's phases are added after the choice of the error
+    model.
     """
     factored = factorise_information(fit)
     shared = fit.shared_count
@@ -509,10 +510,10 @@ def _compare_recordings(
             least_squares_of_fit(alone).standard_errors[: fit.shared_count] ** 2
         )
         variances = np.diag(uncertainty.covariance) / sizes**2
-        known[alone.blocks[0].name] = (
+        known[alone.blocks[0].name] = RecordingEstimate(
             step[: fit.shared_count],
             variances,
-            independent,
+            independent_variances=independent,
         )
     return compare_recordings(fit, known) if len(known) > 1 else None
 
@@ -563,9 +564,8 @@ def _is_explained(
     those in `result`; false without disturbances.
 
     `REPLICAS` simulated residuals with disturbances and white noise are tested likewise: the
-    autocorrelation has to lie within
-    their range, and correlations among channels must not be more significant than in all of them.
-    Correlation in space is ignored.
+    autocorrelation has to lie within their range, and correlations among channels must not be more
+    significant than in all of them. Correlation in space is ignored.
     """
     added = disturbance_samples(fit)
     if not len(added[0]):
@@ -600,8 +600,8 @@ def _is_explained(
 def _correlated_score_covariance(
     fit: LinearisedFit, factored: Information, kind: Noise, level: NoiseLevel
 ) -> tuple[Array, Array]:
-    """Return the covariance (r, r) of the score for correlated errors, and degrees of
-    freedom (shared,).
+    """Return the covariance (r, r) of the score for correlated errors, and degrees of freedom
+    (shared,).
 
     Notes
     -----

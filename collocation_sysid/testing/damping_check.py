@@ -74,10 +74,8 @@ def check_damping(
     Notes
     -----
     `largest_strain` does not change the deformation of the small body. An empty `elements` skips
-    the check
-    of compiled forces. Values of `constants` that neither law nor material declares are ignored; a
-    constant
-    without a value has that of `usual_constants`.
+    the check of compiled forces. Values of `constants` that neither law nor material declares are
+    ignored; a constant without a value has that of `usual_constants`.
     """
     made = as_damping(law)
     known = as_material(material)

@@ -108,10 +108,8 @@ def check_force(
     Notes
     -----
     An `energy` is compared only at random states of a node, with velocity zero. `is_zero_at_rest`
-    is
-    checked at the first place, to 1e-9 N. With `file`, the function that the problem file names is
-    the
-    ``__name__`` of the law.
+    is checked at the first place, to 1e-9 N. With `file`, the function that the problem file names
+    is the ``__name__`` of the law.
     """
     made = force if isinstance(force, NodeForce) else NodeForce.from_law(force)
     check = PropertyCheck(f"force {made.name!r}")
@@ -175,10 +173,8 @@ class ForceLaw:
     Notes
     -----
     n dofs are 3 for a force on nodes and 9 for one on faces, corner after corner. u is (n
-    positions, n
-    velocities, constants, internal variables of the previous evaluation); the outputs are n forces
-    [N], then the
-    internal variables of this evaluation.
+    positions, n velocities, constants, internal variables of the previous evaluation); the outputs
+    are n forces [N], then the internal variables of this evaluation.
     """
 
     force: NodeForce
@@ -205,10 +201,8 @@ class ForceLaw:
         """Return inputs u and data of a random state near a place (3,) [m], after the start.
 
         Corners of a face are the place and points at `FACE_EDGE_M` from it along x and y, all
-        displaced at
-        random, as are the velocities, the normal and the previous internal variables. The state is
-        returned as two
-        (k,) arrays.
+        displaced at random, as are the velocities, the normal and the previous internal variables.
+        The state is returned as two (k,) arrays.
         """
         corners = np.zeros((self.dofs // 3, 3))
         corners[1:] = FACE_EDGE_M * np.eye(3)[: self.dofs // 3 - 1]
@@ -254,8 +248,7 @@ class ForceLaw:
         """Return forces on node or corners, then the internal variables, by calling the law.
 
         On a face the law is called with mean position and velocity of the corners and with the
-        current area and normal of
-        the triangle; each corner gets a third of the result.
+        current area and normal of the triangle; each corner gets a third of the result.
 
         Parameters
         ----------

@@ -262,8 +262,7 @@ def check_internal_forces(
     Notes
     -----
     The body is one box of six elements without grasps, memory or field; that the compiled force
-    without velocities is minus
-    the gradient of the compiled energy is required too.
+    without velocities is minus the gradient of the compiled energy is required too.
     """
     body = Body(
         uneven_box(1),

@@ -99,8 +99,7 @@ def check_material(
     Notes
     -----
     An empty `elements` skips the check of compiled forces. The missing and the misspelt constant
-    are those of this material;
-    entries of `constants` that it does not declare are ignored.
+    are those of this material; entries of `constants` that it does not declare are ignored.
     """
     made = as_material(material)
     check = PropertyCheck(f"material {made.name!r}")
@@ -245,8 +244,7 @@ def deformation_gradients(
     count : int
     largest_strain : float
         Entries of F − I are uniform between minus and plus this; draws with a smaller determinant
-        are
-        repeated.
+        are repeated.
     """
     for _ in range(count):
         F = np.eye(3) + rng.uniform(-largest_strain, largest_strain, (3, 3))

@@ -70,9 +70,8 @@ def check_method(
     Notes
     -----
     The method is called twice: with `watch`, and with its own answer as `start`. What it changes in
-    the program is seen by
-    its guess, bounds and values at one point. A method that raises an error lets the check raise
-    it.
+    the program is seen by its guess, bounds and values at one point. A method that raises an error
+    lets the check raise it.
     """
     name = getattr(method, "name", None) or getattr(
         method, "__name__", type(method).__name__
@@ -246,8 +245,8 @@ def _check_options(check: PropertyCheck, method: Any) -> None:
     problem file.
 
     An unknown option, and the text "text" as the value of each option that is a number or boolean,
-    must be refused.
-    Options that are None or callable are left out of the problem file; tuples are written as lists.
+    must be refused. Options that are None or callable are left out of the problem file; tuples are
+    written as lists.
     """
     kind = type(method)
     key = f"solver.{method.name}"

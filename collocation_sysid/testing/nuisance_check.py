@@ -102,8 +102,7 @@ def _with_row(experiment: Experiment, row: NuisanceRow) -> Experiment:
     modified.
 
     A row of the package gets its usual standard deviation, or else the considered one, or else
-    `USUAL_SIGMA`;
-    another row is added to the own ones of the experiment.
+    `USUAL_SIGMA`; another row is added to the own ones of the experiment.
     """
     nuisance = experiment.nuisance
     if row not in KINDS:
@@ -156,8 +155,7 @@ def _check_reading(
     the reading.
 
     First and second derivatives of the row's reading by position and values are compared with
-    central
-    differences at one random place, at the mean time of the recording.
+    central differences at one random place, at the mean time of the recording.
     """
     assert row.reading is not None
     (transcription,) = collocation.transcriptions

@@ -36,9 +36,8 @@ def check_program(check: PropertyCheck, collocation: Collocation) -> None:
     Notes
     -----
     Each is compared at one random point, which satisfies no equation, along one random direction
-    for the parameters, the
-    positions, the nuisance parameters and the lifted variables; blocks without variables are
-    skipped. The collocation is not modified.
+    for the parameters, the positions, the nuisance parameters and the lifted variables; blocks
+    without variables are skipped. The collocation is not modified.
     """
     program = collocation.with_lifted_variables()
     z = shaken_variables(program, check.rng)

@@ -145,9 +145,8 @@ class PropertyCheck:
         Notes
         -----
         The largest entry is not taken below `ROUNDING` times the largest value of the function. Of
-        the differences
-        with the `STEPS`, the closest to the derivative count. `derivative` may have any shape of m
-        n entries.
+        the differences with the `STEPS`, the closest to the derivative count. `derivative` may have
+        any shape of m n entries.
         """
         steps = np.broadcast_to(np.asarray(scale, dtype=float), point.shape)
         found = (
@@ -203,8 +202,8 @@ class PropertyCheck:
         Notes
         -----
         The largest entry is not taken below `ROUNDING` times the largest value of the function.
-        `direction` is a large
-        change of `point`; of the differences with the `STEPS`, the closest to the product count.
+        `direction` is a large change of `point`; of the differences with the `STEPS`, the closest
+        to the product count.
         """
         found = np.asarray(product, dtype=float)
         size = _size(found, function(point))

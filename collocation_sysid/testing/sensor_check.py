@@ -79,8 +79,7 @@ def check_sensor(
     Notes
     -----
     The prediction for a known motion is checked only for sensors on points. Values of `sensor` and
-    its times are ignored; a
-    sensor on any grasp is placed on the only grasp of the small recording.
+    its times are ignored; a sensor on any grasp is placed on the only grasp of the small recording.
     """
     check = PropertyCheck(f"sensor {sensor.name!r}")
     expression = SensorExpression(sensor)

@@ -122,8 +122,7 @@ def swung_experiment(body: Body, **changes: Any) -> Experiment:
     Notes
     -----
     There are no nuisance parameters and no air. The markers are on up to four nodes; their tracks
-    are constant, at the undeformed positions,
-    not those of the motion.
+    are constant, at the undeformed positions, not those of the motion.
     """
     t_s: Array = TIMESTEP_S * np.arange(STEPS + 1, dtype=np.float64)
     points_m = body.nodes_m[:: max(1, len(body.nodes_m) // 4)][:4]

@@ -70,8 +70,7 @@ class _EffectColumns(SweepColumns):
         equations and the forces in k rows.
 
         `rows` selects the time steps and `free` the dofs of R; the other arguments, those of
-        `SweepColumns.right_hand_sides`,
-        are not used.
+        `SweepColumns.right_hand_sides`, are not used.
         """
         return self.rows_n[rows][:, free].copy(), self.forces_n[rows].copy()
 
@@ -125,10 +124,8 @@ def changes_of_assumptions(
     Notes
     -----
     Assumptions without an entry have the deviation of their table; those that are None there are
-    left out. The entry for
-    `CORRELATION_KEY` is the correlation length of the surface's error, by default `CORRELATION`.
-    Columns of `ASSUMPTIONS` come first, then
-    those of nuisance parameters.
+    left out. The entry for `CORRELATION_KEY` is the correlation length of the surface's error, by
+    default `CORRELATION`. Columns of `ASSUMPTIONS` come first, then those of nuisance parameters.
     """
     rows = [(row, deviations.get(row.name, row.sigma)) for row in ASSUMPTIONS]
     assumptions = [(row, s) for row, s in rows if s is not None]

@@ -156,8 +156,8 @@ class Refinement:
         -------
         (str, float)
             Name, and the absolute correction over the standard error. Of equal ratios the first in
-            `errors` counts. An error whose
-            name is missing in `std_errors`, or has None or 0 there, is left out.
+            `errors` counts. An error whose name is missing in `std_errors`, or has None or 0 there,
+            is left out.
         """
         if std_errors is None:
             std_errors = {
@@ -289,9 +289,8 @@ def discretisation_error(
     Notes
     -----
     The order of the mesh is `MESH_ORDER`. All values are compared in one coordinate, which is
-    linear if any of them is not
-    positive. `step` and `mesh` of the result are the changes of the value itself with the first
-    halving.
+    linear if any of them is not positive. `step` and `mesh` of the result are the changes of the
+    value itself with the first halving.
     """
     known = (
         estimate.value,

@@ -225,8 +225,7 @@ def sag_m(body: Body, theta: Array, support_dofs: Index, axis: int) -> Array:
     Notes
     -----
     Gravity of 9.81 m/s² acts towards positive coordinates of the axis; the other sign gives the
-    opposite difference. Air is
-    ignored.
+    opposite difference. Air is ignored.
     """
     own = body.nodes.points_m.size
     x = np.asarray(body.nodes_m, dtype=float)

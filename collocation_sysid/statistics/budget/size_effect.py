@@ -47,8 +47,7 @@ class FirstContact:
         none.
 
         Contact begins where a gap is less than the width of the contact law. Without pressure in
-        that row, the point
-        with the smallest gap counts.
+        that row, the point with the smallest gap counts.
         """
         law = contact.law_of_contact
         nearest_m = np.inf
@@ -104,8 +103,7 @@ def obstacle_shifts_m(
     Notes
     -----
     Nothing is yielded without obstacles. The shift is along the obstacle's normal at first contact,
-    moves with the rotation of the obstacle, and is in
-    world axes at the N grid times.
+    moves with the rotation of the obstacle, and is in world axes at the N grid times.
     """
     experiment = iterate.segment.experiment
     forces = iterate.equations.dynamics.forces

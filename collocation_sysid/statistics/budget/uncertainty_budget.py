@@ -73,6 +73,11 @@ class BudgetLine:
             Its standard deviation in the coordinate of the estimate.
         coordinate : IntervalCoordinate
             That coordinate.
+
+        Notes
+        -----
+        The source counts as systematic. Bounds are not applied. A source of this name in `shares`
+        is replaced, although its variance remains in the total.
         """
         low, high = map(coordinate.from_value, self.combined95)
         known_variance = ((high - low) / 2 / NORMAL_95) ** 2
@@ -113,7 +118,7 @@ class VarianceSources:
     covariance_known : (nq, nq) array
         Covariance of q for the stated noise, with known nuisance parameters.
     derivatives : mapping of str to (nq,) array
-        Derivatives of each estimate.
+        Derivatives of each estimate by q.
     widening : (nq,) array
         Factor by which intervals are widened because recordings disagree.
     recording_sensitivities : (nq, b) array
@@ -161,6 +166,10 @@ class VarianceSources:
             Statistical uncertainty of the fit.
         means : mapping of str to float, optional
             Known effects over their standard deviations; None if there are none.
+
+        Notes
+        -----
+        Rows and columns of parameters at a bound are zero.
         """
         free = np.flatnonzero(~fit.at_bound)
         shared = free[free < fit.shared_count]
@@ -203,7 +212,7 @@ class VarianceSources:
         -------
         (float, float)
             Share that would remain with known nuisance parameters; and share that would remain if
-            recordings agreed. Both are 1 if the variance is 0 or not finite.
+            recordings agreed, 1 if they do. Both are 1 if the variance is 0 or not finite.
         """
         scaled_by_noise = self.widening * by_q
         known, all_free, all_scaled_by_noise = (
@@ -239,6 +248,11 @@ class VarianceSources:
             Variance of all other sources.
         counted : float
             Variance between recordings that is counted already.
+
+        Returns
+        -------
+        float
+            The excess over `counted`, enlarged; 0 if there is none.
         """
         more = max(
             0.0,
@@ -251,7 +265,8 @@ class VarianceSources:
 
     def known_effect(self, by_q: Array) -> float:
         """Return the change of an estimate with the derivative `by_q` (nq,) by all known effects,
-        to first order.
+        to first order; 0 without known effects. Of an assumption with several components each
+        has the effect.
         """
         sizes = [
             self.means.get(name.partition(" ")[0], 0.0) for name in self.names
@@ -289,6 +304,10 @@ def budget(
         Discretisation errors; estimates without an entry have none, or an unknown one.
     parameters : Parameters
         The parameters of the problem, with their coordinates and bounds.
+
+    Notes
+    -----
+    Estimates that do not depend on q, such as fixed ones, are left out.
     """
     lines = {}
     for name, estimate in {
@@ -378,8 +397,18 @@ def _line(
 
 
 def _variance(at: IntervalCoordinate, middle: float, ends: Interval) -> float:
-    """Return the variance, in the coordinate of the interval, of a 95 % interval about a middle
-    value, one end of which may be cut off by a bound: the mean of both sides.
+    """Return the variance of a 95 % interval, in the coordinate of the interval.
+
+    If both sides are equal, half the interval counts as 1.96 standard deviations; else, as where
+    one end is cut off by a bound, it is the mean of the variances of both sides.
+
+    Parameters
+    ----------
+    at : IntervalCoordinate
+    middle : float
+        Value between the ends.
+    ends : (lower, upper)
+        Interval, as values.
     """
     centre = at.from_value(middle)
     low, high = map(at.from_value, ends)
@@ -396,7 +425,7 @@ def _variance(at: IntervalCoordinate, middle: float, ends: Interval) -> float:
 
 
 def _ranked(shares: Mapping[str, float]) -> dict[str, float]:
-    """Sort shares of a variance, the largest first."""
+    """Return a copy of shares of a variance, the largest first; equal shares keep their order."""
     return dict(sorted(shares.items(), key=lambda part: -part[1]))
 
 
@@ -441,7 +470,9 @@ def main_sources(
 
 
 def source_label(source: str) -> str:
-    """Return the name of a source as text, without unit suffix."""
+    """Return the name of a source as text for messages: without a unit suffix such as "_rad", and
+    with spaces for underscores.
+    """
     unit = next(
         (
             u
