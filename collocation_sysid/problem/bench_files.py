@@ -93,7 +93,8 @@ class BenchTable:
         values: Mapping[str, Array],
         known_quantities: Sequence[Quantity],
     ) -> None:
-        """Add the time and columns of quantities, in place, in the file's units and under its names.
+        """Add the time and columns of quantities, in place, in the file's units and under its
+        names.
 
         The name of a column is the one that `layout` states for its key, else the usual one of the
         quantity; its unit is that in the name, else the usual one.

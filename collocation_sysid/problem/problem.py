@@ -34,7 +34,9 @@ from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 def _as_parameters(
     parameters: Parameters | Mapping[str, Unknown | Tied | float],
 ) -> Parameters:
-    """Return parameters as they are; a mapping by name is converted by `Parameters.from_mapping`."""
+    """Return parameters as they are; a mapping by name is converted by
+    `Parameters.from_mapping`.
+    """
     return (
         parameters
         if isinstance(parameters, Parameters)
@@ -271,7 +273,9 @@ class Problem:
 
     @property
     def first_substeps(self) -> int:
-        """Grid steps between samples in the first solve, and where nothing is solved: 1 for "auto"."""
+        """Grid steps between samples in the first solve, and where nothing is solved: 1
+        for "auto".
+        """
         return 1 if self.substeps == "auto" else self.substeps
 
     def collocation(self) -> Collocation:
@@ -288,7 +292,8 @@ class Problem:
     def solver(self, method: str | Method | None = None) -> Method:
         """Return the method for a name, or the method itself; None means the method of the problem.
 
-        A name is looked up in `methods` first, then in `METHODS`, whose methods get default options.
+        A name is looked up in `methods` first, then in `METHODS`, whose methods get default
+        options.
 
         Raises
         ------

@@ -135,7 +135,9 @@ class WrenchSection(TableSection):
 
 
 def _as_table(value: str | DisplacementSection) -> DisplacementSection:
-    """Return a displacement as a table: text is the name of its file, a table is returned as it is."""
+    """Return a displacement as a table: text is the name of its file, a table is returned
+    as it is.
+    """
     return (
         DisplacementSection.model_validate({"file": value})
         if isinstance(value, str)

@@ -202,5 +202,7 @@ def _advice_on_tables(options: Sequence[str], chosen: Any) -> str:
 
 
 def table_heading(method: str) -> str:
-    """Return the heading of a method's table in the file, with quotes around a name with a colon."""
+    """Return the heading of a method's table in the file, with quotes around a name with a
+    colon.
+    """
     return f'[solver."{method}"]' if ":" in method else f"[solver.{method}]"

@@ -55,7 +55,8 @@ class SpecimenReader:
     notes: list[str] = field(default_factory=list)
 
     def read(self) -> tuple[Specimen, Experiment]:
-        """Read the file; return the measurements, and the static experiment of the homogeneous cell.
+        """Read the file; return the measurements, and the static experiment of the homogeneous
+        cell.
 
         Notes are added to `notes`, each with the experiment's name in front.
 

@@ -514,5 +514,7 @@ def concern_if(
 
 
 def topics_of(concerns: Iterable[Concern]) -> dict[str, Topic]:
-    """Return the topics of several concerns by key, each once, in the order of their first concern."""
+    """Return the topics of several concerns by key, each once, in the order of their first
+    concern.
+    """
     return {concern.topic: TOPICS[concern.topic] for concern in concerns}

@@ -117,7 +117,9 @@ class IntervalCoordinate:
         return 1.0 if self.is_linear else 1 / value
 
     def from_value(self, value: float) -> float:
-        """Return the coordinate of a value; ±infinity at the ends of its domain, NaN beyond them."""
+        """Return the coordinate of a value; ±infinity at the ends of its domain, NaN
+        beyond them.
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.is_odds:
                 return float(np.log(value / (0.5 - value)))

@@ -188,7 +188,9 @@ class DampingStress:
         )
 
     def evaluate(self, F: Array, rate: Array) -> DampingState:
-        """Return stress and derivatives at F (9,) and its rate Ḟ (9,) [1/s], column after column."""
+        """Return stress and derivatives at F (9,) and its rate Ḟ (9,) [1/s], column after
+        column.
+        """
         outputs = [o.full() for o in self._function.call([F, rate])]
         return DampingState(
             stress=outputs[0].ravel(),

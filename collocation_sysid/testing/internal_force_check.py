@@ -184,7 +184,8 @@ class PlainInternalForce:
     def evaluate(
         self, x: Array, v: Array, w: Array, theta: Array
     ) -> ForceDerivatives:
-        """Return force and derivatives of one state by u = (x, v, θ), with mass-proportional damping.
+        """Return force and derivatives of one state by u = (x, v, θ), with mass-proportional
+        damping.
 
         Parameters
         ----------

@@ -196,7 +196,8 @@ def _check_answer(
 def _check_history(
     check: PropertyCheck, solution: Solution, lines: list[Iteration]
 ) -> None:
-    """Require a history that `watch` got line by line, with losses that decrease, and a finite loss.
+    """Require a history that `watch` got line by line, with losses that decrease, and a finite
+    loss.
 
     Losses are compared between lines about the complete recording: the last of them must not
     exceed the first.

@@ -83,14 +83,14 @@ class PropertyCheck:
         tolerance : float
             Largest difference, relative to `scale`.
         scale : float, optional
-            Size of the quantity; by default the largest absolute expected entry. With a size of zero
-            the entries must be equal.
+            Size of the quantity; by default the largest absolute expected entry. With a size of
+            zero the entries must be equal.
 
         Raises
         ------
         AssertionError
-            If shapes or values differ, or an entry of either array is NaN. Empty arrays of one shape
-            are equal.
+            If shapes or values differ, or an entry of either array is NaN. Empty arrays of one
+            shape are equal.
         """
         values = np.asarray(found, dtype=float)
         references = np.asarray(expected, dtype=float)

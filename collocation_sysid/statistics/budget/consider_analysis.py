@@ -157,12 +157,14 @@ def changes_of_nuisances(
     Returns
     -------
     ResidualChanges
-        One column for each value of these parameters in each experiment, zero in the blocks of other
-        experiments, with the name of the kind. Huber's weights are not applied.
+        One column for each value of these parameters in each experiment, zero in the blocks of
+        other experiments, with the name of the kind. Huber's weights are not applied.
     """
 
     def with_added_nuisances(experiment: Experiment) -> Experiment:
-        """Return the experiment in which the parameters that are not estimated are estimated too."""
+        """Return the experiment in which the parameters that are not estimated are
+        estimated too.
+        """
         nuisance = experiment.nuisance
         sigmas = {
             row: deviations.get(row.name, row.considered) for row in KINDS

@@ -199,7 +199,9 @@ class ExperimentAtAnswer:
 
     @cached_property
     def internal_force_n(self) -> Array:
-        """Forces (N, 3n) of the material at the answer with its stress-free shape, without γ_m [N]."""
+        """Forces (N, 3n) of the material at the answer with its stress-free shape, without
+        γ_m [N].
+        """
         return self.internal_n(
             body=self.body.with_stress_free(self.stress_free_m)
         )

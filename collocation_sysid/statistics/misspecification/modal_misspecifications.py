@@ -253,7 +253,9 @@ class ModalComparison:
         predicted = self.response.predict(self.declared)
 
         def remaining_misfit(tracks_m: Array) -> float:
-            """Return the misfit [m] of tracks (T, M, 3) from the prediction of the best stiffness."""
+            """Return the misfit [m] of tracks (T, M, 3) from the prediction of the best
+            stiffness.
+            """
             turned = replace(self.declared, tracks_m=tracks_m)
             return float(self._misfits_m(turned, predicted).min())
 
@@ -450,7 +452,9 @@ def simple_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
 
 
 def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
-    """Yield untested hypotheses of inverted poses, inverted rotations and other quaternion orders."""
+    """Yield untested hypotheses of inverted poses, inverted rotations and other quaternion
+    orders.
+    """
     inverse = declared.rotations.transpose(0, 2, 1)
     shift = -np.einsum("tij,tj->ti", inverse, declared.translations_m)
     inverted = replace(declared, rotations=inverse, translations_m=shift)

@@ -124,7 +124,9 @@ def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
 
 
 def _excess_factor(value: float, limits: tuple[float, float]) -> float:
-    """Return the factor by which a positive value is outside limits (low, high); at most 1 inside."""
+    """Return the factor by which a positive value is outside limits (low, high); at most 1
+    inside.
+    """
     return max(limits[0] / value, value / limits[1])
 
 
@@ -348,7 +350,9 @@ def _pose_jump_hypotheses(
 
 
 def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield a hypothesis for each marker that steps alone and stays displaced against the others."""
+    """Yield a hypothesis for each marker that steps alone and stays displaced against the
+    others.
+    """
     markers = experiment.markers
     sizes = step_sizes(markers.positions_m)
     for m, name in enumerate(markers.names):

@@ -283,7 +283,9 @@ def profile_of_solution(
 
 
 def _loss_of(solution: Solution) -> float:
-    """Return the loss of a solution, Σ ((ŷ − h(x)) / σ)² (shortened by Huber's loss), with priors."""
+    """Return the loss of a solution, Σ ((ŷ − h(x)) / σ)² (shortened by Huber's loss), with
+    priors.
+    """
     return (
         solution.collocation.objective(solution.z)
         / solution.collocation.loss_scale

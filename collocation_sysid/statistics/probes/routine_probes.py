@@ -8,8 +8,8 @@ step.
 
 A probe is *significant* if its amplitude is farther from zero than noise explains, and *relevant*
 if relaxing the assumption changes what is reported. Only what is both gives concern, see
-`assessment.probe_concerns`: with much data any imperfection is significant, and with little data any
-change is large.
+`assessment.probe_concerns`: with much data any imperfection is significant, and with little data
+any change is large.
 """
 
 from __future__ import annotations

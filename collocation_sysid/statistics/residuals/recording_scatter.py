@@ -119,7 +119,9 @@ class RecordingComparison:
 
 
 def blocks_by_recording(fit: LinearisedFit) -> dict[str, list[int]]:
-    """Return the indices of the blocks of each recording, by its name, in the order of the blocks."""
+    """Return the indices of the blocks of each recording, by its name, in the order of the
+    blocks.
+    """
     blocks: dict[str, list[int]] = {}
     for k, block in enumerate(fit.blocks):
         blocks.setdefault(block.name, []).append(k)
