@@ -194,6 +194,17 @@ def add_wrench(
         Times of the samples [s]. Each is assigned to the nearest row; other rows are left blank.
     wrench : (S, 6) array
         Wrench on the modelled part: fx, fy, fz [N], tx, ty, tz [N m]; NaN where not measured.
+
+    Raises
+    ------
+    InputError
+        If the table already has a column of that name with other values.
+
+    Notes
+    -----
+    The columns are those that the layout names; if it names none, the stress if `area_m2` is
+    stated, else a machine's force if only the force along the layout's axis is measured, else all
+    measured components.
     """
     rows = np.searchsorted((table.t_s[1:] + table.t_s[:-1]) / 2, at_s)
     six_components = np.full((len(table.t_s), 6), np.nan)

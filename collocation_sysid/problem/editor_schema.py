@@ -23,7 +23,9 @@ def schema_text() -> str:
 
 
 def schema_url() -> str | None:
-    """Return the address at which the documentation publishes the schema; None if it has none."""
+    """Return the address at which the documentation publishes the schema; None if the documentation
+    has no address.
+    """
     base = documentation_url()
     return None if base is None else f"{base}/{SCHEMA_FILE}"
 

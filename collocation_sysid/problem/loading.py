@@ -216,13 +216,14 @@ def _load_object(
 class SpecimenCells:
     """Homogeneous cells of specimens of the object's material, each made once.
 
+    Tests that need an inner node have another cell than those that do not; there are at most two.
+
     Parameters
     ----------
     section : ObjectSection
         Table of the object.
     code : CodeLoader
         Loader of Python files.
-    Tests that need an inner node have another cell than those that do not; there are at most two.
     """
 
     def __init__(self, section: ObjectSection, code: CodeLoader) -> None:

@@ -106,6 +106,9 @@ class Problem:
     origin: Origin | None = None
 
     def __post_init__(self) -> None:
+        """Complete the bodies with free densities, the parameters with those of fields, and the
+        notes; then validate the problem.
+        """
         vars(self)["experiments"] = _with_free_densities(
             self.experiments, self.parameters
         )
@@ -134,6 +137,9 @@ class Problem:
         vars(self)["notes"] = tuple(dict.fromkeys((*unscaled, *self.notes)))
 
     def __repr__(self) -> str:
+        """Return the title (if there is one), the names of the experiments and the parameters as
+        text.
+        """
         names = ", ".join(
             repr(experiment.name) for experiment in self.experiments
         )
@@ -370,6 +376,10 @@ def _require_rest_shapes(
     """Raise `InputError` if no stress-free shape exists for the mesh under gravity at the guess.
 
     Nothing is checked if a parameter has no guess: the search then starts where the shape exists.
+
+    Notes
+    -----
+    The message is located at "object.rest_shape". Bodies without a scan under gravity pass.
     """
     if any(
         item.guess is None for item in parameters.items if item.tied is None

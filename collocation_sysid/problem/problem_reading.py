@@ -125,7 +125,7 @@ def _beyond_limits(error: Exception) -> str:
 
 
 def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
-    """Return the text of a file (UTF-8).
+    """Return the text of a file (UTF-8), without a byte order mark.
 
     Parameters
     ----------
@@ -138,7 +138,6 @@ def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
     ------
     InputError
         If the file does not exist or is not a text file.
-    A byte order mark is removed.
     """
     require_regular(path)
     try:

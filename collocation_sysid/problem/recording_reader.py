@@ -178,7 +178,7 @@ class RecordingReader:
 
     @property
     def _is_static(self) -> bool:
-        """Whether the samples are equilibria."""
+        """Whether the samples are equilibria (kind "static")."""
         return self.section.kind == "static"
 
     def _add_notes(self, *notes: str) -> None:
@@ -226,7 +226,9 @@ class RecordingReader:
 
     @property
     def _requires_times(self) -> bool:
-        """Whether files must contain times: not for equilibria of bodies without memory."""
+        """Whether files must contain times: for motions, and for equilibria of bodies with
+        memory.
+        """
         return not self._is_static or self.body.has_memory
 
     # Grasps ---------------------------------------------------------------------------------------
@@ -374,9 +376,9 @@ class RecordingReader:
         """Return the measured wrench within the times t_s of the experiment, and note how many
         samples are used.
 
-        If a simulation has no file, the wrench is zero at t_s. Of equilibria without markers, only
-        measurements at the times t_s are used, if there are any. Stated sigmas are divided by the
-        section's `symmetry`.
+        If a simulation has no file, the wrench is zero at t_s, with a `sigma_nm` of 1 unless
+        stated. Of equilibria without markers, only measurements at the times t_s are used, if there
+        are any. Stated sigmas are divided by the section's `symmetry`.
 
         Parameters
         ----------
@@ -461,7 +463,8 @@ class RecordingReader:
             return Gauge(t_s=at_s[is_used], values=values[is_used], **arguments)
 
     def _depth_images(self, k: int) -> tuple[DepthFileContent, Array]:
-        """Return the content of the file of the depth camera with index k, and the times [s].
+        """Return the content of the file or folder of the depth camera with index k, and the times
+        of its images or clouds [s].
 
         Times are the stated ones, or those of the file; for equilibria, or a single image, without
         times they are 0, 1, 2, …
@@ -573,7 +576,7 @@ class RecordingReader:
         """Return the object of a table in a list, such as a tendon or a pressure, on the body.
 
         Values over time are read from the files that the table names. An object without a name is
-        numbered.
+        called by `list_key` and its number from 1, such as tendon_1.
 
         Parameters
         ----------
@@ -676,13 +679,14 @@ class RecordingReader:
     def _sample_times(self, poses: Sequence[PoseSequence]) -> Array:
         """Return the sample times [s] where no marker file gives them.
 
-        They are those of the first wrench file if there are no markers, else for equilibria those
-        of all depth images, else those of the longest sequence of poses.
+        They are those of the first existing wrench file if there are no markers, else for
+        equilibria without moving grasps those of all depth images, else those of the longest
+        sequence of poses.
 
         Raises
         ------
         InputError
-            If nothing is measured, or there are fewer than three times (one for equilibria).
+            If nothing is measured, or poses have fewer than three times (one for equilibria).
         """
         section = self.section
         wrench_sections = [
@@ -732,7 +736,10 @@ class RecordingReader:
         return times
 
     def _select_tracks(self, table: MarkerTable) -> MarkerTable:
-        """Return the tracks to fit, without markers of the gripper alone and those of weight 0.
+        """Return the tracks to fit, in the order of the table; markers of a weight of 0 are noted.
+
+        They are the markers that `names` of the section has, or else all but those of grippers,
+        without those of weight 0.
 
         Raises
         ------

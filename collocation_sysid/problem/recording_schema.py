@@ -412,8 +412,8 @@ class MarkersSection(Section):
 
 
 def _require_file_name(name: str) -> str:
-    """Return a name unchanged if it can be part of a file name on every platform; raise
-    `ValueError` otherwise.
+    r"""Return a name unchanged if it can be part of a file name on every platform: printable, not
+    empty, no leading dot, and none of / \ : * ? " < > |; raise `ValueError` otherwise.
     """
     if (
         not name.isprintable()
@@ -647,12 +647,14 @@ class ExperimentSection(NamedSection):
 
     @property
     def grasp_list(self) -> list[GraspSection]:
-        """Grasps as a list, also if the file has a single table."""
+        """Grasps as a list; a single table is a list of one, no grasp an empty one."""
         return self.grasp if isinstance(self.grasp, list) else [self.grasp]
 
     @property
     def moved_sections(self) -> list[GraspSection | ObstacleSection]:
-        """Grasps, followed by the obstacles."""
+        """Grasps, followed by the obstacles, in the order of the file; their indices from 0 are
+        those of `Experiment.grasps`.
+        """
         return [*self.grasp_list, *self.obstacle]
 
     @model_validator(mode="after")

@@ -546,7 +546,7 @@ class ProblemFile(Section):
 
     @property
     def recordings(self) -> list[ExperimentSection]:
-        """Experiments with the object's mesh."""
+        """Experiments with the object's mesh, in the order of the file."""
         return [
             each
             for each in self.experiment
@@ -555,7 +555,7 @@ class ProblemFile(Section):
 
     @property
     def specimens(self) -> list[SpecimenSection]:
-        """Material tests without a mesh."""
+        """Material tests without a mesh, in the order of the file."""
         return [
             each
             for each in self.experiment

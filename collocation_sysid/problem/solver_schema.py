@@ -60,6 +60,9 @@ class OptionTable:
     kind: type[Options]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Return the schema by which pydantic converts the table of options to the method, see
+        `_method_from_table`; the arguments are not used.
+        """
         return no_info_plain_validator_function(
             partial(_method_from_table, self.kind.name)
         )
@@ -67,6 +70,9 @@ class OptionTable:
     def __get_pydantic_json_schema__(
         self, schema: Any, handler: Any
     ) -> dict[str, Any]:
+        """Return the JSON schema of the method's options for editors; the arguments are
+        not used.
+        """
         return method_options_schema(self.kind.name)
 
 

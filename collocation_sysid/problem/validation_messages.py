@@ -59,8 +59,10 @@ def explain_validation_error(
 
 
 def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:
-    """Return the parts of the key of a fault, without tags of unions and without indices in an
-    array of numbers.
+    """Return the parts of the key of a fault, from the root of the file: keys, and indices from 0
+    of tables in lists.
+
+    Tags of unions are left out, and so are indices at the end that refer to numbers in an array.
     """
     loc = fault["loc"]
     own = (
@@ -149,7 +151,8 @@ def _written_key(key: Sequence[Part], content: dict[str, Any]) -> str:
     """Return a key as text, as it is written in the file: "experiment 'swing': markers.file" for a
     key of an experiment with a name, else its parts joined by dots.
 
-    A value that an experiment has from [experiment_defaults] is located there.
+    A value that an experiment has from [experiment_defaults] is located there. `content` is that of
+    the file, without defaults inserted.
     """
     value: Any = content
     defaults = _item(content, "experiment_defaults")
@@ -179,7 +182,9 @@ def _written_key(key: Sequence[Part], content: dict[str, Any]) -> str:
 
 
 def _value_at(key: Sequence[Part], content: dict[str, Any]) -> Any:
-    """Return the value of a key in the content of a file; None if it does not exist."""
+    """Return the value of a key in the content of a file; None if it does not exist; the content
+    itself for an empty key.
+    """
     value: Any = content
     for part in key:
         value = _item(value, part)

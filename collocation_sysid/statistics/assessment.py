@@ -133,7 +133,7 @@ class Assessment:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict in one word.
+        """Verdict in one word: "good" without concerns, else the grade of the first concern.
 
         "good": nothing speaks against the answer and its error bars. "check": usable, after a look
         at the reasons. "doubtful": something is wrong with data, model or solve.

@@ -491,12 +491,12 @@ class Concern:
 
     @property
     def topic(self) -> str:
-        """Topic of the concern, a key of `TOPICS`."""
+        """Topic of the concern, a key of `TOPICS`: the code up to the first slash."""
         return self.code.partition("/")[0]
 
     @property
     def message(self) -> str:
-        """Message of the concern for the user."""
+        """Message of the concern for the user, see `message_of`."""
         return message_of(self.code, self.data)
 
 

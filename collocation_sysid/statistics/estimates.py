@@ -363,7 +363,9 @@ def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
 
 
 def _estimate_at_bound(value: float) -> Estimate:
-    """Return the estimate of a value at a bound, without error bars."""
+    """Return the estimate of a value at a bound, or that follows from one: without standard error
+    and interval, with a reason.
+    """
     return Estimate(
         value,
         at_bound=True,
@@ -643,8 +645,8 @@ def disagreement_notes(
 
 
 def display_name(name: str) -> str:
-    """Return the name of an estimated parameter for messages; a mode coefficient is
-    described by its field.
+    """Return the name of an estimated parameter for messages: itself, or for a mode coefficient a
+    phrase with the name of its kind and its own name.
     """
     return (
         f"the {MODE.name} (share {name})"

@@ -129,7 +129,8 @@ def _combination_sentence(
     eigenvalue: float,
     vector: Array,
 ) -> str:
-    """Return the sentence about one combination of confounded parameters.
+    """Return the sentence about one combination of confounded parameters, from a small eigenvalue
+    of their correlations.
 
     It states the combination as a product of powers, the largest of them 1, and the factor of its
     95 % interval; of two parameters also their correlation. If the value of a parameter is not

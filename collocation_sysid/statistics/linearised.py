@@ -206,7 +206,9 @@ class ResidualBlock:
 
     @cached_property
     def is_measured(self) -> Mask:
-        """Mask (T, M, 3) of the coordinates that exist."""
+        """Mask (T, M, 3) of the coordinates that exist: `components`, or all three of each present
+        sample.
+        """
         if self.components is not None:
             return self.components
         return np.repeat(self.is_present[..., None], 3, axis=2)
@@ -238,7 +240,7 @@ class ResidualBlock:
 
     @property
     def measurement_count(self) -> int:
-        """Number of scalar measurements that are present."""
+        """Number of coordinates that exist: of scalar measurements in this block."""
         return int(self.is_measured.sum())
 
     @cached_property
@@ -341,7 +343,7 @@ class LinearisedFit:
 
     @property
     def measurement_count(self) -> int:
-        """Number of scalar measurements that are present."""
+        """Number of scalar measurements of all blocks, without priors."""
         return sum(block.measurement_count for block in self.blocks)
 
     def with_disturbances(

@@ -283,7 +283,8 @@ def sample_phases(
     start: Array,
     settings: SamplerSettings = USUAL,
 ) -> PosteriorDraws:
-    """Draw phases, contrast and parameters from their posterior, by several chains.
+    """Draw phases, contrast and parameters from their posterior, by several chains, whose samples
+    are concatenated.
 
     The same arguments give the same samples.
 
@@ -334,6 +335,13 @@ def _run_chain(
         Seed of the random numbers.
     settings : SamplerSettings
         Constants of the sampler.
+
+    Notes
+    -----
+    Phases flip one at a time: element e is proposed with a probability proportional to the root of
+    the ratio of posteriors with and without the flip (locally balanced), and accepted by Metropolis
+    and Hastings. δp and s are drawn from their normal distribution every `steps_per_draw`
+    proposals.
     """
     rng = np.random.default_rng(seed)
     count = len(start)

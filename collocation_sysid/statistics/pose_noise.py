@@ -64,7 +64,9 @@ class PoseNoise:
 
     @property
     def message(self) -> str:
-        """Message for the user about the assumed pose noise."""
+        """Message for the user: the size of the noise in mm and degrees, and whether it was stated
+        or estimated.
+        """
         how = (
             "estimated from their roughness"
             if self.is_estimated

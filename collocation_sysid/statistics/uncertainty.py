@@ -187,7 +187,9 @@ class Uncertainty(ErrorBasis):
 
     @property
     def reduced_chi_squared(self) -> float:
-        """χ² per degree of freedom; 1 if the residuals are as large as σ."""
+        """χ² per degree of freedom, with at least one degree of freedom; 1 if the residuals are as
+        large as σ.
+        """
         return self.chi_squared / max(1.0, self.degrees_of_freedom)
 
 
@@ -252,9 +254,9 @@ def uncertainty_from_fit(
 
     Notes
     -----
-    If several recordings are fitted, each is also linearised alone, with the same assumptions, to
-    compare them. Covariances of a two-phase field's phases are added after the choice of the error
-    model.
+    If several recordings are fitted, each is also fitted alone, by a Gauss–Newton step and with the
+    same assumptions, to compare them. Covariances of a two-phase field's phases are added after the
+    choice of the error model.
     """
     factored = factorise_information(fit)
     shared = fit.shared_count

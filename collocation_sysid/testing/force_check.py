@@ -187,7 +187,9 @@ class ForceLaw:
 
     @cached_property
     def generated(self) -> GeneratedFunction:
-        """Force as the programs evaluate it, with generated derivatives."""
+        """Force as the programs evaluate it, as a function of u and data with generated
+        derivatives.
+        """
         return GeneratedFunction(
             self.force.expression,
             self.force.input_size(self.dofs),

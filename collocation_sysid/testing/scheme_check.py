@@ -51,7 +51,8 @@ def check_scheme(scheme: str | Scheme) -> None:
     use no point before the start. An undamped oscillation does not grow. The error of an
     oscillator, computed in plain NumPy from the table, decreases with the stated order. A
     simulated motion of a small body satisfies every row of the table, evaluated in plain NumPy,
-    and gradient, Jacobian and Hessian of its program agree with central differences.
+    and gradient, Jacobian and Hessian of its program agree with central differences. An unknown
+    start rule is refused by its name. The scheme can be pickled.
 
     Parameters
     ----------
@@ -62,8 +63,6 @@ def check_scheme(scheme: str | Scheme) -> None:
     ------
     AssertionError
         For the first property that fails: which one, where, found and expected value.
-    A scheme that does not satisfy a row of its own table, cannot be pickled, or accepts an unknown
-    start rule fails, too.
     """
     made = as_scheme(scheme)
     check = PropertyCheck(f"scheme {made.name!r}")

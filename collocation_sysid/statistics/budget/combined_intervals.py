@@ -176,7 +176,7 @@ def widened_interval(
 
 
 def _clip(bounds: Interval, value: float) -> float:
-    """Return a value clipped to bounds."""
+    """Return a value clipped to bounds (lower, upper), which may be infinite."""
     low, high = bounds
     return float(min(max(value, low), high))
 

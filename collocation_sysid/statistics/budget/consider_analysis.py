@@ -399,6 +399,7 @@ def _without_row_changes(
     """
 
     def forced() -> ReactionForces:
+        """Return the reaction forces of the motion with changed derivatives by the columns."""
         lacking = motion.reactions
         assert lacking.reaction_by is not None  # along columns
         return replace(lacking, reaction_by=lacking.reaction_by - inertia_n)

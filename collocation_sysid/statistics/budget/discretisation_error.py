@@ -131,8 +131,8 @@ class Refinement:
 
     @property
     def contributions(self) -> tuple[str, ...]:
-        """Contributions that its intervals contain: "noise", and of "step" and "mesh" what
-        is known.
+        """Contributions that its intervals contain: "noise", then "step" and "mesh" if they are
+        known for at least one estimate.
         """
         return ("noise", *known_kinds(self.errors.values()))
 

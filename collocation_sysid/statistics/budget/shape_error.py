@@ -76,6 +76,9 @@ def surface_modes(
         Nodes of the mesh near which the surface is known, such as contact areas.
     correlation : float
         Correlation length over the longest extent.
+
+    Notes
+    -----
     Near `known` nodes they vanish. There are `SURFACE_MODES` modes; if the surface has fewer nodes,
     the others are zero.
     """
@@ -185,10 +188,10 @@ def _extend_to_all_nodes(body: Body, corner_fields: Array) -> Array:
 
 
 def standing_nodes(body: Body, gravity_m_s2: Array) -> Index:
-    """Return the indices of the lowest nodes of the undeformed body, on which it stands if nothing
-    grips it.
+    """Return the indices of the lowest nodes of the undeformed body, up to `STANDING` of its
+    height, on which it stands if nothing grips it.
 
-    Down is the direction of gravity (3,); that of −z if there is no gravity.
+    Down is the direction of gravity (3,) [m/s²]; that of −z if there is no gravity.
     """
     points_m = body.nodes.points_m
     length = float(np.linalg.norm(gravity_m_s2))

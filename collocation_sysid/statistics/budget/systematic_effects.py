@@ -126,17 +126,17 @@ class ExperimentAtAnswer:
 
     @property
     def gravity(self) -> Array:
-        """Gravity at each dof (3n,) [m/s²]."""
+        """Acceleration of gravity at each dof (3n,) [m/s²], at the answer."""
         return self.dynamics.forces.weight.gravity
 
     @cached_property
     def own_mass_kg(self) -> Array:
-        """Masses (3n,) of the body without point masses [kg]."""
+        """Masses (3n,) of the dofs of the body at the answer, without point masses and air [kg]."""
         return self.body.mass_of_dofs(self.theta)
 
     @cached_property
     def acceleration(self) -> Array:
-        """Accelerations (N, 3n) of the rows [m/s²]."""
+        """Accelerations (N, 3n) that the scheme assigns to the rows [m/s²]."""
         return self.dynamics.acceleration(self.iterate.x)
 
     @cached_property
@@ -270,8 +270,9 @@ class ExperimentAtAnswer:
 
     @cached_property
     def likely_support_dofs(self) -> Index:
-        """Dofs that were probably supported while the mesh was made: those prescribed in the
-        recording or, if these leave rigid motions, those of the lowest nodes.
+        """Dofs (k,) that were probably supported while the mesh was made: those prescribed in the
+        recording, without obstacles, or, if these leave rigid motions, all three of each of the
+        lowest nodes.
         """
         prescribed = self.iterate.equations.prescribed.dofs
         own = prescribed[prescribed < self.body.nodes.points_m.size]
@@ -283,8 +284,8 @@ class ExperimentAtAnswer:
         return own
 
     def weight_and_drag(self, mass_kg: Array) -> Array:
-        """Return the weight and the mass-proportional damping (N, 3n) [N] of masses (3n,) or (N,
-        3n) [kg].
+        """Return the weight and the mass-proportional damping −γ_m m v at the evaluations (N, 3n)
+        [N] of masses (3n,) or (N, 3n) [kg], without air.
         """
         return mass_kg * (
             self.gravity
@@ -372,7 +373,7 @@ class ExperimentAtAnswer:
 
     @cached_property
     def young_pa(self) -> float:
-        """Young's modulus of the softest part at small strain [Pa]."""
+        """Young's modulus of the softest part at small strain, at the answer [Pa]."""
         return min(
             engineering_constants(*moduli)[0]
             for moduli in self.body.lame(self.theta).values()

@@ -341,10 +341,16 @@ def _line(
         Name of the estimate.
     estimate : Estimate
     sources : VarianceSources
+        Covariances and sensitivities of the fit.
     error : DiscretisationError or None
         None if the discretisation error is not known.
     parameters : Parameters
         Provides scale and bounds.
+
+    Notes
+    -----
+    Sources without variance have no share. The variance for noise is divided into noise, nuisance
+    parameters and differences between recordings.
     """
     assert estimate.statistical95 is not None
     linear, bounds = parameters.scale_and_bounds(name)
@@ -448,8 +454,8 @@ def _estimate_derivatives(
 def main_sources(
     shares: Mapping[str, Mapping[str, float]], minimum_share: float
 ) -> list[str]:
-    """Return the sources with at least a share `minimum_share` in the variance of some estimate,
-    the largest first.
+    """Return the sources whose share in the variance of at least one estimate is `minimum_share` or
+    more, by their largest share, the largest first.
 
     Parameters
     ----------

@@ -252,7 +252,8 @@ class _CameraTrial:
 
     def visible_share(self, seeing: CameraDescription) -> float:
         """Return the share, from 0 to 1, of the surface facing the camera that has points of the
-        first image nearby, for a description of the camera; 0 if nothing faces it.
+        first sample with points within `within_m`, for a description of the camera; 0 if nothing
+        faces it. For a camera without a matrix the whole visible surface counts as facing.
         """
         motion = seeing.carrier @ seeing.pose
         turn = motion[:3, :3]

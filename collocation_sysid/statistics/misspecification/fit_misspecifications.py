@@ -127,6 +127,12 @@ def _refit_hypotheses(
     budget : int or None
         Largest number of sweeps for all refits together; None for the default, see
         `find_misspecifications`.
+
+    Notes
+    -----
+    Only the first `MOST_SAMPLES` samples are fitted. Tested are a clock lag (not in a static
+    experiment), a marker that slips, directions of gravity, and grasps one layer deeper or less
+    deep.
     """
     first = first_samples(experiment, MOST_SAMPLES)
     alone = _Refitter(solution, first, sweeps=budget)
@@ -419,9 +425,11 @@ def _delayed_poses(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
 
 
 def _marker_lag_s(experiment: Experiment, predicted_m: Array) -> float:
-    """Return by how much the markers lag behind predicted tracks (T, M, 3) [m], in seconds: Σ r·v /
-    Σ v·v of residuals (fitted less measured) and velocities; 0 without motion. Missing samples are
-    ignored.
+    """Return by how much the markers lag behind predicted tracks (T, M, 3) [m], in seconds, to
+    first order; negative if they are early.
+
+    It is Σ r·v / Σ v·v of residuals r (predicted less measured) and velocities v of the predicted
+    tracks; 0 without motion. Missing samples are ignored.
     """
     v = np.gradient(predicted_m, experiment.timestep_s, axis=0)
     residual = np.where(

@@ -345,8 +345,9 @@ class ModalComparison:
             )
 
     def _name_hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield the hypothesis that markers have each other's names, tested on these markers; none
-        with fewer than two markers or a marker without samples.
+        """Yield the hypothesis that markers have each other's names, by the best assignment of
+        tracks to predictions, if on these markers it fits far better; nothing with fewer than
+        two markers or a marker without samples.
         """
         declared = self.declared
         squares = np.sum(
@@ -409,7 +410,9 @@ def _fit_rigid_motion(from_m: Array, to_m: Array) -> tuple[Array, Array]:
 
 
 def _determines_rotation(places_m: Array) -> bool:
-    """Whether places (M, 3) are not collinear, so that they determine a rotation."""
+    """Whether places (M, 3) determine a rotation: at least three, whose second principal extent is
+    above a tenth of the first, so that they are not nearly collinear.
+    """
     if len(places_m) < 3:
         return False
     extents = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)

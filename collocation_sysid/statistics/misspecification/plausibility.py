@@ -103,8 +103,9 @@ def _likely_length(body: Body, *, too_large: bool) -> str:
 
 
 def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
-    """Return the hypothesis that no material is as dense and as soft as a body with constants θ
-    (k,); None if there may be one.
+    """Return the hypothesis "density/metal" that no material is as dense and as soft as a body with
+    constants θ (k,); None if there may be one: with a density below `METAL_KG_M3`, or a Young's
+    modulus of the stiffest part above `SOFTEST_METAL_PA`.
 
     Motion determines the stiffness over the density only, so a wrong density leaves no other trace.
     """
@@ -432,7 +433,7 @@ def _is_lasting(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
 
 def _usual_change(sizes: Array) -> float:
     """Return the 90 % quantile of changes of any shape, without NaN and the largest three; 0 if
-    there are no others.
+    there are three or fewer.
     """
     rest = np.sort(sizes[np.isfinite(sizes)])[:-3]
     return float(np.quantile(rest, LIVELY)) if len(rest) else 0.0

@@ -116,7 +116,9 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
 
 
 def _thinned(experiment: Experiment) -> Experiment:
-    """Return the experiment of a specimen with at most `REFITTED_SAMPLES` of its samples."""
+    """Return a copy of the experiment of a specimen with at most `REFITTED_SAMPLES` of its samples,
+    evenly chosen by index, without markers and without sensors that have no value there.
+    """
     count = len(experiment.t_s)
     chosen = np.unique(
         np.linspace(0, count - 1, min(count, REFITTED_SAMPLES)).astype(int)

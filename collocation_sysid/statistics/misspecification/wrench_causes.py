@@ -496,6 +496,7 @@ class _OneSensor:
 def _without_tare(values: Array, tare: float) -> Array:
     """Return columns (S, c) in standard deviations, without the offset that a tare with a prior of
     `tare` standard deviations explains: none for 0, the mean if infinite. NaN is ignored.
+    Columns without a value stay NaN.
     """
     is_measured = np.isfinite(values)
     prior_weight = (

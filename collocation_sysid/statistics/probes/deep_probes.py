@@ -118,7 +118,9 @@ def _window_probes(at: SolvedFit) -> Iterator[Probe]:
 
 
 def _third(block: ResidualBlock, k: int) -> slice:
-    """Return the slice of the samples in third k (an index) of a block's samples."""
+    """Return the slice of the samples in third k (index 0, 1 or 2) of a block's samples, by their
+    number; thirds are as equal as rounding allows.
+    """
     ends = np.round(np.linspace(0, len(block.t_s), len(WINDOWS) + 1)).astype(
         int
     )

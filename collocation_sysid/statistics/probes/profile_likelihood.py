@@ -207,7 +207,8 @@ def _message(
     interval: tuple[float | None, float | None],
     bounds: tuple[float, float],
 ) -> str:
-    """Return the message for an interval of a parameter.
+    """Return the message for an interval of a parameter: two limits, one limit, or not
+    identifiable.
 
     Parameters
     ----------

@@ -73,7 +73,8 @@ class Probe:
     name : str
         Name of the window, of the recording, or of the assumption with its component after a space.
     chi_squared : float
-        Decrease of χ², with the stated σ and with priors, compared with the fit of all data.
+        Decrease of χ² of the refitted data, with the stated σ and with priors, from the parameters
+        of the fit of all data to those of the refit.
     moves : mapping of str to EstimateChange
         Changes of the estimates that the refit determines.
     size, size_error : float or None
@@ -343,8 +344,8 @@ def relaxed_probe(
     Returns
     -------
     Probe
-        Its size is that of the most significant amplitude, if there are several; its `sentences`
-        are empty.
+        Its size, in the unit of the assumption, is that of the most significant amplitude if there
+        are several; its `sentences` are empty.
     """
     first = len(fit.fit.names)
     step = gauss_newton_step(wide)

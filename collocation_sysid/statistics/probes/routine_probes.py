@@ -64,7 +64,8 @@ def probed_deviations(
 
 
 def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
-    """Relax each routine assumption by one linear step from the answer.
+    """Return the probes that relax each routine assumption by one linear step from the answer, in
+    the order of `ROUTINE`; none is left out because it is not significant.
 
     Parameters
     ----------
