@@ -258,8 +258,8 @@ def _check_order(check: PropertyCheck, scheme: Scheme) -> None:
 
 
 def _check_simulation(check: PropertyCheck, scheme: Scheme) -> None:
-    """Require that a simulated fall of a swung small body satisfies every row of the table, and
-    check the derivatives of its program by `check_program`.
+    """Require that a simulated motion of a small body, swung by a grasp from its undeformed shape,
+    satisfies every row of the table at its free dofs; check its program by `check_program`.
     """
     body = Body(
         box_mesh((0.05, 0.05, 0.1), (1, 1, 2)), density_kg_m3=DENSITY_KG_M3
