@@ -407,7 +407,10 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
     surface = existing_file(folder, section.surface, key="surface")
     cache = folder / ".meshes"
     return TetMesh.from_surface(
-        surface, section.edge_length_m, section.length_unit, cache
+        surface,
+        section.edge_length_m,
+        length_unit=section.length_unit,
+        cache=cache,
     )
 
 

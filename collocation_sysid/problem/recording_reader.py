@@ -285,7 +285,9 @@ class RecordingReader:
         if (transform := grasp.gripper_to_body) is not None:
             with located(where=self._grasp_key(k, "gripper_to_body")):
                 transform_pose = PoseSequence(
-                    [0.0], [transform.position_m], [transform.quaternion_xyzw]
+                    [0.0],
+                    [transform.position_m],
+                    quaternions_xyzw=[transform.quaternion_xyzw],
                 )
                 poses = poses.after(transform_pose)
         return replace(poses, interpolation=grasp.interpolation)
@@ -656,7 +658,9 @@ class RecordingReader:
         """
         if not self.section.has_markers:
             times = self._sample_times(poses)
-            return MarkerTable(times, (), np.zeros((len(times), 0, 3)))
+            return MarkerTable(
+                times, (), positions_m=np.zeros((len(times), 0, 3))
+            )
         if self._marker_tracks is not None:
             return self._select_tracks(self._marker_tracks)
         markers = self.section.markers
@@ -673,7 +677,9 @@ class RecordingReader:
             raise InputError(message, where="markers.reference_m")
         times = self._sample_times(poses)
         return self._select_tracks(
-            MarkerTable(times, names, np.zeros((len(times), len(names), 3)))
+            MarkerTable(
+                times, names, positions_m=np.zeros((len(times), len(names), 3))
+            )
         )
 
     def _sample_times(self, poses: Sequence[PoseSequence]) -> Array:
@@ -775,7 +781,9 @@ class RecordingReader:
             )
             raise InputError(message, where="markers")
         names = tuple(table.names[k] for k in indices)
-        return MarkerTable(table.t_s, names, table.positions_m[:, indices])
+        return MarkerTable(
+            table.t_s, names, positions_m=table.positions_m[:, indices]
+        )
 
     def _align(self, poses: list[PoseSequence]) -> AlignedRecording:
         """Return times, poses and tracks on one clock and time grid, and add notes.
@@ -906,8 +914,9 @@ class RecordingReader:
         return Markers(
             t_s,
             table.positions_m,
-            sigma_m / np.sqrt(_by_marker(section.weights, names, default=1.0)),
-            names,
+            sigma_m=sigma_m
+            / np.sqrt(_by_marker(section.weights, names, default=1.0)),
+            names=names,
             places_m=np.array(
                 [section.reference_m.get(name, [np.nan] * 3) for name in names]
             ),

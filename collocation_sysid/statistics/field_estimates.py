@@ -459,7 +459,7 @@ class SampleQuantiles(NamedTuple):
 def _quantiles(values: Array) -> SampleQuantiles:
     """Return median and 95 % interval of samples (any shape, not empty)."""
     lower, median, upper = np.quantile(values, [ENDS[0], 0.5, ENDS[1]])
-    return SampleQuantiles(float(lower), float(median), float(upper))
+    return SampleQuantiles(float(lower), float(median), upper=float(upper))
 
 
 def field_estimates_at(

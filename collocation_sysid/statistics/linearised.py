@@ -91,14 +91,16 @@ def observable_responses(
         grasp_forces = GraspForces.zeros(
             len(iterate.x),
             len(segment.sensed_dofs),
-            len(segment.dynamic_parameters),
+            columns=len(segment.dynamic_parameters),
         )
         rows = Sweep(segment).sensitivities(
-            iterate.x, iterate.equations, grasp_forces
+            iterate.x, iterate.equations, grasp_forces=grasp_forces
         )
         return iterate.observation.response_of_rows(rows, grasp_forces)
 
-    return map_experiments(of, collocation.iterates(z), collocation.threads)
+    return map_experiments(
+        of, collocation.iterates(z), threads=collocation.threads
+    )
 
 
 def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
@@ -252,7 +254,7 @@ class ResidualBlock:
             self.jacobian.reshape(
                 samples, 3 * markers, self.jacobian.shape[-1]
             ),
-            self.is_measured.reshape(samples, 3 * markers),
+            is_measured=self.is_measured.reshape(samples, 3 * markers),
         )
 
 

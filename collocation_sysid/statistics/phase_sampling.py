@@ -119,7 +119,7 @@ class InternalFaces:
         return cls(
             np.column_stack([cell_of_face[first], cell_of_face[second]]),
             areas / areas.mean(),
-            len(cells),
+            element_count=len(cells),
         )
 
     @property

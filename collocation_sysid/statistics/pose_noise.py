@@ -202,17 +202,21 @@ def _residual_samples(
     solver = Sweep(segment)
     changes = []
     columns = SweepColumns.from_prescribed(
-        solver, iterate.equations, displacements_m
+        solver, iterate.equations, changes_m=displacements_m
     )
     for response in propagate_columns(iterate, solver, columns=columns):
         reading = response.reading
         by_noise = response.changes
         for grasp, shifts, rotations in pose_errors:
             by_noise = by_noise + reading.observable.frame_changes(
-                grasp, response.motion, iterate.phi, shifts, rotations
+                grasp,
+                response.motion,
+                phi=iterate.phi,
+                shifts=shifts,
+                rotations=rotations,
             )
         residual_changes = reading.residual_changes(
-            response.values, by_noise, iterate.phi
+            response.values, by_noise, phi=iterate.phi
         )
         changes.append(np.moveaxis(residual_changes, 3, 0))
     return changes
@@ -237,7 +241,7 @@ def _pose_samples(
         for own, sigma, values in zip(
             samples, (noise.sigma_m, noise.sigma_rad), white, strict=True
         ):
-            between = _interpolate(grasp.poses, sigma * values, t_s[rows])
+            between = _interpolate(grasp.poses, sigma * values, t_s=t_s[rows])
             own[rows] = between.reshape(len(rows), count, 3)
     return samples[0], samples[1]
 

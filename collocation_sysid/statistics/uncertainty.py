@@ -266,7 +266,7 @@ def uncertainty_from_fit(
             f"the noise cannot be estimated from {fit.measurement_count} measurements of "
             f"{len(fit.names)} parameters; give sigma_m and use noise = 'given'"
         )
-    bars = _error_bars(fit, factored, error_model)
+    bars = _error_bars(fit, factored, requested=error_model)
     basis = bars.basis
     of_all, bounded = _reported_covariance(
         bars.covariance, fit, parameters=parameters, q=q
@@ -366,7 +366,9 @@ def _error_bars(
     )
     if requested.noise == "auto" and correlated and level.pooled < 1:
         kind = "given"
-    of_score, freedom = level.score_covariance(kind, factored, fit.shared_count)
+    of_score, freedom = level.score_covariance(
+        kind, factored, shared=fit.shared_count
+    )
     covariance = factored.fit.covariance(of_score)
     used = "independent"
     if correlated:
@@ -391,7 +393,7 @@ def _error_bars(
     return _ErrorBars(
         covariance,
         student_ppf(0.975, freedom),
-        ErrorBasis(
+        basis=ErrorBasis(
             kind, used, level=level, dependence=dependence, outliers=outliers
         ),
     )
@@ -473,7 +475,9 @@ def _widen_by_scatter(
         Comparison of the recordings; None leaves everything unchanged.
     """
     if scatter is None:
-        return _WidenedBars(covariance_q, quantiles, np.ones(len(quantiles)))
+        return _WidenedBars(
+            covariance_q, quantiles, factors=np.ones(len(quantiles))
+        )
     with np.errstate(invalid="ignore"):
         factors = np.sqrt(
             scatter.widen(np.diag(covariance_q)) / np.diag(covariance_q)
@@ -611,12 +615,14 @@ def _correlated_score_covariance(
     independent errors in every direction.
     """
     of_score, freedom = score_covariance(
-        factored, error_processes(fit, factored), fit.shared_count
+        factored, error_processes(fit, factored), shared=fit.shared_count
     )
     if kind == "given" or level.known_score_covariance.any():
         # In no direction less than independent errors of the σ given bring, nor than those found
         # with what is known to add to them: an autoregression may miss that.
-        least, _ = level.score_covariance(kind, factored, fit.shared_count)
+        least, _ = level.score_covariance(
+            kind, factored, shared=fit.shared_count
+        )
         root = np.linalg.cholesky(least + 1e-12 * np.eye(len(least)))
         over = np.linalg.solve(root, np.linalg.solve(root, of_score).T)
         values, vectors = np.linalg.eigh((over + over.T) / 2)

@@ -84,7 +84,7 @@ def check_damping(
         check.fail(
             "it has both or neither of a stress and a potential",
             made,
-            "one of both",
+            expected="one of both",
         )
     values = usual_constants((*known.constants, *made.constants), constants)
     stress = DampingStress(made, known, values=np.array([*values.values()]))
@@ -97,11 +97,11 @@ def check_damping(
             f"at random deformation {number} (strains up to {largest_strain:g})"
         )
         rate = check.rng.standard_normal(9)
-        _check_derivatives(check, stress, F, rate, where)
+        _check_derivatives(check, stress, F=F, rate=rate, where=where)
         if is_dissipative:
-            _check_dissipation(check, stress, F, where)
+            _check_dissipation(check, stress, F=F, where=where)
         if is_objective:
-            _check_objectivity(check, stress, F, rate, where)
+            _check_objectivity(check, stress, F=F, rate=rate, where=where)
     for element in elements:
         check_internal_forces(
             check,
@@ -178,7 +178,7 @@ class DampingStress:
             ca.SX(ca.DM(each)) for each in np.split(self.values, [count])
         ]
         stress, stated = damping_stress(
-            self.law, self.material, [F, rate, *constants]
+            self.law, self.material, symbols=[F, rate, *constants]
         )
         by_F = ca.jacobian(stress, F)
         by_rate = ca.jacobian(stress, rate)
@@ -233,7 +233,7 @@ def _check_derivatives(
     check.require_derivative(
         lambda at: stress.evaluate(at, rate).stress,
         state.stated_by_F,
-        F,
+        point=F,
         statement=f"∂P_v/∂F is wrong {where}",
         scale=0.1,
     )
@@ -252,7 +252,7 @@ def _check_dissipation(
             f"it adds energy {where}: the smallest dissipated power P_v:Ḟ of a rate with "
             "‖Ḟ‖ = 1/s is negative",
             powers[0],
-            "at least 0 W/m³",
+            expected="at least 0 W/m³",
         )
 
 

@@ -86,7 +86,7 @@ def assert_derivative(
     """
     for _ in range(directions):
         direction = np.asarray(scale) * rng.standard_normal(np.shape(point))
-        expected = directional_derivative(function, point, direction)
+        expected = directional_derivative(function, point, direction=direction)
         product = np.asarray(jacobian_times(direction))
         assert product.shape == expected.shape
         error = np.linalg.norm(product - expected)

@@ -125,11 +125,11 @@ def check_force(
     ]
     for number, state in enumerate(states):
         where = f"at random state {number}"
-        _check_derivatives(check, law, state, where)
+        _check_derivatives(check, law, state=state, where=where)
         if energy is not None:
-            _check_energy(check, law, state, energy, where)
+            _check_energy(check, law, state=state, energy=energy, where=where)
         if is_dissipative:
-            _check_dissipation(check, law, state, where)
+            _check_dissipation(check, law, state=state, where=where)
     if is_zero_at_rest:
         u, data = law.state_at_rest(states[0])
         found = law.evaluate_plain(u, data)[: law.dofs]
@@ -140,8 +140,8 @@ def check_force(
             scale=1.0,
         )
     unplaced = replace(made, nodes=None)
-    _check_messages(check, unplaced, values)
-    _check_round_trips(check, law, states[0], file)
+    _check_messages(check, unplaced, values=values)
+    _check_round_trips(check, law, state=states[0], file=file)
     small = body or Body(
         uneven_box(1), density_kg_m3=DENSITY_KG_M3, forces=[unplaced]
     )
@@ -346,7 +346,7 @@ def _check_derivatives(
     check.require_derivative(
         lambda at: law.evaluate_plain(at, data),
         jacobian[..., 0],
-        u,
+        point=u,
         statement=f"the derivative of the force by (x, v, constants) is wrong {where}",
         scale=scale,
     )
@@ -358,7 +358,7 @@ def _check_derivatives(
             ]
         ),
         hessian,
-        u,
+        point=u,
         statement=f"the second derivative of the force by (x, v, constants) is wrong {where}",
         scale=scale,
     )
@@ -395,7 +395,7 @@ def _check_energy(
             ca.evalf(ca.SX(energy(ca.DM(place), at, **named))).full()
         ),
         -force,
-        u[:3],
+        point=u[:3],
         statement=statement,
         scale=DISPLACEMENT_M,
     )
@@ -427,7 +427,7 @@ def _check_dissipation(
         check.fail(
             f"it adds energy {where}: the power (f(x, v) − f(x, 0))·v is positive",
             max(powers),
-            "at most 0 W",
+            expected="at most 0 W",
         )
 
 

@@ -159,7 +159,7 @@ class PlainInternalForce:
         symbols = [ca.SX.sym("F", 9), ca.SX.sym("rate", 9)]
         psi = part.material.psi(ca.reshape(symbols[0], 3, 3), constants[0])
         viscous, _ = damping_stress(
-            part.damping, part.material, [*symbols, *constants]
+            part.damping, part.material, symbols=[*symbols, *constants]
         )
         total = ca.gradient(psi, symbols[0]) + viscous
         return ca.substitute(total, ca.vertcat(*symbols), ca.vertcat(F, rate))
@@ -222,7 +222,7 @@ class PlainInternalForce:
         jacobian[:, -1] -= self.body.dof_mass * v
         hessian[size : 2 * size, -1] -= self.body.dof_mass * w
         hessian[-1, size : 2 * size] -= self.body.dof_mass * w
-        return ForceDerivatives(force, jacobian, hessian)
+        return ForceDerivatives(force, jacobian, second=hessian)
 
 
 def check_internal_forces(
@@ -282,17 +282,24 @@ def check_internal_forces(
     w = check.rng.standard_normal(x.size)
     plain = None if body.element.mean_dilatation else PlainInternalForce(body)
     first = _check_derivatives(
-        check, body, [x, v, w], theta, plain=plain, where=""
+        check, body, state=[x, v, w], theta=theta, plain=plain, where=""
     )
     at_rest = [body.nodes_m.ravel(), np.zeros_like(v), w]
     _check_derivatives(
-        check, body, at_rest, theta, plain=plain, where=" undeformed"
+        check,
+        body,
+        state=at_rest,
+        theta=theta,
+        plain=plain,
+        where=" undeformed",
     )
-    _check_energy(check, body, x, theta)
+    _check_energy(check, body, x=x, theta=theta)
     if is_objective:
-        _check_objectivity(check, body, x, v, theta)
+        _check_objectivity(check, body, x=x, v=v, theta=theta)
     if is_dissipative:
-        _check_dissipation(check, body, first[:, x.size : 2 * x.size])
+        _check_dissipation(
+            check, body, by_velocity=first[:, x.size : 2 * x.size]
+        )
 
 
 def _check_derivatives(
@@ -328,7 +335,7 @@ def _check_derivatives(
     elements = f"{where} {body.element.name} elements".strip()
     force = body.force(x, v, theta)[0]
     first = _first_derivatives(body, x, v=v, theta=theta)
-    second = _second_derivatives(body, state, theta)
+    second = _second_derivatives(body, state, theta=theta)
     # Forces of an undeformed body are zero; what counts is their change by a large change of x.
     size = max(
         float(np.abs(force).max()),
@@ -384,8 +391,8 @@ def _check_energy(
     check.require_product(
         lambda at: np.atleast_1d(body.energy(at, **constants)),
         np.atleast_1d(-force @ direction),
-        x,
-        direction,
+        point=x,
+        direction=direction,
         statement=f"the compiled force of {body.element.name} elements is not minus the gradient "
         "of the compiled energy",
     )
@@ -426,7 +433,7 @@ def _check_dissipation(
             f"the damping of {body.element.name} elements adds energy: the largest eigenvalue of "
             "∂f/∂v is positive",
             powers[-1],
-            "at most 0 N s/m",
+            expected="at most 0 N s/m",
         )
 
 
@@ -473,15 +480,15 @@ def _check_differences(
     check.require_product(
         force_at,
         derivatives[0] @ direction,
-        point,
-        direction,
+        point=point,
+        direction=direction,
         statement=f"the first derivative {where}",
     )
     check.require_product(
         weighted_derivative_at,
         derivatives[1] @ direction,
-        point,
-        direction,
+        point=point,
+        direction=direction,
         statement=f"the second derivative {where}",
     )
 

@@ -107,11 +107,11 @@ def check_material(
     law = EnergyDerivatives(made, np.array([*values.values()]))
     _check_undeformed(check, law)
     for where, F in _deformations(check.rng, largest_strain):
-        _check_derivatives(check, law, F, where)
+        _check_derivatives(check, law, F=F, where=where)
         if is_objective:
-            _check_objectivity(check, law, F, where)
-    _check_messages(check, made, values)
-    _check_round_trips(check, made, values, file, function)
+            _check_objectivity(check, law, F=F, where=where)
+    _check_messages(check, made, values=values)
+    _check_round_trips(check, made, values=values, file=file, function=function)
     for element in elements:
         check_internal_forces(
             check,
@@ -184,7 +184,7 @@ class EnergyDerivatives:
         values = ca.SX.sym("values", len(self.values))
         gradient = ca.reshape(F, 3, 3)
         rule = self.material.chain_rule(gradient, values)
-        psi = self.material.psi_in(rule, gradient, values)
+        psi = self.material.psi_in(rule, gradient, values=values)
         stress = rule.gradient(psi, F)
         outputs = [
             psi,
@@ -197,7 +197,9 @@ class EnergyDerivatives:
     def evaluate(self, F: Array) -> StressState:
         """Return energy, stress and stiffness at F (9,), stacked column after column."""
         outputs = [output.full() for output in self._function.call([F])]
-        return StressState(outputs[0].ravel(), outputs[1].ravel(), outputs[2])
+        return StressState(
+            outputs[0].ravel(), outputs[1].ravel(), tangent=outputs[2]
+        )
 
     def evaluate_kernel(
         self, F: Array, values: Array | None = None
@@ -306,7 +308,7 @@ def _check_undeformed(check: PropertyCheck, law: EnergyDerivatives) -> None:
         check.fail(
             "the undeformed material does not resist every strain",
             smallest,
-            "above 0 Pa",
+            expected="above 0 Pa",
         )
 
 
@@ -327,7 +329,7 @@ def _check_derivatives(
         check.fail(
             f"the energy is not finite {where}",
             state.psi[0],
-            "a finite energy, or a smaller largest_strain",
+            expected="a finite energy, or a smaller largest_strain",
         )
     check.require_equal(
         state.psi,
@@ -337,14 +339,14 @@ def _check_derivatives(
     check.require_derivative(
         lambda at: law.evaluate(at).psi,
         state.stress,
-        F,
+        point=F,
         statement=f"P is not ∂ψ/∂F {where}",
         scale=0.1,
     )
     check.require_derivative(
         lambda at: law.evaluate(at).stress,
         state.tangent,
-        F,
+        point=F,
         statement=f"∂P/∂F is wrong {where}",
         scale=0.1,
     )
@@ -379,7 +381,7 @@ def _check_kernel_derivatives(
     check.require_derivative(
         lambda values: law.evaluate_kernel(F, values).stress,
         kernel.by_constants,
-        law.values,
+        point=law.values,
         statement=f"∂P/∂θ is wrong {where}",
         scale=sizes,
     )

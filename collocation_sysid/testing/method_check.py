@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -166,30 +167,38 @@ def _check_answer(
     """
     if not isinstance(solution, Solution):
         check.fail(
-            "it does not return a Solution", type(solution).__name__, "Solution"
+            "it does not return a Solution",
+            type(solution).__name__,
+            expected="Solution",
         )
     if not solution.status.converged:
         check.fail(
-            f"it does not converge{where}", solution.status.value, "converged"
+            f"it does not converge{where}",
+            solution.status.value,
+            expected="converged",
         )
     for name in GUESSES:
         value = solution.parameters[name]
         if not abs(value / TRUTH[name] - 1) <= largest_error:
             check.fail(
-                f"the estimate of {name} is wrong{where}", value, TRUTH[name]
+                f"the estimate of {name} is wrong{where}",
+                value,
+                expected=TRUTH[name],
             )
     low, high = solution.collocation.bounds()
     excess = float(
         np.maximum(low - solution.z, solution.z - high).max(initial=0.0)
     )
     if not excess <= 1e-9:
-        check.fail(f"a variable is outside its bounds{where}", excess, "0")
+        check.fail(
+            f"a variable is outside its bounds{where}", excess, expected="0"
+        )
     violation = solution.max_violation_relative
     if is_exact and not violation <= LARGEST_VIOLATION:
         check.fail(
             f"the equations of motion do not hold{where}: residual over the largest force",
             violation,
-            f"at most {LARGEST_VIOLATION:g}",
+            expected=f"at most {LARGEST_VIOLATION:g}",
         )
 
 
@@ -211,25 +220,27 @@ def _check_history(
         Lines that `watch` received, in order.
     """
     if not solution.history:
-        check.fail("the history of the solve is empty", 0, "at least one line")
+        check.fail(
+            "the history of the solve is empty", 0, expected="at least one line"
+        )
     if lines != list(solution.history):
         check.fail(
             "watch did not get every line of the history",
             len(lines),
-            len(solution.history),
+            expected=len(solution.history),
         )
     complete = [line.loss for line in solution.history if line.share >= 1.0]
     if not complete:
         check.fail(
             "no line of the history is about the complete recording",
             solution.history[-1].share,
-            1.0,
+            expected=1.0,
         )
     if not complete[-1] <= complete[0]:
         check.fail(
             "the loss of the last line of the history is above that of the first",
             complete[-1],
-            complete[0],
+            expected=complete[0],
         )
     expected = (
         solution.collocation.objective(solution.z)
@@ -237,7 +248,9 @@ def _check_history(
     )
     if not np.isfinite(expected):
         check.fail(
-            "the loss of the answer is not finite", expected, "a finite loss"
+            "the loss of the answer is not finite",
+            expected,
+            expected="a finite loss",
         )
 
 
@@ -260,9 +273,7 @@ def _check_options(check: PropertyCheck, method: Any) -> None:
     for name, value in options.items():
         if isinstance(value, bool | int | float):
             check.require_refusal(
-                lambda name=name: method_from_options(
-                    kind, {name: "text"}, key=key
-                ),
+                partial(method_from_options, kind, {name: "text"}, key=key),
                 naming=f"{key}.{name}",
                 statement=f"the text 'text' as the option {name}",
             )
@@ -279,9 +290,11 @@ def _check_options(check: PropertyCheck, method: Any) -> None:
         check.fail(
             "its options from a problem file are refused",
             error,
-            "the same method",
+            expected="the same method",
         )
     if read != method:
         check.fail(
-            "its options from a problem file give another method", read, method
+            "its options from a problem file give another method",
+            read,
+            expected=method,
         )

@@ -83,13 +83,15 @@ def check_nuisance(
         check.fail(
             f"the recording {base.name!r} does not have it",
             "no value",
-            "at least one value",
+            expected="at least one value",
         )
     collocation = program_of(changed, {})
     data = collocation.transcriptions[0].nuisance
-    _check_round_trips(check, row, data, file, name_in_file)
+    _check_round_trips(
+        check, row, data=data, file=file, name_in_file=name_in_file
+    )
     if row not in KINDS:
-        _check_messages(check, row, base)
+        _check_messages(check, row, experiment=base)
     if row.reading is not None:
         _check_reading(check, row, collocation=collocation)
     if row.clock is not None:
@@ -189,14 +191,14 @@ def _check_reading(
     check.require_derivative(
         lambda at: _read(row, at[:3], values=at[3:], t_s=t_s, data=data),
         jacobian,
-        u,
+        point=u,
         statement="the first derivative of the reading is wrong",
         scale=scale,
     )
     check.require_derivative(
         lambda at: weights @ derivatives.call([at])[0].full(),
         hessian,
-        u,
+        point=u,
         statement="the second derivative of the reading is wrong",
         scale=scale,
     )

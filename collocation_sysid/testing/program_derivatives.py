@@ -65,23 +65,23 @@ def check_program(check: PropertyCheck, collocation: Collocation) -> None:
         check.require_product(
             lambda at: np.atleast_1d(program.objective(at)),
             np.atleast_1d(gradient @ direction),
-            z,
-            direction,
+            point=z,
+            direction=direction,
             statement=f"the gradient of the loss by {meaning} is wrong in a small program",
         )
         check.require_product(
             program.constraint_values,
             jacobian @ direction,
-            z,
-            direction,
+            point=z,
+            direction=direction,
             statement=f"the Jacobian of the equations of motion by {meaning} is wrong "
             "in a small program",
         )
         check.require_product(
             lagrangian_gradient,
             hessian @ direction,
-            z,
-            direction,
+            point=z,
+            direction=direction,
             statement=f"the Hessian of the Lagrangian by {meaning} is wrong in a small program",
         )
 

@@ -156,7 +156,9 @@ class PropertyCheck:
         def differences(step: float) -> Array:
             """Return the derivative by differences, times the scale."""
             columns = [
-                directional_derivative(function, point, direction, step)
+                directional_derivative(
+                    function, point, direction=direction, step=step
+                )
                 for direction in np.diag(steps)
             ]
             return np.stack([np.ravel(column) for column in columns], axis=1)
@@ -210,7 +212,7 @@ class PropertyCheck:
         expected = _closest(
             found,
             lambda step: directional_derivative(
-                function, point, direction, step
+                function, point, direction=direction, step=step
             ),
             tolerance=tolerance * size,
         )

@@ -50,7 +50,7 @@ def check_pickling(
         check.fail(
             "pickling fails, so that no cluster can evaluate it",
             f"{type(error).__name__}: {error}",
-            "a function that refers to no open file, lock or CasADi symbol",
+            expected="a function that refers to no open file, lock or CasADi symbol",
         )
     check.require_equal(
         evaluate(copy),

@@ -68,7 +68,7 @@ def check_scheme(scheme: str | Scheme) -> None:
     check = PropertyCheck(f"scheme {made.name!r}")
     _check_regular(check, made.regular)
     for row, stencil in enumerate(made.start, start=1):
-        _check_start(check, stencil, row)
+        _check_start(check, stencil, row=row)
     _check_stability(check, made)
     _check_order(check, made)
     _check_simulation(check, made)
@@ -130,7 +130,7 @@ def _check_start(check: PropertyCheck, stencil: Stencil, row: int) -> None:
         check.fail(
             f"the stencil of row {row} uses points before the start",
             f"{max(points, len(stencil.s))} points",
-            f"at most {row + 1}",
+            expected=f"at most {row + 1}",
         )
 
 
@@ -149,7 +149,7 @@ def _check_values(
     """
     for name, (moment, value) in expected.items():
         if not abs(moment - value) <= ROUNDING:
-            check.fail(f"{name} in {where} is wrong", moment, value)
+            check.fail(f"{name} in {where} is wrong", moment, expected=value)
 
 
 def _check_stability(check: PropertyCheck, scheme: Scheme) -> None:
@@ -168,7 +168,7 @@ def _check_stability(check: PropertyCheck, scheme: Scheme) -> None:
             check.fail(
                 f"it adds energy: per step, an undamped oscillation with ωΔt = {step:g} grows by",
                 largest,
-                "at most a factor of 1",
+                expected="at most a factor of 1",
             )
 
 
@@ -253,7 +253,7 @@ def _check_order(check: PropertyCheck, scheme: Scheme) -> None:
         check.fail(
             "the error of an oscillator has another order than stated",
             order,
-            scheme.order,
+            expected=scheme.order,
         )
 
 
@@ -271,7 +271,9 @@ def _check_simulation(check: PropertyCheck, scheme: Scheme) -> None:
             experiment, values, scheme, substeps=1
         ).positions_m.reshape(-1, 3 * len(body.nodes_m))
     except SimulationError as error:
-        check.fail("a small body cannot be simulated", error, "a motion")
+        check.fail(
+            "a small body cannot be simulated", error, expected="a motion"
+        )
     theta = np.array([*values.values()])
     weight = np.tile(experiment.gravity_m_s2, len(body.nodes_m)) * body.dof_mass
     rows = PlainRows(

@@ -85,7 +85,9 @@ def check_sensor(
     expression = SensorExpression(sensor)
     for number in range(STATES):
         u = expression.random_state(check.rng)
-        _check_derivatives(check, expression, u, f"at random state {number}")
+        _check_derivatives(
+            check, expression, u=u, where=f"at random state {number}"
+        )
     check.require_refusal(
         lambda: replace(
             sensor, unknowns={**sensor.unknowns, "no_such_unknown": 1.0}
@@ -93,7 +95,7 @@ def check_sensor(
         naming="no_such_unknown",
         statement="an unknown that the expression does not have",
     )
-    _check_round_trips(check, sensor, file, function)
+    _check_round_trips(check, sensor, file=file, function=function)
     collocation = _small_program(sensor)
     if sensor.grasp is None:
         _check_prediction(check, expression, collocation=collocation)
@@ -226,14 +228,14 @@ def _check_derivatives(
     check.require_derivative(
         expression.evaluate_plain,
         jacobian,
-        u,
+        point=u,
         statement=f"the first derivative of the expression is wrong {where}",
         scale=expression.scale,
     )
     check.require_derivative(
         lambda at: weights @ expression.automatic.call([at, weights])[1].full(),
         hessian,
-        u,
+        point=u,
         statement=f"the second derivative of the expression is wrong {where}",
         scale=expression.scale,
     )

@@ -67,7 +67,7 @@ def smooth_poses(
     share = 1 - np.cos(angular_frequency_rad_s * t_s)
     rotations = Rotation.from_rotvec(np.outer(share, half_turn_rad))
     positions_m = np.outer(share, half_translation_m)
-    return PoseSequence(t_s, positions_m, rotations.as_quat())
+    return PoseSequence(t_s, positions_m, quaternions_xyzw=rotations.as_quat())
 
 
 def usual_constants(
@@ -130,7 +130,9 @@ def swung_experiment(body: Body, **changes: Any) -> Experiment:
     names = [f"m{k}" for k in range(len(points_m))]
     arguments: dict[str, Any] = {
         "grasps": [Grasp(highest_nodes(body.nodes_m), smooth_poses(t_s))],
-        "markers": Markers(t_s, tracks, 1e-2, names, points_m),
+        "markers": Markers(
+            t_s, tracks, sigma_m=1e-2, names=names, places_m=points_m
+        ),
         "nuisance": Nuisance.none(),
         "air_density_kg_m3": "none",
         "name": "check",

@@ -101,7 +101,9 @@ def combine(
     corrections = (
         () if error is None else (error.extrapolated, *(error.interval95 or ()))
     )
-    at = IntervalCoordinate.for_estimate(name, (*known, *corrections), linear)
+    at = IntervalCoordinate.for_estimate(
+        name, (*known, *corrections), linear=linear
+    )
     optimum = at.from_value(estimate.value)
     centre = optimum if error is None else at.from_value(error.extrapolated)
     centre += known_effect

@@ -308,7 +308,7 @@ def _changes_by_effects(
         count,
         has_parameters=False,
         prescribed=PrescribedColumns.from_columns(
-            solver, prescribed.dofs, displacements_m
+            solver, prescribed.dofs, columns=displacements_m
         ),
         forces_n=forces,
         rows_n=rows,
@@ -317,7 +317,7 @@ def _changes_by_effects(
         part, solver, columns=columns, inertia_n=rows[:, segment.sensed_dofs]
     ):
         yield response.reading.residual_changes(
-            response.values, response.changes, part.phi
+            response.values, response.changes, phi=part.phi
         )
 
 
@@ -366,7 +366,9 @@ def propagate_columns(
     segment = iterate.segment
     x = iterate.x
     phi = iterate.phi
-    sensed = GraspForces.zeros(len(x), len(segment.sensed_dofs), columns.count)
+    sensed = GraspForces.zeros(
+        len(x), len(segment.sensed_dofs), columns=columns.count
+    )
     response = iterate.observation.response_of_rows(
         ForwardSubstitution(solver, columns, grasp_forces=sensed).iterate_rows(
             x

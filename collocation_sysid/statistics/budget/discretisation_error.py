@@ -246,11 +246,11 @@ class _Extrapolation:
             remaining = last / (2**order - 1)
             slow_remaining = last / (2**least - 1) - remaining
             sides = sorted((-2 * remaining, slow_remaining))
-            return cls(last + remaining, -sides[0], sides[1])
+            return cls(last + remaining, -sides[0], above=sides[1])
         ratio = float(changes[-2] / last) if last else np.inf
         if not ratio > 2**LEAST_ORDER:
             largest = float(np.abs(changes).max())
-            return cls(float(changes.sum()), largest, largest)
+            return cls(float(changes.sum()), largest, above=largest)
         # No faster than in theory: a change that vanishes by chance promises nothing.
         observed_order = float(np.log2(ratio))
         remaining = last / (2 ** min(observed_order, order) - 1)
@@ -258,8 +258,8 @@ class _Extrapolation:
         return cls(
             float(changes.sum()) + remaining,
             uncertainty,
-            uncertainty,
-            observed_order,
+            above=uncertainty,
+            order=observed_order,
         )
 
 
@@ -298,13 +298,13 @@ def discretisation_error(
         *by_step,
         *by_mesh,
     )
-    at = IntervalCoordinate.for_estimate(name, known, linear)
+    at = IntervalCoordinate.for_estimate(name, known, linear=linear)
     x = at.from_value(estimate.value)
     step = _Extrapolation.from_values(
-        [x, *map(at.from_value, by_step)], step_order, step_order / 2
+        [x, *map(at.from_value, by_step)], step_order, least=step_order / 2
     )
     mesh = _Extrapolation.from_values(
-        [x, *map(at.from_value, by_mesh)], MESH_ORDER, LEAST_ORDER
+        [x, *map(at.from_value, by_mesh)], MESH_ORDER, least=LEAST_ORDER
     )
     limit = x + step.change + mesh.change
     interval = None

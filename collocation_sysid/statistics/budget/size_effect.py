@@ -87,7 +87,9 @@ class FirstContact:
             + contact.points.vectors(x[before : before + 1])[:3, 0] @ weights
         )
         return cls(
-            row, place_m, normal / max(float(np.linalg.norm(normal)), 1e-9)
+            row,
+            place_m,
+            normal=normal / max(float(np.linalg.norm(normal)), 1e-9),
         )
 
 

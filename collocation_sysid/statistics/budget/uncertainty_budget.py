@@ -195,13 +195,13 @@ class VarianceSources:
         return cls(
             assumed.names,
             moved,
-            all_free,
-            known,
-            by_q,
-            wider,
-            between,
-            freedom,
-            known_effects,
+            covariance_free=all_free,
+            covariance_known=known,
+            derivatives=by_q,
+            widening=wider,
+            recording_sensitivities=between,
+            freedom=freedom,
+            means=known_effects,
         )
 
     def noise_shares(self, by_q: Array) -> tuple[float, float]:
@@ -358,7 +358,7 @@ def _line(
     if error is not None and error.interval95 is not None:
         ends = error.interval95
     at = IntervalCoordinate.for_estimate(
-        name, (estimate.value, *estimate.statistical95, *ends), linear
+        name, (estimate.value, *estimate.statistical95, *ends), linear=linear
     )
     noise = _variance(at, estimate.value, ends=estimate.statistical95)
     middle = estimate.value if error is None else error.extrapolated
@@ -370,7 +370,9 @@ def _line(
     by_coordinate = by_q * at.derivative(estimate.value)
     by_assumption = sources.variances_of_assumptions(by_coordinate)
     others = sum(parts.values()) + sum(by_assumption.values())
-    between = sources.variance_between_recordings(by_coordinate, others, excess)
+    between = sources.variance_between_recordings(
+        by_coordinate, others, counted=excess
+    )
     systematic = float(np.sqrt(sum(by_assumption.values()) + between))
     variances = parts | {BETWEEN: excess + between} | by_assumption
     total = sum(variances.values())

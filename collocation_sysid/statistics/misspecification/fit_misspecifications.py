@@ -148,7 +148,9 @@ def _refit_hypotheses(
     )
     of = f"'{experiment.name}'"
     lags = (
-        [] if first.is_static else _clock_hypotheses(alone, first, fitted_m, of)
+        []
+        if first.is_static
+        else _clock_hypotheses(alone, first, fitted_m=fitted_m, of=of)
     )
     comparison = ModalComparison.from_experiment(first, solution.parameters)
     turned = (
@@ -158,7 +160,7 @@ def _refit_hypotheses(
         *trial.accepted(
             [
                 *lags,
-                *_slip_hypotheses(first, fitted_m, of),
+                *_slip_hypotheses(first, fitted_m, of=of),
                 *turned,
                 *_grasp_layer_hypotheses(first, of),
             ]

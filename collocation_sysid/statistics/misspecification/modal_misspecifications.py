@@ -197,8 +197,8 @@ class ModalComparison:
         return cls(
             declared,
             markers.names,
-            response,
-            float(np.hypot(noise_m, ROUGHLY * response.size_m)),
+            response=response,
+            floor_m=float(np.hypot(noise_m, ROUGHLY * response.size_m)),
         )
 
     def misfit_m(self, declared: DeclaredMotion) -> float:

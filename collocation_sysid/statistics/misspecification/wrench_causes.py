@@ -442,7 +442,9 @@ class _OneSensor:
                 np.tile(signs, 2) * values[:, [*order, *(3 + k for k in order)]]
             )
             without = replace(wrench, values=turned)
-            yield hypothesis("wrench-axes", without, ONE_OF_MANY, axes=axes)
+            yield hypothesis(
+                "wrench-axes", without, handicap=ONE_OF_MANY, axes=axes
+            )
         for what, units, columns in UNITS:
             for unit, factor in (
                 units.items()
@@ -464,7 +466,7 @@ class _OneSensor:
                 yield hypothesis(
                     "wrench-gain",
                     _multiplied(wrench, columns, factor=factor),
-                    FITTED,
+                    handicap=FITTED,
                     **data,
                 )
         shift_m = self._point_shift_m()
@@ -475,7 +477,10 @@ class _OneSensor:
                 "point": str(np.round(point_m, 3).tolist()),
             }
             yield hypothesis(
-                "wrench-point", replace(wrench, point_m=point_m), FITTED, **data
+                "wrench-point",
+                replace(wrench, point_m=point_m),
+                handicap=FITTED,
+                **data,
             )
         span_s = LATEST * float(np.ptp(wrench.t_s))
         for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):

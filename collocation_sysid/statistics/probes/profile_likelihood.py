@@ -153,7 +153,7 @@ def compute_profile(
     )
     values = np.array(sorted(losses_by_value))
     losses = np.array([losses_by_value[at] for at in values.tolist()])
-    message = _message(parameter, (lower, upper), bounds)
+    message = _message(parameter, (lower, upper), bounds=bounds)
     if losses.min() < loss - 1e-3 * max(1.0, abs(loss)):
         better = values[int(np.argmin(losses))]
         message += (

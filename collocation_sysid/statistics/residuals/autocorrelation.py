@@ -479,7 +479,7 @@ def error_processes(
         before, autocovariances = (
             autocovariances,
             moments.autocovariances(
-                moments.long_lag_products(fit, information, tails)
+                moments.long_lag_products(fit, information, tails=tails)
             ),
         )
         if np.allclose(

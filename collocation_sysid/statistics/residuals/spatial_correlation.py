@@ -109,7 +109,9 @@ def estimate_spatial_correlation(
                 _Contrasts(
                     free.T @ residual[t, present_channels],
                     free,
-                    distances_m[np.ix_(present_channels, present_channels)],
+                    distances_m=distances_m[
+                        np.ix_(present_channels, present_channels)
+                    ],
                 )
             )
     if not contrasts:
