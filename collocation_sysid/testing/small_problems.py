@@ -47,26 +47,26 @@ def uneven_box(divisions: int) -> TetMesh:
 
 def smooth_poses(
     t_s: Array,
-    half_translation_m: Sequence[float] = (0.02, 0.01, -0.015),
-    half_turn_rad: Sequence[float] = (0.2, -0.15, 0.3),
+    sway_m: Sequence[float] = (0.02, 0.01, -0.015),
+    turn_rad: Sequence[float] = (0.2, -0.15, 0.3),
     angular_frequency_rad_s: float = 20.0,
 ) -> PoseSequence:
     """Return a periodic motion that starts at rest from the identity, sampled from its formula.
 
-    Translation and rotation vector are (1 − cos ωt) times `half_translation_m` and `half_turn_rad`.
+    Translation and rotation vector are (1 − cos ωt) times `sway_m` and `turn_rad`.
 
     Parameters
     ----------
     t_s : (T,) array
         Times [s].
-    half_translation_m, half_turn_rad : three floats
+    sway_m, turn_rad : three floats
         Half the largest translation [m] and rotation vector [rad].
     angular_frequency_rad_s : float
         ω [rad/s].
     """
     share = 1 - np.cos(angular_frequency_rad_s * t_s)
-    rotations = Rotation.from_rotvec(np.outer(share, half_turn_rad))
-    positions_m = np.outer(share, half_translation_m)
+    rotations = Rotation.from_rotvec(np.outer(share, turn_rad))
+    positions_m = np.outer(share, sway_m)
     return PoseSequence(t_s, positions_m, quaternions_xyzw=rotations.as_quat())
 
 
