@@ -557,7 +557,7 @@ def least_squares_of_blocks(
         channels = fit.blocks[k].channels
         residual = channels.residual.ravel()
         problem = problem.with_rows(
-            residual, channels.jacobian.reshape(residual.size, -1)
+            residual, channels.jacobian.reshape(residual.size, len(fit.names))
         )
     return problem
 
