@@ -42,8 +42,9 @@ OTHER_TIME = "Time (s)"
 
 
 def strain_length_m(table: DisplacementSection, body: Body) -> float | None:
-    """Return the undeformed length [m] by which a strain is multiplied: the stated one, or the
-    extent of the body along the axis of the table; None for displacements.
+    """Return the undeformed length [m] by which a strain is multiplied: the stated `length_m`, or
+    the extent of the undeformed body along the axis of the table if that is "body"; None if the
+    table states none.
     """
     if table.length_m != "body":
         return table.length_m
@@ -51,19 +52,17 @@ def strain_length_m(table: DisplacementSection, body: Body) -> float | None:
 
 
 def has_displacement_table(section: ExperimentSection) -> bool:
-    """Return whether a grasp or an obstacle of an experiment is moved by a table of
-    displacements.
-    """
+    """Whether a grasp or an obstacle of an experiment is moved by a table of displacements."""
     return any(
         moved.displacement is not None for moved in section.moved_sections
     )
 
 
 def table_name(section: ExperimentSection, table: TableSection) -> str:
-    """Return the file name of a test bench's table in the folder of a simulation.
+    """Return the file name of a test bench's table, relative to the folder of a simulation.
 
-    It is the stated path if that is inside the problem's folder, else its last part; without a
-    stated file, the name of the experiment with .csv.
+    It is the stated path (of the table, else of the experiment) if that is inside the problem's
+    folder, else its last part; without a stated file, the name of the experiment with .csv.
     """
     path = PurePath(section.file_of(table) or f"{section.name}.csv")
     is_below = not path.is_absolute() and ".." not in path.parts
@@ -77,9 +76,11 @@ class BenchTable:
     Parameters
     ----------
     t_s : (T,) array
+        Times of the rows [s].
     time_column : str
         Name of the time where the problem does not state it.
     columns : dict of name to (T,) array
+        Columns in the units of the file, the time among them once `add` was called.
     """
 
     t_s: Array
@@ -92,7 +93,11 @@ class BenchTable:
         values: Mapping[str, Array],
         known_quantities: Sequence[Quantity],
     ) -> None:
-        """Add columns of quantities, in place, in the file's units and under the file's names.
+        """Add the time and columns of quantities, in place, in the file's units and under its
+        names.
+
+        The name of a column is the one that `layout` states for its key, else the usual one of the
+        quantity; its unit is that in the name, else the usual one.
 
         Parameters
         ----------
@@ -107,6 +112,8 @@ class BenchTable:
         ------
         InputError
             If the table already has a column of that name with other values.
+        KeyError
+            If a key of `values` is not among `known_quantities`.
         """
         quantities = {
             quantity.key: quantity for quantity in (TIME, *known_quantities)
@@ -187,6 +194,17 @@ def add_wrench(
         Times of the samples [s]. Each is assigned to the nearest row; other rows are left blank.
     wrench : (S, 6) array
         Wrench on the modelled part: fx, fy, fz [N], tx, ty, tz [N m]; NaN where not measured.
+
+    Raises
+    ------
+    InputError
+        If the table already has a column of that name with other values.
+
+    Notes
+    -----
+    The columns are those that the layout names; if it names none, the stress if `area_m2` is
+    stated, else a machine's force if only the force along the layout's axis is measured, else all
+    measured components.
     """
     rows = np.searchsorted((table.t_s[1:] + table.t_s[:-1]) / 2, at_s)
     six_components = np.full((len(table.t_s), 6), np.nan)
@@ -206,7 +224,9 @@ def add_wrench(
 
 
 def _named_quantities(layout: TableSection) -> list[str]:
-    """Return the keys of the quantities whose columns the table names; empty if it names none."""
+    """Return the keys of the quantities whose columns the table names; empty if it names none. The
+    time does not count.
+    """
     return [key for key in layout.columns if key != TIME.key]
 
 
@@ -217,13 +237,17 @@ def bench_tables(
 ) -> dict[str, BenchTable]:
     """Return the tables of a test bench that a simulation writes, by file name, see `table_name`.
 
+    Displacements are written at the times of the poses, wrenches into the same table if the file is
+    the same, else at their own times. Nothing is written to disk.
+
     Parameters
     ----------
     section : ExperimentSection
-        How the problem reads the experiment.
+        Table of the experiment in the problem file, which states the layout of the files.
     experiment : Experiment
+        Simulated experiment, with the grasps and obstacles of `section` in the same order.
     wrenches : iterable of (S, 6) array
-        What each sensor of the experiment measures in the simulation, at its own times.
+        Simulated wrench of each grasp or obstacle with a sensor, at its own times [N, N m].
 
     Raises
     ------

@@ -23,13 +23,13 @@ from .schema import CodeSection, NodeForceSection
 
 
 def existing_file(folder: Path, name: str, key: str) -> Path:
-    """Return the path of a file that a key of the problem file names, relative to `folder`; it may
-    also be a topic of a log, as "log#topic".
+    """Return the path of a file that a key of the problem file names, relative to `folder`; `name`
+    may also be a topic of a log, as "log#topic", or an absolute path.
 
     Raises
     ------
     InputError
-        At `key`, if it does not exist or is a folder.
+        At `key`, if it does not exist, is a folder or no regular file.
     """
     file = folder / name
     require_regular(file, key)
@@ -58,7 +58,20 @@ class CodeLoader:
     is_allowed: bool
 
     def material(self, section: CodeSection, key: str) -> Material:
-        """Return a custom material.
+        """Return the custom material that a section names.
+
+        Parameters
+        ----------
+        section : CodeSection
+            File, and name of the energy function or of a `Material` in it.
+        key : str
+            Key of the section in the problem file, for messages.
+
+        Returns
+        -------
+        Material
+            The value itself if the file defines a `Material`, else one made from the energy
+            function, named like the function.
 
         Raises
         ------
@@ -74,13 +87,24 @@ class CodeLoader:
             return Material.from_energy(cast(Energy, loaded), section.function)
 
     def force(self, section: NodeForceSection, key: str) -> NodeForce:
-        """Return the custom force on nodes that a section names, on its nodes if it states some.
+        """Return the custom force on nodes or faces that a section names, on the section's nodes if
+        it states some.
+
+        A `NodeForce` that the file defines is used as it is, `on` of the section is then ignored; a
+        function is the law of a new force with `on` and `carries` of the section.
+
+        Parameters
+        ----------
+        section : NodeForceSection
+            File, name and options of the force.
+        key : str
+            Key of the section in the problem file, for messages.
 
         Raises
         ------
         InputError
-            See `function`; also if the function is no force, see `NodeForce.from_law`, or `carries`
-            is wrong.
+            See `function`; also if the function is no force, see `NodeForce.from_law`, or if
+            `carries` is stated and differs from that of a `NodeForce`.
         """
         file, loaded = self.function(
             section.file, section.function, f"{key}.file"
@@ -112,7 +136,7 @@ class CodeLoader:
         """
 
         def is_row(value: Any) -> bool:
-            """Return whether a value of the file is a nuisance parameter."""
+            """Whether a value of the file is a nuisance parameter."""
             return isinstance(value, NuisanceRow)
 
         key = "nuisance.own.file"
@@ -125,7 +149,7 @@ class CodeLoader:
     ) -> tuple[Path, Callable[..., Any]]:
         """Run a Python file, and return its path and the function in it that has a name.
 
-        A force with an energy, `NodeForce`, counts as a function.
+        Any callable and any `NodeForce` count as functions. The file is run in every call.
 
         Parameters
         ----------
@@ -144,7 +168,7 @@ class CodeLoader:
         """
 
         def is_function(value: Any) -> bool:
-            """Return whether a value of the file is a function or a force."""
+            """Whether a value of the file is callable or a `NodeForce`."""
             return callable(value) or isinstance(value, NodeForce)
 
         return self._load(file, name, key, "function", is_function)
@@ -157,7 +181,7 @@ class CodeLoader:
         kind: str,
         is_kind: Callable[[Any], bool],
     ) -> tuple[Path, Any]:
-        """Run a file, and return its path and the value with a name.
+        """Run a file, which is done in every call, and return its path and the value with a name.
 
         Parameters
         ----------

@@ -18,12 +18,22 @@ def with_guessed_densities(
     section: ObjectSection, parameters: Sections
 ) -> ObjectSection:
     """Return a copy of [object] in which missing densities of the body and of regions are guesses
-    of parameters.
+    of parameters (or their prior means or fixed values).
+
+    A region without a density of its own and without a parameter remains without. If the body has
+    neither mass nor density, the mass or the density is taken from the parameters. The argument is
+    not modified.
+
+    Parameters
+    ----------
+    section : ObjectSection
+    parameters : mapping of name to ParameterSection or float
+        Table [parameters]; a number is a fixed value.
 
     Raises
     ------
     InputError
-        Unless exactly one of the body's mass and density is stated or guessed.
+        If the body states neither mass nor density, and the parameters give none or both of them.
     """
     regions = [
         _with_guessed_density(region, parameters) for region in section.region
@@ -49,8 +59,8 @@ def with_guessed_densities(
 def with_declared_densities(
     parameters: Sections, body: Body
 ) -> dict[str, ParameterSection | float]:
-    """Return [parameters], where a density or mass that is to be estimated without a guess gets the
-    value that the body states.
+    """Return a copy of [parameters] in which a density or mass that is to be estimated without a
+    guess or prior has the value that the body states as its guess; all others are unchanged.
     """
     return {
         name: section.model_copy(
@@ -69,8 +79,8 @@ def with_declared_densities(
 def _with_guessed_density(
     region: RegionSection, parameters: Sections
 ) -> RegionSection:
-    """Return a region with its density [kg/m³]: its own, else the guess of its parameter, else
-    None.
+    """Return a region with its density [kg/m³]: the region itself if it states one, else a copy
+    with the guess of its parameter "NAME.density_kg_m3", or None.
     """
     if region.density_kg_m3 is not None:
         return region
@@ -79,7 +89,9 @@ def _with_guessed_density(
 
 
 def _guess(parameters: Sections, name: str) -> float | None:
-    """Return the guess, prior mean or fixed value of a parameter; None if it has none of these."""
+    """Return a number known for a parameter: its guess, else the mean of its prior, else its fixed
+    value; None if it has none of these or is missing. A parameter that is a number is returned.
+    """
     section = parameters.get(name)
     if not isinstance(section, ParameterSection):
         return section
@@ -89,10 +101,11 @@ def _guess(parameters: Sections, name: str) -> float | None:
 
 
 def _declared_density(body: Body, name: str) -> float | None:
-    """Return the value that the body states for a parameter called `name`; None if it has none.
+    """Return the value that the body states for a density or mass parameter called `name`; None if
+    it has none.
 
-    The mass [kg] if that is the parameter, else the density [kg/m³] of the region that the name
-    begins with, or of the parts without an own density.
+    It is the total mass [kg] if that is the parameter, else the density [kg/m³] of the region that
+    the name begins with, or, if no part has this name, of the first part without an own density.
     """
     if without_region(name) == MASS.name:
         return body.mass_kg

@@ -23,7 +23,9 @@ def schema_text() -> str:
 
 
 def schema_url() -> str | None:
-    """Return the address at which the documentation publishes the schema; None if it has none."""
+    """Return the address at which the documentation publishes the schema; None if the documentation
+    has no address.
+    """
     base = documentation_url()
     return None if base is None else f"{base}/{SCHEMA_FILE}"
 
@@ -37,6 +39,11 @@ def with_schema_reference(text: str, reference: str) -> str:
         A first line that names another schema is replaced.
     reference : str
         Address of the schema, or its path relative to the TOML file.
+
+    Returns
+    -------
+    str
+        The text with the first line ``#:schema REFERENCE`` inserted, or replaced.
     """
     first, newline, rest = text.partition("\n")
     body = rest if first.startswith(SCHEMA_DIRECTIVE) and newline else text

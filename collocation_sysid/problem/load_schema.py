@@ -62,7 +62,9 @@ class ForceSection(Section):
 
     @model_validator(mode="after")
     def _require_one_force(self) -> ForceSection:
-        """Raise `ValueError` unless either a constant force or a file is given."""
+        """Return the section itself; raise `ValueError` unless exactly one of a constant force and
+        a file is given.
+        """
         require_one(self, "force_n", "file")
         return self
 
@@ -89,7 +91,9 @@ class TendonSection(Section):
 
     @model_validator(mode="after")
     def _require_one_tension(self) -> TendonSection:
-        """Raise `ValueError` unless either a constant tension or a file is given."""
+        """Return the section itself; raise `ValueError` unless exactly one of a constant tension
+        and a file is given.
+        """
         require_one(self, "tension_n", "tension")
         return self
 
@@ -121,7 +125,9 @@ class PressureSection(Section):
 
     @model_validator(mode="after")
     def _require_one_pressure(self) -> PressureSection:
-        """Raise `ValueError` unless either a constant pressure or a file is given."""
+        """Return the section itself; raise `ValueError` unless exactly one of a constant pressure
+        and a file is given.
+        """
         require_one(self, "pressure_pa", "pressure")
         return self
 

@@ -68,9 +68,16 @@ def problem_arguments(
     folder: str | Path | None = None,
     say: Say | None = None,
 ) -> dict[str, Any]:
-    """Return the arguments of `Problem` from a problem file and the files it names.
+    """Return the arguments of `Problem` by name, from a problem file and the files it names.
 
-    See `Problem.read` for the parameters and errors.
+    See `Problem.read` for the parameters. If `folder` is None, it is the folder of the problem
+    file; if `say` is None, nothing is announced. Unless the problem is simulated, at least one
+    experiment must not be for validation.
+
+    Raises
+    ------
+    InputError
+        For the first mistake, with file and key; see `Problem.read`.
     """
     file, text = read_problem_file(path, overrides)
     if not simulation and all(
@@ -162,7 +169,26 @@ def _load_object(
     simulation: bool,
     say: Say | None,
 ) -> tuple[Body, Size]:
-    """Return the body of the recordings, and the size of the problem with one sample."""
+    """Return the body of the recordings, with the parts whose density is estimated marked, and the
+    size of the problem with one sample.
+
+    Parameters
+    ----------
+    file : ProblemFile
+    folder : Path
+        Folder of the named files.
+    code : CodeLoader
+    simulation : bool
+        Whether nothing is estimated.
+    say : callable or None
+        Called with a sentence if a solve with one sample will take long.
+
+    Raises
+    ------
+    InputError
+        If the mesh, the material or a density is missing or invalid, or if one sample exceeds the
+        memory.
+    """
     with _lengths_checked(file.object):
         generated = _generated_counts(file.object)
         if generated:
@@ -190,6 +216,8 @@ def _load_object(
 class SpecimenCells:
     """Homogeneous cells of specimens of the object's material, each made once.
 
+    Tests that need an inner node have another cell than those that do not; there are at most two.
+
     Parameters
     ----------
     section : ObjectSection
@@ -204,7 +232,14 @@ class SpecimenCells:
         self._bodies: dict[bool, Body] = {}
 
     def body_for(self, test: str) -> Body:
-        """Return the cell of a kind of test, one of `homogeneous_deformation.TESTS`."""
+        """Return the cell of a kind of test, one of `homogeneous_deformation.TESTS`; the same
+        object for all tests with the same kind of cell.
+
+        Raises
+        ------
+        InputError
+            If the material is a Python file that may not be run or is invalid.
+        """
         has_inner_node = DEFORMATIONS[test].needs_inner_node
         if has_inner_node not in self._bodies:
             law = self._section.material
@@ -223,8 +258,8 @@ class SpecimenCells:
     def with_undamped(
         self, parameters: Mapping[str, ParameterSection | float]
     ) -> Mapping[str, ParameterSection | float]:
-        """Return parameters with zero for damping constants that are not given, on which no
-        equilibrium depends.
+        """Return a copy of parameters with zero for γ_r and γ_m if they are not given, on which no
+        equilibrium depends; `body_for` must have been called before.
         """
         constants = next(iter(self._bodies.values())).constants.values()
         damping = {c.name: 0.0 for c in constants if c in (GAMMA_R, GAMMA_M)}
@@ -235,8 +270,8 @@ class SpecimenCells:
 
 
 def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
-    """Return the numbers of nodes and elements of a mesh to be generated; None for meshes
-    from files.
+    """Return the numbers of corner nodes and of elements of a box or cylinder to be generated; None
+    for meshes and surfaces from files.
     """
     length_m = section.edge_length_m
     if length_m is None:
@@ -265,6 +300,11 @@ def _smallest_size(
         Numbers of corner nodes and elements of the mesh.
     simulation : bool
         Whether nothing is estimated, so that there are no sensitivities.
+
+    Returns
+    -------
+    Size
+        A quadratic mesh counts eight nodes per corner; substeps "auto" count as one.
     """
     # A quadratic element has a node on every edge; a mesh has about 7 edges per corner.
     nodes = corners if file.object.element == "tet4" else 8 * corners
@@ -284,7 +324,9 @@ def _smallest_size(
 
 
 def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
-    """Return the data files that a problem names, whether or not they exist."""
+    """Return the paths of the data files that a problem names, in `folder`, whether or not they
+    exist; Python files and poses of depth cameras are not among them.
+    """
     names = [file.object.mesh, file.object.surface]
     names += [section.file for section in file.specimens]
     for section in file.recordings:
@@ -365,13 +407,21 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
     surface = existing_file(folder, section.surface, key="surface")
     cache = folder / ".meshes"
     return TetMesh.from_surface(
-        surface, section.edge_length_m, section.length_unit, cache
+        surface,
+        section.edge_length_m,
+        length_unit=section.length_unit,
+        cache=cache,
     )
 
 
 def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
-    """Return a mesh of the cylinder, or else the box, that the section states, with edges of about
-    this length [m].
+    """Return a mesh of the cylinder, or else of the box, that the section states, with edges of
+    about this length [m].
+
+    Raises
+    ------
+    InputError
+        If the lengths are unusable.
     """
     if (shape := section.cylinder) is not None:
         return cylinder_of_edge(
@@ -385,8 +435,8 @@ def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
 
 @contextmanager
 def _lengths_checked(section: ObjectSection) -> Iterator[None]:
-    """Context that names a length of a generated body that is implausible, in place of the error
-    that follows from it.
+    """Context that replaces an `InputError` by one that names the largest length of the cylinder or
+    box, if that is above the largest plausible size; other errors pass.
     """
     if (shape := section.cylinder) is not None:
         lengths_m = {
@@ -410,17 +460,41 @@ def _lengths_checked(section: ObjectSection) -> Iterator[None]:
 
 
 def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
-    """Return the body with its materials, regions, forces and fields."""
+    """Return the body with its materials, regions, forces and fields.
+
+    Parameters
+    ----------
+    section : ObjectSection
+        Table of the object, with mass or density.
+    mesh : TetMesh
+        Mesh of the body.
+    code : CodeLoader
+        Loader of the Python files of materials and forces.
+
+    Raises
+    ------
+    InputError
+        If a selection, material, force or field is invalid.
+    """
 
     def material(law: str | CodeSection | None, key: str) -> Any:
+        """Return a custom material if `law` is the table of a Python file, else the name itself, or
+        None.
+        """
         return code.material(law, key) if isinstance(law, CodeSection) else law
 
     def branches(region: str | None) -> list[str]:
+        """Return the names of the memory branches of a region; None stands for branches without a
+        region.
+        """
         return [
             branch.name for branch in section.prony if branch.region == region
         ]
 
     def field(section: Section | None, where: str) -> Field | None:
+        """Return the spatially varying constant that a table states at the key `where`; None
+        without a table.
+        """
         return (
             None
             if section is None
@@ -461,7 +535,9 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
 def _rest_shape(
     section: ObjectSection,
 ) -> UnderGravity | Literal["stress_free"] | None:
-    """Return the stated stress-free shape; None if the file states none."""
+    """Return the stated stress-free shape: that of a scan under gravity, "stress_free", or None if
+    the file states none.
+    """
     if section.scan is not None:
         return UnderGravity(
             selection_from_section(section.scan.nodes),
@@ -471,8 +547,9 @@ def _rest_shape(
 
 
 def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
-    """Return the friction parameters that obstacles name, each once; frictions given as numbers are
-    left out.
+    """Return the friction parameters that obstacles name, each once, in the order of the file;
+    frictions given as numbers are left out, and so are names that do not end with that of a
+    coefficient of friction.
     """
     declared = (
         each.friction
@@ -490,8 +567,8 @@ def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
 def _as_parameter(
     name: str, section: ParameterSection | float
 ) -> Unknown | Tied | float:
-    """Return one parameter from its table, or its fixed value; a table with `tied_to` gives a tied
-    parameter.
+    """Return one parameter from its table: its fixed value, a `Tied` one if it has `tied_to` (with
+    the ratio 1 by default), else one that is estimated; a number is returned as it is.
     """
     if not isinstance(section, ParameterSection):
         return section
@@ -515,7 +592,8 @@ def _as_parameter(
 def _prior(section: PriorSection, linear: bool) -> tuple[float, float]:
     """Return mean and standard deviation of a prior.
 
-    The deviation is absolute for a linear parameter, and relative otherwise.
+    The deviation is absolute for a linear parameter, and relative to the mean otherwise; the one
+    that the section states is converted with the absolute mean if necessary.
     """
     size = abs(section.mean)
     if linear:

@@ -26,15 +26,24 @@ ROUNDING = 1e-6
 
 
 def gripper_markers(section: ExperimentSection) -> set[str]:
-    """Return the names of the markers from which poses of grasps and obstacles are computed."""
+    """Return the names of the markers from which poses of grasps and obstacles are computed; empty
+    if there are none.
+    """
     return {
         name for moved in section.moved_sections for name in moved.markers or ()
     }
 
 
 def read_marker_tracks(section: ExperimentSection, file: Path) -> MarkerTable:
-    """Return the tracks of the markers that an experiment uses, of gripper and template too, in the
-    file's frame; all of the file if the problem names none.
+    """Return the tracks of the markers that an experiment uses, in the file's frame.
+
+    They are the named markers first, then those of template, grippers and obstacles; all of the
+    file if the problem names none. Labels, unit and frame rate of the section are applied.
+
+    Raises
+    ------
+    InputError
+        If the file is unusable or lacks a marker.
     """
     markers = section.markers
     names = None
@@ -117,6 +126,16 @@ def poses_from_markers(
         Tracks in the body's frame.
     window_s : tuple of two floats or None
         First and last time that the notes refer to [s]; None for all.
+
+    Returns
+    -------
+    (PoseSequence, list of str)
+        Poses at all times of the table, with the interpolation of the grasp.
+
+    Raises
+    ------
+    InputError
+        If the fit is not possible.
     """
     assert grasp.markers is not None
     names = list(grasp.markers)
@@ -194,5 +213,5 @@ def _rigidity_note(
 
 
 def _mm(length_m: float) -> str:
-    """Return a length [m] as text in millimetres."""
+    """Return a length [m] as text in millimetres with three digits, such as "1.25 mm"."""
     return f"{1e3 * length_m:.3g} mm"

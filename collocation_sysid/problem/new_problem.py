@@ -20,7 +20,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 
 def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
-    """Write problem.toml, and data for it, to a folder; the title is the folder's name.
+    """Write problem.toml, and data for it, to a folder, whose name becomes the title.
 
     The first line of problem.toml names the JSON schema for editors: its address if the project
     publishes it, or else a file schema.json that is written, too.
@@ -28,20 +28,20 @@ def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
     Parameters
     ----------
     folder : Path
-        Folder; it is created if necessary.
+        Folder; it is created if necessary. Other files in it remain.
     kind : str, optional
-        Kind of simulated recording that is written too; None writes only the file, for a swinging
-        body.
+        Name of a folder of `TEMPLATES`, whose simulated recording is written too; None writes only
+        the file, for a swinging body.
 
     Returns
     -------
     list of Path
-        The problem file, followed by its data files and the schema.
+        The problem file, its data files by name, and the schema, if it is written.
 
     Raises
     ------
     InputError
-        If one of these files exists, or the folder cannot be created.
+        If one of these files exists, or the folder cannot be created; nothing is written then.
     """
     file = folder / "problem.toml"
     template = TEMPLATES / (kind or "swing")

@@ -16,8 +16,8 @@ from ..recording.nuisance import SCOPE, SCOPE_TEXT
 
 
 def _require_scope(word: str) -> str:
-    """Return a scope unchanged if it is "recording" or matches `SCOPE`; raise `ValueError`
-    otherwise.
+    """Return a scope unchanged if it is "recording" or matches `SCOPE` ("shared", or "shared" and a
+    word); raise `ValueError` otherwise.
     """
     if word != "recording" and not re.fullmatch(SCOPE, word):
         raise ValueError(f'found {word!r}; expected "recording", {SCOPE_TEXT}')
@@ -48,7 +48,9 @@ class NuisancePriorSection(Scoped):
 
     @model_validator(mode="after")
     def _require_one_prior(self) -> NuisancePriorSection:
-        """Raise `ValueError` if no prior is given and the scope alone is not sufficient."""
+        """Return the section itself; raise `ValueError` if no standard deviation is given, unless
+        the parameter has a default and another scope than "recording" is stated.
+        """
         priors = [key for key in type(self).model_fields if key != "scope"]
         if not used_keys(self, *priors) and (
             self.scope == "recording" or not self.has_default

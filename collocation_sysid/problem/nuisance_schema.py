@@ -195,7 +195,13 @@ def nuisance_from_section(
     section : NuisanceSection or "none"
         Table; "none" means no nuisance parameters.
     row_of : callable
-        Function that returns the custom nuisance parameter of a table.
+        Function that returns the custom nuisance parameter of a table; what it raises is raised.
+
+    Notes
+    -----
+    A key without a table leaves its parameters at their defaults; "none" removes all of them. Of a
+    table that states a deviation, those that it does not state are removed (exact values); a table
+    with a scope alone leaves the deviations as they are.
     """
     if section == "none":
         return Nuisance.none()

@@ -34,7 +34,9 @@ from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 def _as_parameters(
     parameters: Parameters | Mapping[str, Unknown | Tied | float],
 ) -> Parameters:
-    """Return the parameters; a mapping by name is converted."""
+    """Return parameters as they are; a mapping by name is converted by
+    `Parameters.from_mapping`.
+    """
     return (
         parameters
         if isinstance(parameters, Parameters)
@@ -104,6 +106,9 @@ class Problem:
     origin: Origin | None = None
 
     def __post_init__(self) -> None:
+        """Complete the bodies with free densities, the parameters with those of fields, and the
+        notes; then validate the problem.
+        """
         vars(self)["experiments"] = _with_free_densities(
             self.experiments, self.parameters
         )
@@ -132,6 +137,9 @@ class Problem:
         vars(self)["notes"] = tuple(dict.fromkeys((*unscaled, *self.notes)))
 
     def __repr__(self) -> str:
+        """Return the title (if there is one), the names of the experiments and the parameters as
+        text.
+        """
         names = ", ".join(
             repr(experiment.name) for experiment in self.experiments
         )
@@ -195,12 +203,14 @@ class Problem:
 
     @property
     def bodies(self) -> tuple[Body, ...]:
-        """Bodies of the experiments, each once."""
+        """Bodies of the experiments, each object once, in the order of the experiments."""
         return tuple({id(e.body): e.body for e in self.experiments}.values())
 
     @property
     def lengths_m(self) -> dict[str, float]:
-        """Correlation lengths of spatially varying constants [m], by name of the constant."""
+        """Correlation lengths of spatially varying constants [m], by name of the constant with its
+        region; empty without fields.
+        """
         return {
             name: each
             for body in self.bodies
@@ -209,7 +219,8 @@ class Problem:
 
     def with_lengths(self, lengths_m: Mapping[str, float]) -> Problem:
         """Return the problem with other correlation lengths [m] of spatially varying constants, by
-        name of the constant; itself if nothing changes.
+        name of the constant; itself if the mapping is equal to `lengths_m`. This problem is not
+        modified.
         """
         if dict(lengths_m) == self.lengths_m:
             return self
@@ -225,7 +236,7 @@ class Problem:
 
     @property
     def two_phase_fields(self) -> dict[str, TwoPhaseModes]:
-        """Two-phase fields of the bodies, by name of the constant."""
+        """Two-phase fields of the bodies, by name of the constant; empty if there are none."""
         return {
             part.field_name: part.field
             for body in self.bodies
@@ -237,8 +248,9 @@ class Problem:
         """Return the problem with other fields of spatially varying constants, by name of the
         constant.
 
-        Parameters that no longer belong to a field of any body are removed, and those of the new
-        fields are added.
+        Coefficients and contrasts that no longer belong to a field of any body are removed from the
+        parameters, and those of the new fields are added. Fields that the mapping does not name
+        remain. This problem is not modified.
         """
         bodies = {id(body): body.with_fields(fields) for body in self.bodies}
         removed_names = {
@@ -267,11 +279,13 @@ class Problem:
 
     @property
     def first_substeps(self) -> int:
-        """Grid steps between samples in the first solve, and where nothing is solved."""
+        """Grid steps between samples in the first solve, and where nothing is solved: 1
+        for "auto".
+        """
         return 1 if self.substeps == "auto" else self.substeps
 
     def collocation(self) -> Collocation:
-        """Return the nonlinear program of the problem, with the first number of substeps."""
+        """Return a new nonlinear program of the problem, with `first_substeps`."""
         return Collocation(
             self.experiments,
             self.parameters,
@@ -283,6 +297,9 @@ class Problem:
 
     def solver(self, method: str | Method | None = None) -> Method:
         """Return the method for a name, or the method itself; None means the method of the problem.
+
+        A name is looked up in `methods` first, then in `METHODS`, whose methods get default
+        options.
 
         Raises
         ------
@@ -303,10 +320,12 @@ class Problem:
         return chosen
 
     def _validate(self) -> None:
-        """Raise `InputError` if experiments, parameters and options do not fit together.
+        """Raise `InputError` if experiments, parameters and options do not fit together; return
+        nothing.
 
-        Checked are names, steps, constants of the bodies, stress-free shapes, fields, scopes of
-        nuisance parameters, scheme, method, and names of profiles.
+        Checked are names of experiments, steps, constants of the bodies, stress-free shapes,
+        fields, scopes of nuisance parameters, scheme, time step of the forward simulation, method,
+        and names of profiles.
         """
         names = [experiment.name for experiment in self.experiments]
         if not names:
@@ -357,6 +376,10 @@ def _require_rest_shapes(
     """Raise `InputError` if no stress-free shape exists for the mesh under gravity at the guess.
 
     Nothing is checked if a parameter has no guess: the search then starts where the shape exists.
+
+    Notes
+    -----
+    The message is located at "object.rest_shape". Bodies without a scan under gravity pass.
     """
     if any(
         item.guess is None for item in parameters.items if item.tied is None
@@ -369,7 +392,9 @@ def _require_rest_shapes(
 
 
 def _require_equal_fields(bodies: Iterable[Body]) -> None:
-    """Raise `InputError` if two bodies have fields of the same constant with different shapes."""
+    """Raise `InputError` if two bodies have fields of the same constant with different shapes.
+    Bodies with equal shapes pass.
+    """
     shapes_by_name: dict[str, Array] = {}
     for part in (part for body in bodies for part in body.parts if part.field):
         assert part.field is not None
@@ -386,8 +411,9 @@ def _require_equal_fields(bodies: Iterable[Body]) -> None:
 def _with_free_densities(
     experiments: Iterable[Experiment], parameters: Parameters
 ) -> tuple[Experiment, ...]:
-    """Return the experiments; where parameters name a density or the mass, with bodies whose
-    density follows from these parameters.
+    """Return the experiments in their order; where parameters name a density or the mass, with
+    copies of their bodies whose density follows from these parameters. Experiments without such
+    a body are the same objects.
     """
     bodies = {}
     experiments = tuple(experiments)

@@ -53,8 +53,8 @@ class UncertaintyOptions(ErrorModel):
 
     @property
     def considered(self) -> dict[str, float | None]:
-        """Standard deviations of systematic effects and the surface's correlation length,
-        by name.
+        """Standard deviations of systematic effects by name (None for exact ones), and the
+        surface's correlation length under `CORRELATION_KEY`.
         """
         return self.assumptions.deviations | {
             CORRELATION_KEY: self.surface_correlation

@@ -46,7 +46,8 @@ def read_problem_file(
     Returns
     -------
     tuple of ProblemFile and str
-        Validated content, and the text of the problem with its overrides.
+        Validated content, and the text of the problem: that of the file, or, with overrides, the
+        overridden content written as TOML, without comments.
 
     Raises
     ------
@@ -68,12 +69,13 @@ def read_problem_file(
 
 
 def parse_toml(text: str, path: Path) -> dict[str, Any]:
-    """Return the content of a TOML text.
+    """Return the content of a TOML text; `path` is only for messages.
 
     Raises
     ------
     InputError
-        For invalid syntax, with the line if it is known, and for excessive nesting.
+        For invalid syntax, with the line if it is known, for more than `DEEPEST` nested levels,
+        keys of 100 or more parts, and integers with too many digits.
     """
     try:
         if (
@@ -94,8 +96,8 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
 
 
 def _depth(content: Any) -> int:
-    """Return the number of nested levels of a table or list, itself included; at most
-    `DEEPEST` + 1.
+    """Return the number of nested levels of a table or list, itself included (1 if nothing is
+    nested); counting stops at `DEEPEST` + 1.
     """
     level = [content]
     depth = 0
@@ -123,7 +125,7 @@ def _beyond_limits(error: Exception) -> str:
 
 
 def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
-    """Return the text of a file (UTF-8).
+    """Return the text of a file (UTF-8), without a byte order mark.
 
     Parameters
     ----------
@@ -155,7 +157,18 @@ def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
 
 
 def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
-    """Return the error for invalid TOML, with the line if the parser states it."""
+    """Return (not raise) the error for invalid TOML, with the line and its text if the parser
+    states it.
+
+    Parameters
+    ----------
+    complaint : str
+        Message of the parser.
+    text : str
+        Text of the file.
+    path : Path
+        File, for the message.
+    """
     reason, _, place = complaint.rpartition(" (at ")
     reason = _PLAINER.get(reason, reason)
     matched = re.match(r"line (\d+)", place)
@@ -179,6 +192,13 @@ def _apply_override(content: dict[str, Any], override: str) -> None:
 
     If a part of a table that an experiment has from [experiment_defaults] is set, the experiment
     gets a copy of the complete table.
+
+    Parameters
+    ----------
+    content : dict
+        Content of the file; modified.
+    override : str
+        Text "dotted.key=value"; see `_item_key` and `_parse_value`.
 
     Raises
     ------
@@ -220,7 +240,16 @@ def _apply_override(content: dict[str, Any], override: str) -> None:
 
 
 def _join_dotted_names(content: Any, parts: list[str]) -> list[str]:
-    """Return the parts of a key, with names that contain dots joined, such as "core.mu_pa"."""
+    """Return the parts of a key, with those parts joined by dots that together are a key of the
+    content, such as "core.mu_pa"; the longest such key counts.
+
+    Parameters
+    ----------
+    content : Any
+        Content of a problem file; not modified.
+    parts : list of str
+        Parts of a dotted key, not empty.
+    """
     names = []
     table = content
     while parts:

@@ -60,7 +60,9 @@ class Size:
     Attributes
     ----------
     nodes, elements : int
+        Nodes (mid nodes of quadratic elements too) and elements of the body.
     samples : int
+        Samples of the experiment.
     substeps : int
         Timesteps per sample.
     unknowns : int
@@ -85,7 +87,10 @@ class Size:
         return self.samples * self.substeps
 
     def memory_mb(self) -> float:
-        """Lower bound of the memory that the problem needs [MB]."""
+        """Return a lower bound of the memory that the problem needs [MB, 10⁶ bytes]: positions,
+        sensitivities and derivatives of residuals if something is estimated, the factor of a
+        matrix, and the body.
+        """
         copies = SIMULATION_COPIES
         if self.unknowns:
             copies = SEARCH_COPIES + SENSITIVITY_COPIES * self.unknowns
@@ -100,13 +105,17 @@ class Size:
         return (8 * values + BYTES_PER_ELEMENT * self.elements) / 1e6
 
     def time_s(self) -> float:
-        """Estimated time [s] of a solve in the reduced space, or of a simulation, on one thread."""
+        """Return the estimated time [s] of a solve in the reduced space, or of a simulation if
+        nothing is estimated, on one thread.
+        """
         step_s = max(LEAST_STEP_S, STEP_S * (self.nodes / NODES) ** STEP_POWER)
         return (SWEEPS if self.unknowns else 1) * self.timesteps * step_s
 
 
 def require_feasible(size: Size, say: Say | None = None) -> None:
     """Raise an error if this machine's memory cannot hold the problem, and announce long work.
+
+    If the memory of the machine is unknown, no error is raised.
 
     Parameters
     ----------
@@ -147,8 +156,8 @@ def require_feasible(size: Size, say: Say | None = None) -> None:
 
 
 def announce_reading(files: Iterable[Path], say: Say) -> None:
-    """Call `say` with an estimate of how long it takes to read text files, if it is long; missing
-    files count as empty.
+    """Call `say` once with an estimate of how long it takes to read text files, if it exceeds
+    `ANNOUNCED_READING_S`; other kinds of files and missing files do not count.
     """
     sizes_mb = {
         file: file.stat().st_size / 1e6

@@ -37,6 +37,7 @@ from ..recording import (
     read_poses,
     read_wrench,
 )
+from ..recording.alignment import AlignedRecording
 from ..recording.checked_arrays import point_text
 from ..recording.depth_camera import points_from_image, samples_with_outlines
 from ..recording.formats.depth_files import DepthFileContent, read_depth
@@ -118,20 +119,25 @@ class RecordingReader:
     say: Say | None = None
 
     def read(self) -> Experiment:
-        """Return the experiment.
+        """Read all files of the experiment and return it; notes are added to `notes`.
+
+        Unless the problem is simulated, markers that cannot belong to the body are refused, see
+        `require_plausible_markers`.
 
         Raises
         ------
         InputError
-            Names the file and line, or the key within the experiment's table.
+            Names the file and line, or the key within the experiment's table. Also if all nodes are
+            grasped, or if the problem exceeds this machine's memory.
         """
         section = self.section
-        t_s, poses, table = self._align(
+        aligned = self._align(
             [*map(self._poses, range(len(section.moved_sections)))]
         )
+        t_s = aligned.t_s
         grasps = [
             self._grasp(k, sequence, t_s=t_s)
-            for k, sequence in enumerate(poses)
+            for k, sequence in enumerate(aligned.poses)
         ]
         if len(prescribed_dofs(grasps)) == 3 * (n := len(self.body.nodes_m)):
             message = (
@@ -156,7 +162,7 @@ class RecordingReader:
                 for k, each in enumerate(section.reading)
             ],
             depths=[self._depth(k, t_s) for k in range(len(section.depth))],
-            markers=self._markers(t_s, table),
+            markers=self._markers(t_s, aligned.table),
             nuisance=nuisance_from_section(
                 section.nuisance, self.code.nuisance_row
             ),
@@ -172,11 +178,11 @@ class RecordingReader:
 
     @property
     def _is_static(self) -> bool:
-        """Whether the samples are equilibria."""
+        """Whether the samples are equilibria (kind "static")."""
         return self.section.kind == "static"
 
     def _add_notes(self, *notes: str) -> None:
-        """Add notes, which begin with the experiment's name."""
+        """Add notes to `notes`, in place, each with the experiment's name in front."""
         self.notes += [
             f"experiment '{self.section.name}': {note}" for note in notes
         ]
@@ -184,7 +190,9 @@ class RecordingReader:
     # Files ----------------------------------------------------------------------------------------
 
     def _must_read(self, name: str | None) -> bool:
-        """Return whether a file must be read: in a solve always, in a simulation if it exists."""
+        """Whether a file must be read: in a solve always, also without a name (None); in a
+        simulation if it is named and exists.
+        """
         return not self.simulation or bool(
             name and stored_files(self.folder / name)
         )
@@ -192,14 +200,22 @@ class RecordingReader:
     def _require_existing(
         self, name: str | None, key: str, what: str = "a file"
     ) -> Path:
-        """Return the path of a file; raise `InputError` if none is named or it does not exist."""
+        """Return the path of a file; raise `InputError` at `key` if none is named (None) or it does
+        not exist. `what` is the expected kind of file, for the message.
+        """
         if name is None:
             raise InputError(f"missing; expected {what}", where=key)
         return existing_file(self.folder, name, key=key)
 
     def _table_file(self, table: TableSection, key: str) -> Path:
-        """Return the existing file of a displacement or a wrench: its own, else that of the
-        experiment; raise `InputError` at `key` if there is none.
+        """Return the path of the existing file of a displacement or a wrench: its own, else that of
+        the experiment.
+
+        Raises
+        ------
+        InputError
+            If there is none, or it does not exist: at `key`, or at "file" if the experiment's file
+            is meant.
         """
         key = "file" if table.file is None and self.section.file else key
         return self._require_existing(
@@ -210,7 +226,9 @@ class RecordingReader:
 
     @property
     def _requires_times(self) -> bool:
-        """Whether files must contain times: not for equilibria of bodies without memory."""
+        """Whether files must contain times: for motions, and for equilibria of bodies with
+        memory.
+        """
         return not self._is_static or self.body.has_memory
 
     # Grasps ---------------------------------------------------------------------------------------
@@ -218,6 +236,9 @@ class RecordingReader:
     def _grasp_key(self, k: int, key: str = "") -> str:
         """Return the key of the grasp or obstacle with index k for messages, followed by `key`
         unless that is empty.
+
+        The grasps have the first indices, from 0, the obstacles follow. A single grasp is "grasp"
+        without an index.
         """
         grasps = len(self.section.grasp_list)
         one = f"grasp.{k}" if grasps > 1 else "grasp"
@@ -225,10 +246,16 @@ class RecordingReader:
         return f"{one}.{key}" if key else one
 
     def _poses(self, k: int) -> PoseSequence:
-        """Return the poses of the grasp or obstacle with index k.
+        """Return the poses of the grasp or obstacle with index k (grasps first), at their own
+        times.
 
         They come from its markers, its displacement table or its file; without any of these they
-        are constant.
+        are constant. `gripper_to_body` and the interpolation of the section are applied.
+
+        Raises
+        ------
+        InputError
+            If a file is missing or unusable.
         """
         grasp = self.section.moved_sections[k]
         if grasp.markers is not None:
@@ -258,7 +285,9 @@ class RecordingReader:
         if (transform := grasp.gripper_to_body) is not None:
             with located(where=self._grasp_key(k, "gripper_to_body")):
                 transform_pose = PoseSequence(
-                    [0.0], [transform.position_m], [transform.quaternion_xyzw]
+                    [0.0],
+                    [transform.position_m],
+                    quaternions_xyzw=[transform.quaternion_xyzw],
                 )
                 poses = poses.after(transform_pose)
         return replace(poses, interpolation=grasp.interpolation)
@@ -285,8 +314,23 @@ class RecordingReader:
         return poses
 
     def _grasp(self, k: int, poses: PoseSequence, t_s: Array) -> Grasp:
-        """Return the grasp or obstacle with index k, with its wrench within the times t_s; a grasp
-        is placed on the nodes of the body.
+        """Return the grasp or obstacle with index k (grasps first), with its wrench within the
+        times t_s.
+
+        A grasp is placed on the nodes of the body; obstacles without a name are numbered from 1.
+
+        Parameters
+        ----------
+        k : int
+        poses : PoseSequence
+            Its poses on the clock of the experiment.
+        t_s : (N,) array
+            Times of the experiment [s].
+
+        Raises
+        ------
+        InputError
+            If a file or key is invalid, or the grasp selects no nodes.
         """
         section = self.section.moved_sections[k]
         zero = ""
@@ -318,7 +362,9 @@ class RecordingReader:
     def _read_wrench(
         self, section: WrenchSection, key: str
     ) -> tuple[Array, Array]:
-        """Return times (S,) [s] and values (S, 6) of a wrench's file."""
+        """Return times (S,) [s] and values (S, 6) [N, N m] of a wrench's file, divided by the
+        section's `symmetry`; `key` is that of the section, for messages.
+        """
         file = self._table_file(section, f"{key}.file")
         layout = section.layout
         return read_wrench(
@@ -332,9 +378,9 @@ class RecordingReader:
         """Return the measured wrench within the times t_s of the experiment, and note how many
         samples are used.
 
-        If a simulation has no file, the wrench is zero at t_s. Of equilibria without markers, only
-        measurements at the times t_s are used, if there are any. Stated sigmas are divided by the
-        section's `symmetry`.
+        If a simulation has no file, the wrench is zero at t_s, with a `sigma_nm` of 1 unless
+        stated. Of equilibria without markers, only measurements at the times t_s are used, if there
+        are any. Stated sigmas are divided by the section's `symmetry`.
 
         Parameters
         ----------
@@ -383,6 +429,12 @@ class RecordingReader:
         how many samples are used.
 
         If a simulation has no file, the values are None and the times are t_s.
+
+        Raises
+        ------
+        InputError
+            If the code may not be run, the file is missing in a solve or unusable, or there is no
+            such grasp.
         """
         key = f"reading.{k}"
         arguments: dict[str, Any] = {
@@ -413,7 +465,8 @@ class RecordingReader:
             return Gauge(t_s=at_s[is_used], values=values[is_used], **arguments)
 
     def _depth_images(self, k: int) -> tuple[DepthFileContent, Array]:
-        """Return the content of the file of the depth camera with index k, and the times [s].
+        """Return the content of the file or folder of the depth camera with index k, and the times
+        of its images or clouds [s].
 
         Times are the stated ones, or those of the file; for equilibria, or a single image, without
         times they are 0, 1, 2, …
@@ -454,7 +507,15 @@ class RecordingReader:
 
     def _depth(self, k: int, t_s: Array) -> Depth:
         """Return the measurements of the depth camera with index k within the times t_s of the
-        experiment [s].
+        experiment [s], and note how many images are used.
+
+        Images are converted to clouds of points. What the section states about the camera replaces
+        what the file contains.
+
+        Raises
+        ------
+        InputError
+            See `_depth_images`; also if the camera is incomplete or no image is within the times.
         """
         section = self.section.depth[k]
         where = f"depth.{k}"
@@ -517,7 +578,7 @@ class RecordingReader:
         """Return the object of a table in a list, such as a tendon or a pressure, on the body.
 
         Values over time are read from the files that the table names. An object without a name is
-        numbered.
+        called by `list_key` and its number from 1, such as tendon_1.
 
         Parameters
         ----------
@@ -597,7 +658,9 @@ class RecordingReader:
         """
         if not self.section.has_markers:
             times = self._sample_times(poses)
-            return MarkerTable(times, (), np.zeros((len(times), 0, 3)))
+            return MarkerTable(
+                times, (), positions_m=np.zeros((len(times), 0, 3))
+            )
         if self._marker_tracks is not None:
             return self._select_tracks(self._marker_tracks)
         markers = self.section.markers
@@ -614,19 +677,22 @@ class RecordingReader:
             raise InputError(message, where="markers.reference_m")
         times = self._sample_times(poses)
         return self._select_tracks(
-            MarkerTable(times, names, np.zeros((len(times), len(names), 3)))
+            MarkerTable(
+                times, names, positions_m=np.zeros((len(times), len(names), 3))
+            )
         )
 
     def _sample_times(self, poses: Sequence[PoseSequence]) -> Array:
         """Return the sample times [s] where no marker file gives them.
 
-        They are those of the first wrench file if there are no markers, else for equilibria those
-        of all depth images, else those of the longest sequence of poses.
+        They are those of the first existing wrench file if there are no markers, else for
+        equilibria without moving grasps those of all depth images, else those of the longest
+        sequence of poses.
 
         Raises
         ------
         InputError
-            If nothing is measured, or there are fewer than three times (one for equilibria).
+            If nothing is measured, or poses have fewer than three times (one for equilibria).
         """
         section = self.section
         wrench_sections = [
@@ -676,7 +742,10 @@ class RecordingReader:
         return times
 
     def _select_tracks(self, table: MarkerTable) -> MarkerTable:
-        """Return the tracks to fit, without markers of the gripper alone and those of weight 0.
+        """Return the tracks to fit, in the order of the table; markers of a weight of 0 are noted.
+
+        They are the markers that `names` of the section has, or else all but those of grippers,
+        without those of weight 0.
 
         Raises
         ------
@@ -712,14 +781,20 @@ class RecordingReader:
             )
             raise InputError(message, where="markers")
         names = tuple(table.names[k] for k in indices)
-        return MarkerTable(table.t_s, names, table.positions_m[:, indices])
+        return MarkerTable(
+            table.t_s, names, positions_m=table.positions_m[:, indices]
+        )
 
-    def _align(
-        self, poses: list[PoseSequence]
-    ) -> tuple[Array, tuple[PoseSequence, ...], MarkerTable]:
-        """Return times [s], poses and tracks on one clock and time grid, and add notes.
+    def _align(self, poses: list[PoseSequence]) -> AlignedRecording:
+        """Return times, poses and tracks on one clock and time grid, and add notes.
 
-        The window, `resample_hz` and `every` are applied.
+        The window, `resample_hz` and `every` are applied (not `every` in a simulation, whose files
+        have been thinned already).
+
+        Parameters
+        ----------
+        poses : list of PoseSequence
+            Poses of the grasps, then of the obstacles, at their own times.
 
         Raises
         ------
@@ -800,7 +875,7 @@ class RecordingReader:
                 "resample_hz is above the markers' own rate; interpolated samples are treated as "
                 "measured, so that error bars are too small"
             )
-        return aligned.t_s, aligned.poses, aligned.table
+        return aligned
 
     def _markers(self, t_s: Array, table: MarkerTable) -> Markers:
         """Return the markers at the times t_s; positions on the body are NaN where they are to be
@@ -839,8 +914,9 @@ class RecordingReader:
         return Markers(
             t_s,
             table.positions_m,
-            sigma_m / np.sqrt(_by_marker(section.weights, names, default=1.0)),
-            names,
+            sigma_m=sigma_m
+            / np.sqrt(_by_marker(section.weights, names, default=1.0)),
+            names=names,
             places_m=np.array(
                 [section.reference_m.get(name, [np.nan] * 3) for name in names]
             ),
@@ -855,7 +931,7 @@ def _by_marker(
     values: Mapping[str, float] | float, names: Sequence[str], default: float
 ) -> Array:
     """Return the values (M,) of the markers with these names: one number for all, or the number of
-    each name, `default` where the mapping has none.
+    each name, `default` where the mapping has none; entries of other names are ignored.
     """
     by_name = (
         values if isinstance(values, Mapping) else dict.fromkeys(names, values)
@@ -866,7 +942,9 @@ def _by_marker(
 def _require_known_markers(
     requested: Iterable[str], names: Sequence[str], key: str
 ) -> None:
-    """Raise `InputError` at `key` if a requested name is not among `names`."""
+    """Raise `InputError` at `key` for the first requested name that is not among `names`; without
+    requested names nothing is checked.
+    """
     present = set(names)
     for name in requested:
         if name not in present:
@@ -888,7 +966,7 @@ def require_plausible_markers(
     experiment : Experiment
         Experiment with markers.
     constants : mapping of str to float
-        Physical values by name, to find the likely cause.
+        Physical values by name, to find the likely cause, which the message then names.
     """
     if (message := _implausible_markers(experiment)) is None:
         return
@@ -940,5 +1018,5 @@ def _implausible_markers(experiment: Experiment) -> str | None:
 
 
 def _diagonal(points_m: Array) -> float:
-    """Return the diagonal [m] of the box that contains points (n, 3)."""
+    """Return the diagonal [m] of the box along the axes that contains points (n, 3), n ≥ 1."""
     return float(np.linalg.norm(np.ptp(points_m, axis=0)))

@@ -76,7 +76,9 @@ class TableSection(Section):
 
     @property
     def layout(self) -> dict[str, Any]:
-        """Arguments with which the columns are read, by name."""
+        """Arguments with which the columns are read, by name: `columns`, `axis`, `sign`, and
+        `length_m` or `area_m2` where the section has them.
+        """
         return self.model_dump(
             include={"columns", "axis", "sign", "length_m", "area_m2"}
         )
@@ -133,7 +135,9 @@ class WrenchSection(TableSection):
 
 
 def _as_table(value: str | DisplacementSection) -> DisplacementSection:
-    """Return a displacement as a table; text is the name of its file."""
+    """Return a displacement as a table: text is the name of its file, a table is returned
+    as it is.
+    """
     return (
         DisplacementSection.model_validate({"file": value})
         if isinstance(value, str)
@@ -190,8 +194,11 @@ class MovedSection(Section):
 
     @model_validator(mode="after")
     def _require_one_source(self) -> MovedSection:
-        """Raise `ValueError` if more than one of poses, displacement and markers is given, or a key
-        without the source that it belongs to.
+        """Return the section itself, or raise `ValueError`.
+
+        The error is raised if more than one of poses, displacement and markers is given,
+        `gripper_to_body` with markers, a key without the source that it belongs to, fewer than
+        three markers, or a weight of an unknown marker.
         """
         sources = used_keys(self, "poses", "displacement", "markers")
         if len(sources) > 1:
@@ -382,8 +389,9 @@ class MarkersSection(Section):
 
     @model_validator(mode="after")
     def _require_template(self) -> MarkersSection:
-        """Raise `ValueError` unless `template_m` and `template_window_s` are given together, with
-        at least three positions and a window that starts before it ends.
+        """Return the section itself; raise `ValueError` unless `template_m` and `template_window_s`
+        are given together or not at all, with at least three positions and a window that does
+        not end before it starts.
         """
         present = used_keys(
             self, "template_m", "template_window_s", "max_template_residual_m"
@@ -404,8 +412,8 @@ class MarkersSection(Section):
 
 
 def _require_file_name(name: str) -> str:
-    """Return a name unchanged if it can be part of a file name on every platform; raise
-    `ValueError` otherwise.
+    r"""Return a name unchanged if it can be part of a file name on every platform: printable, not
+    empty, no leading dot, and none of / \ : * ? " < > |; raise `ValueError` otherwise.
     """
     if (
         not name.isprintable()
@@ -628,26 +636,32 @@ class ExperimentSection(NamedSection):
 
     @property
     def has_markers(self) -> bool:
-        """Whether the table contains markers."""
+        """Whether the problem file states a table of markers, also an empty one."""
         return "markers" in self.model_fields_set
 
     def file_of(self, table: TableSection | None) -> str | None:
-        """Return the file of a table; None if neither it nor the experiment names one."""
+        """Return the file of a table, else that of the experiment; None if there is no table
+        (None), or neither names one.
+        """
         return table and (table.file or self.file)
 
     @property
     def grasp_list(self) -> list[GraspSection]:
-        """Grasps as a list, also if the file has a single table."""
+        """Grasps as a list; a single table is a list of one, no grasp an empty one."""
         return self.grasp if isinstance(self.grasp, list) else [self.grasp]
 
     @property
     def moved_sections(self) -> list[GraspSection | ObstacleSection]:
-        """Grasps, followed by the obstacles."""
+        """Grasps, followed by the obstacles, in the order of the file; their indices from 0 are
+        those of `Experiment.grasps`.
+        """
         return [*self.grasp_list, *self.obstacle]
 
     @model_validator(mode="after")
     def _require_window(self) -> ExperimentSection:
-        """Raise `ValueError` unless the window is missing or begins before it ends."""
+        """Return the section itself; raise `ValueError` unless the window is missing or begins
+        before it ends.
+        """
         if (
             self.window_s is not None
             and not self.window_s[0] < self.window_s[1]
@@ -659,9 +673,11 @@ class ExperimentSection(NamedSection):
 
     @model_validator(mode="after")
     def _require_static_keys(self) -> ExperimentSection:
-        """Raise `ValueError` if a series of equilibria has a key of motions: another `start` than
-        "equilibrium", another `start_rule` than "standard", `resample_hz`, or
-        `nuisance.time_shift`.
+        """Return the section itself; raise `ValueError` if a series of equilibria has a key of
+        motions.
+
+        These are another `start` than "equilibrium", another `start_rule` than "standard",
+        `resample_hz`, and a table `nuisance.time_shift`.
         """
         if self.kind == "dynamic":
             return self

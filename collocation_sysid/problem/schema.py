@@ -250,12 +250,18 @@ class ObjectSection(Section):
 
     @property
     def has_shape(self) -> bool:
-        """Whether the table states a mesh, a surface or a shape."""
+        """Whether the table states a mesh, a surface, a cylinder, a box, or an edge length."""
         return bool(used_keys(self, *SHAPES)) or self.edge_length_m is not None
 
     @model_validator(mode="after")
     def _require_consistent(self) -> ObjectSection:
-        """Raise `ValueError` for keys that exclude or require each other."""
+        """Return the section itself, or raise `ValueError` for keys that exclude or require each
+        other.
+
+        Required are at most one shape, `edge_length_m` exactly with a shape other than a mesh, not
+        both mass and density, `scan` exactly with rest_shape = "under_gravity", and existing
+        regions of Prony branches.
+        """
         if self.has_shape:
             require_one(self, *SHAPES)
         if self.has_shape and (self.mesh is None) != (
@@ -302,7 +308,9 @@ class PriorSection(Section):
 
     @model_validator(mode="after")
     def _require_one_deviation(self) -> PriorSection:
-        """Raise `ValueError` unless exactly one of both deviations is given."""
+        """Return the section itself; raise `ValueError` unless exactly one of both deviations is
+        given.
+        """
         require_one(self, "relative", "deviation")
         return self
 
@@ -341,7 +349,9 @@ class ParameterSection(Section):
 
     @model_validator(mode="after")
     def _require_one_kind(self) -> ParameterSection:
-        """Raise `ValueError` for keys that do not belong together."""
+        """Return the section itself; raise `ValueError` for more than one of guess, fixed and
+        tied_to, or for keys that do not belong to it (without any of them: to a guess).
+        """
         if len(used_kinds := used_keys(self, "guess", "fixed", "tied_to")) > 1:
             raise ValueError(
                 f"found {' and '.join(used_kinds)}; expected one of them, or none"
@@ -457,7 +467,9 @@ class UncertaintySection(Section, UncertaintyOptions):  # pyright: ignore[report
 
 
 def _kind_tag(value: Any) -> str:
-    """Return the tag of an experiment's table, which messages omit."""
+    """Return the tag of an experiment's table or model, which messages omit: `SPECIMEN_TAG` for the
+    kind "specimen", else "<recording>".
+    """
     kind = (
         value.get("kind")
         if isinstance(value, dict)
@@ -506,12 +518,16 @@ class ProblemFile(Section):
     @model_validator(mode="before")
     @classmethod
     def _merge_defaults(cls, content: Any) -> Any:
-        """Insert [experiment_defaults] into each experiment before the file is validated."""
+        """Return the content with [experiment_defaults] inserted into each experiment, before the
+        file is validated, see `with_experiment_defaults`.
+        """
         return with_experiment_defaults(content)
 
     @model_validator(mode="after")
     def _require_shape(self) -> ProblemFile:
-        """Raise an `InputError` if a recording has no mesh, or regions have none."""
+        """Return the file itself; raise an `InputError` if the object states no shape although
+        there is a recording, or has regions, a field, a force or a scan.
+        """
         if self.object.has_shape:
             return self
         if self.recordings:
@@ -530,7 +546,7 @@ class ProblemFile(Section):
 
     @property
     def recordings(self) -> list[ExperimentSection]:
-        """Experiments with the object's mesh."""
+        """Experiments with the object's mesh, in the order of the file."""
         return [
             each
             for each in self.experiment
@@ -539,7 +555,7 @@ class ProblemFile(Section):
 
     @property
     def specimens(self) -> list[SpecimenSection]:
-        """Material tests without a mesh."""
+        """Material tests without a mesh, in the order of the file."""
         return [
             each
             for each in self.experiment
@@ -552,7 +568,8 @@ def with_experiment_defaults(content: Any) -> Any:
     experiment that does not state them.
 
     Only complete keys are taken over: a table in the experiment replaces that of the defaults. The
-    content itself is not modified, and is returned if there is nothing to insert.
+    content itself is not modified, and is returned if there is nothing to insert. Content that is
+    not as the schema expects is passed on.
     """
     shared = (
         content.get("experiment_defaults")

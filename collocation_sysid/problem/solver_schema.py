@@ -33,8 +33,8 @@ DEFAULT = "reduced-space"
 
 
 def _require_offered(name: Any) -> Any:
-    """Return the name of a method; raise `ValueError` with the reason if CasADi's solver is
-    not offered.
+    """Return the name of a method, also an unknown one; raise `ValueError` with the reason if it is
+    a solver of CasADi that cannot be used here.
     """
     reason = refusal_reason(name) if isinstance(name, str) else None
     if reason is not None:
@@ -60,6 +60,9 @@ class OptionTable:
     kind: type[Options]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Return the schema by which pydantic converts the table of options to the method, see
+        `_method_from_table`; the arguments are not used.
+        """
         return no_info_plain_validator_function(
             partial(_method_from_table, self.kind.name)
         )
@@ -67,11 +70,16 @@ class OptionTable:
     def __get_pydantic_json_schema__(
         self, schema: Any, handler: Any
     ) -> dict[str, Any]:
+        """Return the JSON schema of the method's options for editors; the arguments are
+        not used.
+        """
         return method_options_schema(self.kind.name)
 
 
 def _method_key(kind: type[Options]) -> Any:
-    """Return the key of a method: its name in the file, and its defaults."""
+    """Return the pydantic field of a method's table: its name in the file as alias, and the method
+    with default options as default.
+    """
     return Field(default_factory=kind, alias=kind.name)
 
 
@@ -125,7 +133,9 @@ class SolverSection(Section):
     @model_validator(mode="before")
     @classmethod
     def _require_option_tables(cls, table: Any) -> Any:
-        """Raise `ValueError` if options of a method are outside the method's table."""
+        """Return the table unchanged; raise `ValueError` if options of a method are outside the
+        method's table.
+        """
         outside = (
             [name for name in table if _methods_with(name)]
             if isinstance(table, Mapping)
@@ -140,7 +150,9 @@ class SolverSection(Section):
 
     @property
     def methods(self) -> dict[str, Method]:
-        """Methods by name, with the options of their tables."""
+        """All methods by their names in the file, with the options of their tables, or default
+        options.
+        """
         return {
             field.alias: getattr(self, name)
             for name, field in type(self).model_fields.items()
@@ -171,13 +183,17 @@ def _method_from_table(method: str, table: Any) -> Any:
 
 
 def _methods_with(option: str) -> list[str]:
-    """Return the names of the methods that have an option."""
+    """Return the names of the methods that have an option, in the order of `METHODS`; empty if none
+    has it.
+    """
     return [method for method in METHODS if option in OPTIONS[method]]
 
 
 def _advice_on_tables(options: Sequence[str], chosen: Any) -> str:
-    """Return text that says to which method's table each of the options belongs, preferably that of
-    `chosen`, the method that the file names.
+    """Return text that says to which method's table each of the options belongs: that of the method
+    `chosen` in the file if it has the option, else that of the first that has it.
+
+    Every option must belong to a method.
     """
     options_by_method: dict[str, list[str]] = {}
     for option in options:
@@ -192,5 +208,7 @@ def _advice_on_tables(options: Sequence[str], chosen: Any) -> str:
 
 
 def table_heading(method: str) -> str:
-    """Return the heading of a method's table in the file."""
+    """Return the heading of a method's table in the file, with quotes around a name with a
+    colon.
+    """
     return f'[solver."{method}"]' if ":" in method else f"[solver.{method}]"

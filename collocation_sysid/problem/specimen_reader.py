@@ -55,12 +55,16 @@ class SpecimenReader:
     notes: list[str] = field(default_factory=list)
 
     def read(self) -> tuple[Specimen, Experiment]:
-        """Return the measurements, and the experiment of the homogeneous cell.
+        """Read the file; return the measurements, and the static experiment of the homogeneous
+        cell.
+
+        Notes are added to `notes`, each with the experiment's name in front.
 
         Raises
         ------
         InputError
-            Names the file and line, or the key within the experiment's table.
+            Names the file and line, or the key within the experiment's table; also for stretches or
+            stresses that are implausible.
         """
         section = self.section
         file = existing_file(self.folder, section.file, key="file")
@@ -98,7 +102,9 @@ class SpecimenReader:
         self.notes.append(f"experiment '{self.section.name}': {note}")
 
     def _specimen(self, table: SpecimenTable) -> Specimen:
-        """Return the measurements of the chosen rows, with their uncertainties."""
+        """Return the measurements of the rows to use, with their uncertainties, and note how many
+        rows are used if not all.
+        """
         section = self.section
         rows = self._rows(table)
         if len(rows) < len(table.t_s):
@@ -125,7 +131,7 @@ class SpecimenReader:
         """Return the indices (k,) of the rows to use; all rows of a simulation.
 
         Otherwise these are the rows within `window_s`, without the first `skip_cycles` cycles of
-        the strain; of these every `every`-th, from the first one on.
+        the strain; of these every `every`-th row, beginning with the first one.
 
         Raises
         ------
@@ -151,7 +157,7 @@ class SpecimenReader:
 
     def _sigma_pa(self) -> float:
         """Return the standard deviation of the noise of the stress [Pa]: the stated one, or else
-        that of the force over the undeformed area.
+        that of the force over the undeformed area (the schema requires one of both).
         """
         section = self.section
         if section.sigma_pa is not None:
@@ -161,7 +167,9 @@ class SpecimenReader:
         return section.sigma_n / section.area_m2
 
     def _note_unknown_past(self, specimen: Specimen) -> None:
-        """Add a note if a material with memory is strained already at the first sample."""
+        """Add a note if the material has memory and the absolute strain of the first sample exceeds
+        `UNKNOWN_PAST` of the largest.
+        """
         strain: Array = np.abs(specimen.strain)
         if self.body.has_memory and strain[0] > UNKNOWN_PAST * strain.max():
             self._add_note(
@@ -173,7 +181,9 @@ class SpecimenReader:
 def layout_from_section(
     section: SpecimenSection, *, requires_times: bool = False
 ) -> SpecimenLayout:
-    """Return the meaning of the columns of the file of a specimen."""
+    """Return the meaning of the columns of the file of a specimen; `requires_times` is whether the
+    file must contain times.
+    """
     return SpecimenLayout(
         test=section.test,
         columns=section.columns,

@@ -94,7 +94,10 @@ class SpecimenSection(NamedSection):
 
     @model_validator(mode="after")
     def _require_consistent(self) -> SpecimenSection:
-        """Raise `ValueError` for keys that exclude or require each other."""
+        """Return the section itself, or raise `ValueError`: unless exactly one of sigma_pa and
+        sigma_n is given, for sigma_n without area_m2, and for a window that does not begin
+        before it ends.
+        """
         require_one(self, "sigma_pa", "sigma_n")
         if self.sigma_n is not None and self.area_m2 is None:
             raise ValueError(
@@ -111,5 +114,5 @@ class SpecimenSection(NamedSection):
 
 
 def deviation(prior: Prior) -> float:
-    """Return the standard deviation of a prior; 0 for "none"."""
+    """Return the standard deviation that a prior states; 0 for "none"."""
     return 0.0 if prior == "none" else float(prior)

@@ -25,14 +25,17 @@ def explain_validation_error(
     path: Path,
     root: type[BaseModel] = ProblemFile,
 ) -> InputError:
-    """Return an `InputError` for the first fault, with the number of other faults.
+    """Return (not raise) an `InputError` for one fault, with the number of other places with
+    faults.
+
+    It is the first unknown key, or else the first fault.
 
     Parameters
     ----------
     error : ValidationError
         Error of pydantic.
     content : dict
-        Content that was validated.
+        Content that was validated, without [experiment_defaults] inserted.
     path : Path
         File, for the message.
     root : type
@@ -56,8 +59,10 @@ def explain_validation_error(
 
 
 def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:
-    """Return the parts of the key of a fault, without tags of unions and without indices in an
-    array of numbers.
+    """Return the parts of the key of a fault, from the root of the file: keys, and indices from 0
+    of tables in lists.
+
+    Tags of unions are left out, and so are indices at the end that refer to numbers in an array.
     """
     loc = fault["loc"]
     own = (
@@ -76,7 +81,17 @@ def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:
 def _fault_message(
     fault: Fault, content: dict[str, Any], root: type[BaseModel]
 ) -> str:
-    """Return what was found and what was expected."""
+    """Return the message of a fault: what was found and what was expected.
+
+    Parameters
+    ----------
+    fault : mapping
+        Error of one value, as `ValidationError.errors` describes it.
+    content : dict
+        Content of the file, with [experiment_defaults] inserted.
+    root : type
+        Model of the file.
+    """
     key = _fault_key(fault, root)
     field, _ = _schema_field(key, root)
     description = (field.description if field else None) or ""
@@ -122,9 +137,10 @@ def _fault_message(
 def _fault_location(
     fault: Fault, content: dict[str, Any], root: type[BaseModel]
 ) -> str:
-    """Return the location of a fault as text.
+    """Return the location of a fault as text, as it is written in the file.
 
-    An `InputError` that a validator raised contains the location within its value.
+    An `InputError` that a validator raised contains the location within its value, which is then
+    returned.
     """
     error = (fault.get("ctx") or {}).get("error")
     known = error.where if isinstance(error, InputError) else None
@@ -135,7 +151,8 @@ def _written_key(key: Sequence[Part], content: dict[str, Any]) -> str:
     """Return a key as text, as it is written in the file: "experiment 'swing': markers.file" for a
     key of an experiment with a name, else its parts joined by dots.
 
-    A value that an experiment has from [experiment_defaults] is located there.
+    A value that an experiment has from [experiment_defaults] is located there. `content` is that of
+    the file, without defaults inserted.
     """
     value: Any = content
     defaults = _item(content, "experiment_defaults")
@@ -165,7 +182,9 @@ def _written_key(key: Sequence[Part], content: dict[str, Any]) -> str:
 
 
 def _value_at(key: Sequence[Part], content: dict[str, Any]) -> Any:
-    """Return the value of a key in the content of a file; None if it does not exist."""
+    """Return the value of a key in the content of a file; None if it does not exist; the content
+    itself for an empty key.
+    """
     value: Any = content
     for part in key:
         value = _item(value, part)
@@ -173,7 +192,9 @@ def _value_at(key: Sequence[Part], content: dict[str, Any]) -> Any:
 
 
 def _item(container: Any, part: Part) -> Any:
-    """Return an item of a table or list; None if it does not exist."""
+    """Return an item of a table by key, or of a list by index; None if it does not exist or
+    `container` is neither.
+    """
     try:
         return container[part]
     except (KeyError, IndexError, TypeError):
@@ -187,9 +208,10 @@ def _schema_field(
     key: Sequence[Part], root: type[BaseModel]
 ) -> tuple[FieldInfo | None, int]:
     """Return the deepest field of the schema on the path of a key, and the number of parts up to
-    it.
+    and including it.
 
-    The field is None if no part is in the schema.
+    Indices and names that the user chooses are passed over. The field is None, and the number 0, if
+    the first part is not in the schema.
     """
     model: type[BaseModel] | None = root
     field = None
@@ -224,7 +246,7 @@ def _schema_field(
 
 
 def _fields_by_key(model: type[BaseModel]) -> dict[str, FieldInfo]:
-    """Return the fields of a model by their keys in the file."""
+    """Return the fields of a model by their keys in the file: the alias, else the name."""
     return {
         field.alias or name: field for name, field in model.model_fields.items()
     }
@@ -238,8 +260,8 @@ def _table_model(annotation: Any) -> type[BaseModel] | None:
 
 
 def _table_models(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models of a field that is a table or a list of tables; several if tables differ
-    by kind.
+    """Return the models in an annotation, from the first to the last: of a field that is a table or
+    a list of tables; several if tables differ by kind, none for other fields.
     """
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
@@ -250,8 +272,8 @@ def _table_models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def shortened(value: Any) -> str:
-    """Return a value as text of at most 60 characters, booleans as in TOML; a sentence with the
-    type if Python cannot print it.
+    """Return a value as text of at most 60 characters, booleans as in TOML, others as `repr` shows
+    them; "a TYPE too large to show" if Python cannot print it.
     """
     if isinstance(value, bool):
         return str(value).lower()

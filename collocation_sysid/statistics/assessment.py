@@ -107,6 +107,10 @@ class Assessment:
     ----------
     concerns : tuple of Concern
         Empty if the verdict is "good".
+
+    Notes
+    -----
+    `from_concerns` establishes the order; the constructor takes the concerns as they are.
     """
 
     concerns: tuple[Concern, ...] = ()
@@ -114,7 +118,10 @@ class Assessment:
 
     @classmethod
     def from_concerns(cls, concerns: Iterable[Concern]) -> Assessment:
-        """Build from concerns; duplicates are removed and the gravest come first."""
+        """Build from concerns: "doubtful" ones come first, in their given order, then "check" ones.
+
+        Of several concerns with the same message the first is kept, whatever its grade and code.
+        """
         by_message = {
             concern.message: concern for concern in reversed([*concerns])
         }
@@ -126,7 +133,7 @@ class Assessment:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict in one word.
+        """Verdict in one word: "good" without concerns, else the grade of the first concern.
 
         "good": nothing speaks against the answer and its error bars. "check": usable, after a look
         at the reasons. "doubtful": something is wrong with data, model or solve.
@@ -139,7 +146,9 @@ class Assessment:
         return tuple(concern.message for concern in self.concerns)
 
     def combined_with(self, other: Assessment) -> Assessment:
-        """Return the graver of two verdicts, with the reasons of both."""
+        """Return the assessment with the concerns of both, by `from_concerns`; those of the graver
+        one come first within each grade, and of equal verdicts those of `self`.
+        """
         light, grave = sorted(
             (other, self), key=lambda t: get_args(Verdict).index(t.verdict)
         )
@@ -147,8 +156,10 @@ class Assessment:
 
 
 def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
-    """Return a concern for each likely misspecification: "doubtful" if the misfit decreases by more
-    than a factor of two without it, else "check".
+    """Return a concern for each likely misspecification, in the same order.
+
+    It is "doubtful" if the misfit decreases by more than a factor of two (`CERTAIN`) without the
+    misspecification, else "check"; its message begins with "likely: ". No hypothesis is left out.
     """
     return [
         replace(cause, subject=f"likely: {cause.subject}").concern(
@@ -159,8 +170,21 @@ def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
 
 
 def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
-    """Return concerns about the residuals: their size compared with σ, correlation,
-    outliers and disagreement of recordings.
+    """Return concerns about the residuals: size compared with σ, correlation, outliers and
+    disagreement of recordings.
+
+    Correlation counts only if the error bars use autocorrelated errors: "residuals/persist" in time
+    ("doubtful" if the residuals are also more than `GROSS_MISFIT` times σ), else
+    "residuals/shared". Residuals more than `MISFIT` times σ are "doubtful" above `GROSS_MISFIT` if
+    they are also correlated, or if nothing is known about their correlation in time. Residuals less
+    than 1/`MISFIT` of σ are "check" unless they are exactly zero or correlated. All need
+    significance at `RARE`. One concern for each outlier, for noisy markers, and for parameters on
+    which recordings disagree is added.
+
+    Parameters
+    ----------
+    uncertainty : Uncertainty
+        Error bars with the tests of the residuals.
     """
     level = uncertainty.level
     dependence = uncertainty.dependence
@@ -211,7 +235,9 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
 
 
 def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
-    """Return a concern if recordings disagree on shared parameters."""
+    """Return one concern, as a list, with the parameters on which recordings disagree; empty if
+    there are none, or if recordings were not compared.
+    """
     scatter = uncertainty.scatter
     disagreeing = (
         []
@@ -225,7 +251,12 @@ def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
 
 
 def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
-    """Return a concern if markers are much noisier than the others, as a list; else empty."""
+    """Return one concern, as a list, if markers are much noisier than the others; else empty.
+
+    Noisy are markers whose residuals exceed `MARKER_MISFIT` times the median of all markers, and
+    `MARKER_MISFIT` times σ. Nothing is reported unless the test for unequal variances is
+    significant at `RARE`.
+    """
     if not level.unequal_p < RARE:
         return []
     usual = float(np.median([*level.factors.values()]))
@@ -247,8 +278,12 @@ def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
 
 
 def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
-    """Return concerns about parameters at their bounds, and about those that the data do
-    not determine.
+    """Return concerns about estimated parameters at their bounds, and about those without a
+    standard error.
+
+    Several parameters at bounds are one concern, "doubtful"; a single one is "check". Parameters
+    without standard error are one concern, "doubtful" if it is all of the estimated parameters,
+    else "check". Mode coefficients of fields do not count.
     """
     known = uncertainty.estimates
     estimates = {
@@ -291,6 +326,13 @@ def numerical_concerns(
         Combined standard uncertainties; None if unknown, then the parameter is left out.
     refinement : Refinement or None
         Discretisation errors; None if they are unknown, which is no concern.
+
+    Returns
+    -------
+    list of Concern
+        Empty, or one concern of grade "check" if the largest correction exceeds `MOVED` standard
+        uncertainties: "mesh/refined" if solutions on finer discretisations exist, else
+        "scheme/step".
     """
     if refinement is None:
         return []
@@ -318,11 +360,11 @@ RELAXED = {
 def probe_concerns(
     probes: Iterable[Probe], corrections: Mapping[str, float]
 ) -> list[Concern]:
-    """Return a concern about the assumption that the data contradict most, with the estimates
-    without it.
+    """Return one concern, as a list, about the assumption that the data contradict most, with the
+    estimates without it; empty if `is_alarming` is false for every probe.
 
-    Other assumptions that would explain the data less well are named in the same concern, because
-    relaxing one is mostly a substitute for relaxing another.
+    Other alarming assumptions, which explain the data less well, are named in the same concern,
+    because relaxing one is mostly a substitute for relaxing another. The grade is "check".
 
     Parameters
     ----------
@@ -361,7 +403,8 @@ def probe_concerns(
 
 def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
     """Return the estimate of a parameter by a probe that relaxes an assumption, multiplied by a
-    correction, as text.
+    correction, as text. The value is multiplied by the correction, the standard error is not; a
+    parameter without an estimate is "not determined".
     """
     move = probe.moves.get(name)
     if move is None:
@@ -373,8 +416,9 @@ def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
 def outlier_share_concerns(
     diagnoses: Iterable[MarkerDiagnosis],
 ) -> list[Concern]:
-    """Return a concern if too many samples of all markers are beyond Huber's threshold, as a list;
-    else empty.
+    """Return one concern, as a list, if the share of samples beyond Huber's threshold, of all
+    samples of all markers, exceeds `WILD`; "doubtful" above `HARDLY_TAME`. Else empty, also
+    without samples.
     """
     diagnoses_list = tuple(diagnoses)
     share = sum(d.wild for d in diagnoses_list) / max(
@@ -404,6 +448,12 @@ def nuisance_concerns(
         Estimates φ in standard deviations of their priors.
     low, high : iterables of float
         Limits of the estimates, likewise.
+
+    Notes
+    -----
+    At a limit (within 0.001 standard deviations) the concern is "doubtful". Else it is "check"
+    beyond `LARGEST_OFFSET` standard deviations, or more if there are many parameters (Bonferroni),
+    and "doubtful" beyond `ABSURD`. Limits may be infinite.
     """
     items = [*zip(names, deviations, low, high, strict=True)]
     limit = (
@@ -429,7 +479,9 @@ def nuisance_concerns(
 def camera_pose_concerns(
     names: Sequence[str], deviations: Sequence[float]
 ) -> list[Concern]:
-    """Return a concern if a depth camera is farther from its stated pose than expected.
+    """Return one concern, as a list, if a component of a depth camera's pose error exceeds
+    `LARGEST_CAMERA_OFFSET` standard deviations, about the largest component; else empty, also
+    without components.
 
     A wrong shape of the body often fits with a camera that is rotated and translated to match.
 
@@ -454,14 +506,16 @@ def camera_pose_concerns(
 
 
 def outline_concerns(camera: str, distances_px: Array) -> list[Concern]:
-    """Return a concern if the outline of the body differs from the edges in a camera's images.
+    """Return one concern, as a list, if more than `OUTLINE_SHARE` of the outline points are farther
+    than `LARGEST_OUTLINE_DISTANCE_PX` from the edges in a camera's images; else empty, also
+    without points.
 
     Parameters
     ----------
     camera : str
         Name of the depth camera and of its experiment, for the message.
     distances_px : (n,) array
-        Distances of outline points from the edges in the images [pixels].
+        Distances of outline points from the edges in the images, of either sign [pixels].
     """
     share = (
         float(np.mean(np.abs(distances_px) > LARGEST_OUTLINE_DISTANCE_PX))
@@ -479,7 +533,8 @@ def outline_concerns(camera: str, distances_px: Array) -> list[Concern]:
 
 
 def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
-    """Return a concern if a time shift is above `LATE` standard deviations of its prior.
+    """Return one concern, as a list, if a time shift of either sign exceeds `LATE` standard
+    deviations of its prior; else empty.
 
     Parameters
     ----------
@@ -507,7 +562,12 @@ def forward_simulation_concerns(
     noise_rms_m: float,
     is_fitted: bool,
 ) -> list[Concern]:
-    """Return a concern if the forward simulation of an experiment is much worse than the fit.
+    """Return one concern, as a list, if the forward simulation of an experiment is much worse than
+    the fit; else empty.
+
+    With the larger of `fit_rms_m` and `noise_rms_m` as unit: a fitted experiment is "check" where
+    √(rms² − fit²) exceeds `ROLLOUT` and "doubtful" above `GROSS_ROLLOUT`; a prediction where
+    `rms_m` exceeds `PREDICTION` and `GROSS_PREDICTION`.
 
     Parameters
     ----------
@@ -518,7 +578,8 @@ def forward_simulation_concerns(
     fit_rms_m : float
         The same distance of the fit, or for a prediction of the fits of other experiments [m].
     noise_rms_m : float
-        Distance that noise alone would give [m]; without both there is no concern.
+        Distance that noise alone would give [m]; if this and `fit_rms_m` are zero there is no
+        concern.
     is_fitted : bool
         Whether the experiment was fitted; if not, the simulation is a prediction.
     """
@@ -567,13 +628,14 @@ def prediction_concerns(
     sigma_key : str
         Key of its σ in the problem.
     sigmas : float
-        Root mean square difference over σ.
+        Root mean square difference over σ, for the message only.
     robust_sigmas : float
-        Root mean square difference over σ with outliers shortened, which decides.
+        Root mean square difference over σ with outliers shortened, which decides: "check" above
+        `MISFIT`, "doubtful" above `GROSS_MISFIT`, none if χ² is as large by chance (p > `RARE`).
     count : int
         Number of measured values.
     size : str
-        Root mean square difference with its unit, for the message.
+        Root mean square difference with its unit, for the message; "" leaves it out.
     """
     is_chance = float(chi2_sf(count * robust_sigmas**2, count)) > RARE
     return concern_if(
@@ -589,7 +651,9 @@ def prediction_concerns(
 
 
 def stability_concerns(instabilities: Iterable[Instability]) -> list[Concern]:
-    """Return concerns about states of the answer in which disturbances grow."""
+    """Return a concern for each instability whose disturbances grow by more than e to the power
+    `E_FOLDINGS` in the recording; "doubtful" above `GROSS_E_FOLDINGS`.
+    """
     concerns: list[Concern] = []
     for each in instabilities:
         grows = each.e_foldings > E_FOLDINGS
@@ -615,6 +679,13 @@ def contact_concerns(
         Contact summaries.
     guess : str
         Text that refers to the guess, such as " at the guess"; empty for an answer.
+
+    Notes
+    -----
+    An obstacle that is never touched is "doubtful" for an answer and "check" at the guess; all
+    others are "check". One concern is returned for each code and name of an obstacle: that of the
+    experiment with the fewest faces in contact, with the number of the other experiments in its
+    message.
     """
     concerns: dict[tuple[str, str], list[Concern]] = {}
     for each in sorted(summaries, key=lambda touch: touch.face_count):
@@ -667,8 +738,18 @@ def rotation_step_concerns(
     limit_rad: float = WARNING_ANGLE_RAD,
     code: str = "scheme/turns",
 ) -> list[Concern]:
-    """Return a concern with a code if a grasp rotates by more than `limit_rad` [rad] within a step
-    of the grid with this many substeps; else an empty list.
+    """Return one concern, as a list, if a grasp rotates by more than a limit within a step of the
+    time grid; else empty, also for a static experiment.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    substeps : int
+        Steps per sample of the grid.
+    limit_rad : float
+        Largest rotation in a step [rad].
+    code : str
+        Code of the concern, whose grade is "check".
     """
     turn = fastest_rotation(experiment, substeps)
     sizes = {"step_ms": 1e3 * turn.step_s, "rate_rad_s": turn.rate_rad_s}
@@ -680,7 +761,12 @@ def rotation_step_concerns(
 def scheme_concerns(
     name: str, damping_ratio: float, added_ratio: float, period_error: float
 ) -> list[Concern]:
-    """Return concerns about the effect of the scheme on the first mode of an experiment.
+    """Return concerns about the effect of the scheme on the first mode of an experiment, at most
+    one about damping and one about the period.
+
+    Added damping is "check" above `DAMPING_SHARE` of the mode's and above `LITTLE_DAMPING`, and
+    "doubtful" above `GROSS_DAMPING_SHARE`; negative added damping is no concern. A change of the
+    period of either sign is "check" above `PERIOD_ERROR`, "doubtful" above `GROSS_PERIOD_ERROR`.
 
     Parameters
     ----------
@@ -715,8 +801,8 @@ def scheme_concerns(
 def rms_expected_from_noise_m(
     sigma_m: Array, samples: Array, parameter_count: float
 ) -> float:
-    """Return the RMS distance of markers that noise alone would leave, √(3 (1 − p/N)) σ, pooled
-    [m].
+    """Return the RMS distance of markers that noise alone would leave, √(3 (1 − p/N) σ²), with the
+    mean σ² of all samples [m]; 0 without samples or if p ≥ N.
 
     Parameters
     ----------

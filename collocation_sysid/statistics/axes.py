@@ -9,7 +9,9 @@ AxesOrder = tuple[tuple[int, ...], tuple[int, ...]]
 
 
 def _other_axes() -> Iterator[tuple[str, AxesOrder]]:
-    """Yield every order and signs of three axes except the identity, with their description."""
+    """Yield every order and signs of three axes except the identity, mirror images included, with
+    their description; the order has indices of axes, the signs are 1 or −1.
+    """
     for order in permutations(range(3)):
         for signs in product((1, -1), repeat=3):
             if order != (0, 1, 2) or min(signs) < 0:

@@ -22,7 +22,7 @@ class Topic:
     Attributes
     ----------
     title : str
-        Title.
+        Title of the topic for headings.
     page : str
         Topic of the page with more information, see `pages`.
     remedy : str
@@ -475,8 +475,21 @@ TOPICS: Mapping[str, Topic] = {
 def message_of(code: str, data: Mapping[str, Any]) -> str:
     """Return the message of a code with its data.
 
-    If the data contain "of", the message begins with that subject; if they contain "nearer", the
-    factor by which the misfit decreases is appended.
+    If the data contain a non-empty "of", the message begins with that subject; only then, and if
+    they contain "nearer", the factor by which the misfit decreases is appended. Lists and tuples
+    are joined to a phrase; data without a placeholder are ignored.
+
+    Parameters
+    ----------
+    code : str
+        Topic and the rest of the code, such as "noise/larger".
+    data : mapping of str to value
+        Values of the placeholders.
+
+    Raises
+    ------
+    KeyError
+        If the code is unknown or a placeholder has no value.
     """
     topic, _, rest = code.partition("/")
     shown = {
@@ -503,7 +516,7 @@ class Concern:
     code : str
         Topic and kind, such as "noise/larger"; stable when messages are reworded.
     grade : {"check", "doubtful"}
-        Severity.
+        Severity: "doubtful" is graver.
     data : mapping of str to value
         Values of the placeholders in the message.
     """
@@ -514,12 +527,12 @@ class Concern:
 
     @property
     def topic(self) -> str:
-        """Topic of the concern, a key of `TOPICS`."""
+        """Topic of the concern, a key of `TOPICS`: the code up to the first slash."""
         return self.code.partition("/")[0]
 
     @property
     def message(self) -> str:
-        """Message of the concern for the user."""
+        """Message of the concern for the user, see `message_of`."""
         return message_of(self.code, self.data)
 
 
@@ -537,5 +550,7 @@ def concern_if(
 
 
 def topics_of(concerns: Iterable[Concern]) -> dict[str, Topic]:
-    """Return the topics of several concerns by key, each once."""
+    """Return the topics of several concerns by key, each once, in the order of their first
+    concern.
+    """
     return {concern.topic: TOPICS[concern.topic] for concern in concerns}

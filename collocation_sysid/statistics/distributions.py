@@ -13,7 +13,9 @@ from scipy.special import betaincc, chdtr, chdtrc, chdtri, ndtri, stdtrit
 
 
 def normal_isf(tail: ArrayLike) -> Any:
-    """Return the value that a standard normal variable exceeds with probability `tail`."""
+    """Return the value that a standard normal variable exceeds with probability `tail`; infinite
+    for 0, NaN outside 0 to 1.
+    """
     return -ndtri(tail)
 
 

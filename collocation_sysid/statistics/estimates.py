@@ -74,8 +74,14 @@ class Estimate:
 
 @dataclass(frozen=True)
 class IntervalCoordinate:
-    """Coordinate in which an interval is symmetric: the logarithm, ln ν/(½ − ν) (`is_odds`),
-    or the value itself (`is_linear`).
+    """Coordinate in which an interval is symmetric.
+
+    Attributes
+    ----------
+    is_odds : bool
+        Whether it is ln ν/(½ − ν), for Poisson's ratio; decides before `is_linear`.
+    is_linear : bool
+        Whether it is the value itself; if neither, it is the logarithm.
     """
 
     is_odds: bool
@@ -92,9 +98,11 @@ class IntervalCoordinate:
         name : str
             Name of the parameter or modulus.
         values : iterable of float
-            Value and ends of its intervals; if any is not positive, the coordinate is linear.
+            Value and ends of its intervals, at least one; if any is not positive, the coordinate is
+            linear.
         linear : bool
-            Whether the parameter is its own coordinate.
+            Whether the parameter is its own coordinate; a positive Poisson's ratio has ln ν/(½ − ν)
+            nevertheless.
         """
         lowest = min(values)
         return cls(
@@ -103,27 +111,31 @@ class IntervalCoordinate:
         )
 
     def derivative(self, value: float) -> float:
-        """Return the derivative of the coordinate by the value."""
+        """Return the derivative of the coordinate by the value, at a value within the domain."""
         if self.is_odds:
             return 0.5 / (value * (0.5 - value))
         return 1.0 if self.is_linear else 1 / value
 
     def from_value(self, value: float) -> float:
-        """Return the coordinate of a value; infinite or NaN outside its domain."""
+        """Return the coordinate of a value; ±infinity at the ends of its domain, NaN
+        beyond them.
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.is_odds:
                 return float(np.log(value / (0.5 - value)))
             return value if self.is_linear else float(np.log(value))
 
     def to_value(self, x: float) -> float:
-        """Return the value of a coordinate."""
+        """Return the value of a coordinate x: the inverse of `from_value`."""
         if self.is_odds:
             return float(0.5 / (1 + np.exp(-x)))
         return x if self.is_linear else float(np.exp(x))
 
 
 def correlation_from_covariance(covariance: Array) -> Array:
-    """Return the correlations (n, n); NaN where a variance is zero or not finite."""
+    """Return the correlations (n, n) of a covariance (n, n), which is not modified; NaN in rows and
+    columns whose variance is zero or not finite.
+    """
     deviation = np.sqrt(np.diag(covariance))
     deviation[~np.isfinite(deviation) | (deviation == 0)] = np.nan
     return covariance / np.outer(deviation, deviation)
@@ -151,6 +163,20 @@ def user_estimates(
         Whether each is at a bound.
     quantiles : (nq,) array
         Half widths of the 95 % intervals in standard deviations.
+
+    Returns
+    -------
+    dict of str to Estimate
+        In the order of `Parameters.values`. Fixed parameters have their value alone; those tied to
+        another its estimate times the ratio. An estimate has an interval but no standard error if
+        the interval covers the range between its bounds, spans more than `WIDE_FACTOR` (of
+        Poisson's ratio `WIDE_POISSON`), or if the correlation with another parameter exceeds
+        `CONFOUNDED` at a relative deviation above `CONFOUNDED_DEVIATION`.
+
+    Notes
+    -----
+    Infinite or NaN variances in `covariance_q` mean that the data do not determine the parameter.
+    The argument arrays are not modified.
     """
     values = parameters.values(q).items()
     estimates = {
@@ -213,8 +239,8 @@ def user_estimates(
 
 
 def relative_derivatives(parameters: Parameters, q: Array) -> Array:
-    """Return the derivative (nq,) of each parameter by its q, over the parameter's size: 1 for a
-    logarithmic scale and for coefficients of fields.
+    """Return the derivative (nq,) of each free parameter by its q, over the parameter's absolute
+    value: 1 for a logarithmic scale; for coefficients of fields the derivative itself.
     """
     slopes = []
     for item, coordinate in zip(parameters.free, q, strict=True):
@@ -243,6 +269,11 @@ def derived_estimates(
         Parameters at a bound; a modulus that depends on one has no interval.
     quantiles : (nq,) array
         Half widths of intervals in standard deviations.
+
+    Notes
+    -----
+    A modulus that does not depend on q, or is not positive, has its value alone; others are taken
+    as log-normal, with the largest quantile of the parameters that they depend on.
     """
     estimates = {}
     for name, value in derived.values.items():
@@ -271,7 +302,12 @@ def derived_estimates(
 def _parameter_estimate(
     item: Parameter, value: float, deviation: float, quantile: float
 ) -> Estimate:
-    """Return the estimate of a parameter with its interval.
+    """Return the estimate of a parameter with its interval, symmetric in the parameter's
+    coordinate.
+
+    Logarithmic parameters and positive Poisson's ratios are treated by `_logarithmic_estimate`.
+    Others have a symmetric interval, cut off at the least value of the constant; with a deviation
+    of q above `UNDETERMINED`, or NaN, only a value and a reason.
 
     Parameters
     ----------
@@ -309,8 +345,8 @@ def _parameter_estimate(
 
 
 def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
-    """Return the estimate, standard error and interval multiplied by a number, which may be
-    negative.
+    """Return an estimate multiplied by a ratio, which may be negative: value, standard error (by
+    its absolute value) and interval, in ascending order.
     """
     ends = estimate.statistical95 and sorted(
         (ratio * estimate.statistical95[0], ratio * estimate.statistical95[1])
@@ -327,7 +363,9 @@ def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
 
 
 def _estimate_at_bound(value: float) -> Estimate:
-    """Return the estimate of a value at a bound, without error bars."""
+    """Return the estimate of a value at a bound, or that follows from one: without standard error
+    and interval, with a reason.
+    """
     return Estimate(
         value,
         at_bound=True,
@@ -338,9 +376,22 @@ def _estimate_at_bound(value: float) -> Estimate:
 def _logarithmic_estimate(
     name: str, value: float, deviation: float, quantile: float
 ) -> Estimate:
-    """Return the estimate of a value whose logarithm has the standard deviation `deviation`, NaN or
-    a large one if it is not determined; `quantile` is the half width of the interval in standard
-    deviations.
+    """Return the estimate of a positive value from the standard deviation of its logarithm.
+
+    For Poisson's ratio the interval is symmetric in ln ν/(½ − ν). An interval that is too wide
+    (`WIDE_FACTOR`, `WIDE_POISSON`) remains, but there is no standard error.
+
+    Parameters
+    ----------
+    name : str
+        Name of the parameter or modulus.
+    value : float
+        Estimated value, above 0.
+    deviation : float
+        Standard deviation of the logarithm; NaN or above `UNDETERMINED` if it is not determined,
+        and then the estimate has neither interval nor standard error.
+    quantile : float
+        Half width of the interval in standard deviations.
     """
     if not deviation <= UNDETERMINED:  # or NaN
         return Estimate(value, reason="the data do not determine it")
@@ -368,7 +419,11 @@ NOTEWORTHY = 1.1
 def parameter_notes(
     parameters: Parameters, estimates: Mapping[str, Estimate]
 ) -> list[str]:
-    """Return notes on parameters at a bound, not determined, or not identifiable."""
+    """Return notes on free parameters at a bound, not determined, or not identifiable.
+
+    Notes on bounds and undetermined parameters come first, in the order of the parameters, then
+    those of `_unidentifiable_notes`. Parameters without an entry in `estimates` are left out.
+    """
     notes = []
     reasons = {}
     for item in (each for each in parameters.free if each.name in estimates):
@@ -401,8 +456,14 @@ def parameter_notes(
 
 
 def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:
-    """Return one note for each parameter that is not identifiable, by the reasons, and one for two
-    parameters that are confounded with each other.
+    """Return one note for each parameter that is not identifiable, and one for two parameters that
+    are confounded with each other.
+
+    Parameters
+    ----------
+    reasons : mapping of str to str
+        Reason by the name of each parameter without a standard error; "confounded with NAME " at
+        its beginning names another parameter.
     """
     notes = []
     mentioned = set()
@@ -427,8 +488,17 @@ def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:
 def memory_notes(
     estimates: Mapping[str, Estimate], longest_s: float
 ) -> list[str]:
-    """Return notes on memory branches whose share ended at zero, may be zero, or whose relaxation
-    is slower than the longest recording [s].
+    """Return notes on memory branches, at most one for each.
+
+    A branch gets a note if its share ended at its bound zero, if the interval of the share contains
+    zero, or if its relaxation time exceeds the longest recording.
+
+    Parameters
+    ----------
+    estimates : mapping of str to Estimate
+        All parameters by name, those of branches with their region and branch in front.
+    longest_s : float
+        Duration of the longest recording [s].
     """
     notes = []
     for name, share in estimates.items():
@@ -475,6 +545,12 @@ def noise_notes(
         Size of the residuals.
     errors : {"independent", "autocorrelated"}
         Correlation of the errors.
+
+    Returns
+    -------
+    list of str
+        Empty, or one note. Empty if the noise was requested as "estimated", if tests find that the
+        residuals agree with σ, or if they differ from it by less than a factor of `NOTEWORTHY`.
     """
     if requested == "estimated" or level.suggested_noise == "given":
         return []
@@ -516,18 +592,20 @@ def noise_notes(
 def correlation_notes(
     requested: str, errors: str, dependence: Dependence
 ) -> list[str]:
-    """Return notes on correlated residuals and how the error bars account for that.
+    """Return one note, as a list, on correlated residuals and how the error bars account for that;
+    else empty.
 
     Empty if they are not correlated, or if their correlation is explained, so that independent
     errors were used without having been requested.
 
     Parameters
     ----------
-    requested : str
+    requested : {"auto", "independent", "autocorrelated"}
         Errors that the user requested.
-    errors : str
+    errors : {"independent", "autocorrelated"}
         Errors that were used.
     dependence : Dependence
+        Tests of the residuals.
     """
     if not dependence.is_correlated or (
         errors != "autocorrelated" and requested != "independent"
@@ -553,8 +631,8 @@ def correlation_notes(
 def disagreement_notes(
     fit: LinearisedFit, scatter: RecordingComparison | None
 ) -> list[str]:
-    """Return notes on parameters on which the recordings disagree; empty without a comparison
-    (None).
+    """Return one note for each parameter on which the recordings disagree; empty without a
+    comparison (None).
     """
     if scatter is None:
         return []
@@ -567,8 +645,8 @@ def disagreement_notes(
 
 
 def display_name(name: str) -> str:
-    """Return the name of an estimated parameter for messages; a mode coefficient is
-    described by its field.
+    """Return the name of an estimated parameter for messages: itself, or for a mode coefficient a
+    phrase with the name of its kind and its own name.
     """
     return (
         f"the {MODE.name} (share {name})"

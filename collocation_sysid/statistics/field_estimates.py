@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -56,7 +57,10 @@ AMPLITUDES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 
 
 def phase_concerns(phases: PhaseSummary, name: str) -> list[Concern]:
-    """Return concerns about a two-phase field: no contrast, few elements, or a bad fit.
+    """Return concerns about a two-phase field, all "check": "field/one-phase" if the interval of
+    the contrast contains 1, "field/few" if the smaller phase has fewer than `FEWEST_ELEMENTS`
+    elements, "field/phases" if χ² per measurement exceeds `WORSE` times the larger of 1 and that
+    of the smooth field.
 
     Parameters
     ----------
@@ -132,7 +136,10 @@ class FieldEstimate:
 
     @property
     def statistical95(self) -> tuple[Array, Array]:
-        """Lower and upper ends (k,) of the 95 % intervals."""
+        """Lower and upper ends (k,) of the 95 % intervals: those from samples if there are any,
+        symmetric about the value for a density, else symmetric in the logarithm. NaN without
+        error bars.
+        """
         if self.sampled_intervals is not None:
             return self.sampled_intervals
         if self.declared_density_kg_m3 is not None:
@@ -145,7 +152,9 @@ class FieldEstimate:
 
     @property
     def deviation_over_prior(self) -> Array:
-        """Standard deviation (k,) over that of the prior about the mean."""
+        """Standard deviation (k,) of the logarithm over that of the prior about the mean; for
+        sampled phases over `PhaseSummary.deviation`. NaN without error bars.
+        """
         prior = (
             self.modes.field.deviation
             if self.phases is None
@@ -155,16 +164,19 @@ class FieldEstimate:
 
     @property
     def is_informed(self) -> NDArray[np.bool_]:
-        """Mask (k,) of the elements that the data determine better than the prior."""
+        """Mask (k,) of the elements whose standard deviation is less than `LEAST_DETERMINED_SHARE`
+        of the prior's; false without error bars.
+        """
         return self.deviation_over_prior < LEAST_DETERMINED_SHARE
 
     @property
     def identified_modes(self) -> int:
-        """Number of independent modes whose variance the data at least halve, compared with
-        the prior.
+        """Number of independent modes whose variance the data at least halve, compared with the
+        prior.
 
         It counts the eigenvalues of `covariance`, of which the prior is the identity, below
-        `LEAST_DETERMINED_SHARE`. The number means nothing if the covariance is not finite.
+        `LEAST_DETERMINED_SHARE`; entries that are NaN count as 1. The number means nothing if the
+        covariance is not finite.
         """
         known = np.linalg.eigvalsh(np.nan_to_num(self.covariance, nan=1.0))
         return int((known < LEAST_DETERMINED_SHARE).sum())
@@ -180,7 +192,9 @@ class FieldEstimate:
 
     @cached_property
     def _data_information(self) -> tuple[Array, Array]:
-        """Information H of the data alone, and the score b, see the module's documentation."""
+        """Information H (m, m) of the data alone and the score b (m,), see the module's
+        documentation; eigenvalues of the covariance are limited to at most 1.
+        """
         values, vectors = np.linalg.eigh(
             (self.covariance + self.covariance.T) / 2
         )
@@ -191,8 +205,9 @@ class FieldEstimate:
 
     @cached_property
     def _is_wider_than_prior(self) -> bool:
-        """Whether error bars exceed the prior, because residuals are much larger than the
-        noise; then there is no valid evidence.
+        """Whether the largest eigenvalue of `covariance` exceeds that of the prior by `WIDER`,
+        because residuals are much larger than the noise, or whether it is not finite; then there
+        is no valid evidence.
         """
         known = self.covariance
         return (
@@ -214,6 +229,10 @@ class FieldEstimate:
             Correlation length; None means the present one.
         factor : float
             Factor of the amplitude.
+
+        Notes
+        -----
+        Positive values favour the other prior. A length equal to the present one counts as None.
         """
         if self.phases is not None or self._is_wider_than_prior:
             return 0.0
@@ -229,8 +248,8 @@ class FieldEstimate:
         return self._log_evidence(prior) - self._log_evidence(np.eye(size))
 
     def _log_evidence(self, prior: Array) -> float:
-        """Return the logarithm of the evidence Z(D) for a prior covariance D (m, m) of the
-        coefficients, up to a constant that does not depend on D.
+        """Return ln Z(D) for a prior covariance D (m, m) of the coefficients, up to a constant that
+        does not depend on D.
         """
         alone, score = self._data_information
         both = np.eye(len(alone)) + alone @ prior
@@ -244,7 +263,13 @@ class FieldEstimate:
 
     @property
     def concerns(self) -> list[Concern]:
-        """Concerns: negative densities, or an amplitude or length that the data contradict."""
+        """Concerns about the field: for two phases those of `phase_concerns`; for a smooth field
+        values of zero or less in some elements ("doubtful", first), and an amplitude or a length
+        that the data contradict.
+
+        The amplitude is reported if the best of `AMPLITUDES` is larger than the stated one and its
+        log-evidence ratio exceeds `LIKELIER`, the length if that of half the length does.
+        """
         if self.phases is not None:
             return phase_concerns(self.phases, self.name)
         amplitude = self.modes.field.deviation
@@ -286,7 +311,8 @@ def field_estimates(
     q: Array,
     uncertainty: Uncertainty | Array | None,
 ) -> list[FieldEstimate]:
-    """Return the estimates of all fields of a body.
+    """Return the estimates of all fields of a body, one for each part with a field, in the order of
+    the parts; empty if there is none.
 
     Parameters
     ----------
@@ -297,7 +323,13 @@ def field_estimates(
     q : (nq,) array
         Estimates in the solver's coordinates.
     uncertainty : Uncertainty, (nq, nq) array or None
-        Error bars, or covariance of q; None gives no error bars.
+        Error bars, or covariance of q, with a quantile of 1.96; None gives NaN as deviations and
+        quantile.
+
+    Notes
+    -----
+    Parameters with a variance of NaN, such as those at a bound, count as known. The deviation
+    contains that of the modes that are left out.
     """
     size = len(q)
     names = [item.name for item in parameters.free]
@@ -368,9 +400,9 @@ def _with_phases(
 ) -> FieldEstimate:
     """Return the estimate of a two-phase field with intervals from its samples.
 
-    Intervals are quantiles of the samples, so that an element at the boundary has an interval from
-    one phase to the other. Without samples the phases count as known, and the estimate is returned
-    unchanged.
+    Intervals are quantiles of the samples, widened to contain the value, so that an element at the
+    boundary has an interval from one phase to the other. Without samples, or without error bars,
+    the phases count as known, and the estimate is returned unchanged.
 
     Parameters
     ----------
@@ -379,7 +411,7 @@ def _with_phases(
     modes : TwoPhaseModes
         Modes with their samples.
     contrast : float
-        Contrast of the answer.
+        Ratio of the inclusion to the surroundings in the answer, above 0.
     """
     samples = modes.samples
     if samples is None or not np.isfinite(estimate.deviation).all():
@@ -406,17 +438,43 @@ def _with_phases(
     )
 
 
-def _quantiles(values: Array) -> tuple[float, float, float]:
-    """Return lower end, median and upper end of the 95 % interval of samples (any shape)."""
+class SampleQuantiles(NamedTuple):
+    """Median and 95 % interval of samples.
+
+    Attributes
+    ----------
+    lower : float
+        Quantile of 2.5 %.
+    median : float
+        Median.
+    upper : float
+        Quantile of 97.5 %.
+    """
+
+    lower: float
+    median: float
+    upper: float
+
+
+def _quantiles(values: Array) -> SampleQuantiles:
+    """Return median and 95 % interval of samples (any shape, not empty)."""
     lower, median, upper = np.quantile(values, [ENDS[0], 0.5, ENDS[1]])
-    return float(lower), float(median), float(upper)
+    return SampleQuantiles(float(lower), float(median), upper=float(upper))
 
 
 def field_estimates_at(
     collocation: Collocation, z: Array
 ) -> dict[str, FieldEstimate]:
-    """Return the field estimates at a solution by name, with the covariance for independent
-    errors of the stated σ.
+    """Return the field estimates of all bodies at a solution by name, with the covariance for
+    independent errors of the stated σ.
+
+    Of several bodies with a field of the same name, the first counts.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    z : (variables,) array
+        Variables at the answer.
     """
     covariance = factorise_information(
         linearise_fit(collocation, z)
@@ -456,6 +514,11 @@ def mean_logarithm(
         Index of the part, which must have a field.
     names : sequence of str
         Names of the estimated parameters of the derivatives, in their order.
+
+    Returns
+    -------
+    (float, (k,) array)
+        The value, and its derivatives by q of each of the `names`.
     """
     modes = body.parts[part_index].field
     assert modes is not None
@@ -480,11 +543,17 @@ def _mean_logarithm(
     part_index : int
     modes : FieldModes
         Field of the part.
+
+    Notes
+    -----
+    For a field of all moduli of a part the mean is Young's modulus, for other fields the first
+    constant that the field scales. The ratio of a density that is not estimated is 1.
     """
     body = constants.body
     part = constants.body.parts[part_index]
 
     def logarithm(q: ca.SX, _: ca.SX) -> ca.SX:
+        """Return the expression at q (nq,); the second argument, data, is empty."""
         own = body.split_theta(constants.expression(q))[part_index]
         if part.stress_field is None:
             return (

@@ -32,6 +32,13 @@ def identifiability_sentences(uncertainty: Uncertainty) -> tuple[str, ...]:
     intervals.
 
     Sentences on parameters at a bound or not identifiable are the same as in the notes.
+
+    Returns
+    -------
+    tuple of str
+        First the determined parameters, then confounded combinations, then the moduli of the other
+        elastic convention (only if a combination or one of the following is reported), then the
+        notes of `uncertainty` that begin with a parameter's name. Empty if nothing can be said.
     """
     open_ends = [
         note
@@ -51,7 +58,9 @@ def identifiability_sentences(uncertainty: Uncertainty) -> tuple[str, ...]:
 
 
 def _single_sentences(uncertainty: Uncertainty) -> list[str]:
-    """Return the sentence about the parameters that are determined, with their precision."""
+    """Return one sentence, as a list, about the parameters with a useful interval and its half
+    width, well determined ones (up to `WELL_FIXED`) first; empty if there are none.
+    """
     factors = {
         name: factor
         for name in uncertainty.names
@@ -78,8 +87,11 @@ def _single_sentences(uncertainty: Uncertainty) -> list[str]:
 
 
 def _combination_sentences(uncertainty: Uncertainty) -> list[str]:
-    """Return sentences about confounded parameters, one for each eigenvector with a small
-    eigenvalue.
+    """Return sentences about confounded parameters, one for each eigenvector of their correlations
+    with an eigenvalue up to 1 − `CONFOUNDED`.
+
+    Mode coefficients and parameters without a finite, positive variance are left out, and
+    combinations of three or more parameters that are all well determined.
     """
     deviations = np.sqrt(np.diag(uncertainty.covariance))
     modes = np.array(
@@ -117,7 +129,8 @@ def _combination_sentence(
     eigenvalue: float,
     vector: Array,
 ) -> str:
-    """Return the sentence about one combination of confounded parameters.
+    """Return the sentence about one combination of confounded parameters, from a small eigenvalue
+    of their correlations.
 
     It states the combination as a product of powers, the largest of them 1, and the factor of its
     95 % interval; of two parameters also their correlation. If the value of a parameter is not
@@ -159,8 +172,8 @@ def _combination_sentence(
 
 
 def _other_convention(uncertainty: Uncertainty) -> list[str]:
-    """Return the sentence about the moduli of the other elastic convention; none if no
-    elastic constant is estimated.
+    """Return one sentence, as a list, about the moduli of the other elastic convention with a
+    useful interval; empty if there are none, or if no elastic constant is estimated.
     """
     if not set(ELASTIC) & {without_region(name) for name in uncertainty.names}:
         return []
@@ -181,8 +194,8 @@ def _other_convention(uncertainty: Uncertainty) -> list[str]:
 
 
 def _interval_factor(estimate: Estimate) -> float | None:
-    """Return the half width of the interval as a factor; None without one, or if it is too
-    wide to be useful.
+    """Return √(upper/lower) of the statistical interval of an estimate; None without one, if its
+    lower end is not positive, or if the factor is `HOPELESS` or more.
     """
     if estimate.statistical95 is None or not estimate.statistical95[0] > 0:
         return None
@@ -193,7 +206,9 @@ def _interval_factor(estimate: Estimate) -> float | None:
 
 
 def _precision_text(factor: float) -> str:
-    """Return an interval's half width, given as a factor, as text."""
+    """Return an interval's half width, given as a factor of 1 or more, as text: in per cent below
+    1.5, "no useful range" from `HOPELESS` on.
+    """
     if factor < 1.5:
         return f"±{100 * (factor - 1):.2g} %"
     return (
@@ -204,7 +219,9 @@ def _precision_text(factor: float) -> str:
 
 
 def _product_text(names: Sequence[str], powers: Array) -> str:
-    """Return a product of powers of parameters as text, such as "a · b^0.5"."""
+    """Return a product of powers (k,) of parameters as text, such as "a · b^0.5"; a power of 1 is
+    left out.
+    """
     parts = []
     for name, power in zip(names, powers, strict=True):
         parts.append(name if abs(power - 1) < 5e-3 else f"{name}^{power:.2g}")

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +73,12 @@ def observable_responses(
     """Return the changes of the observables of each experiment with its parameters, computed in
     parallel.
 
+    Parameters
+    ----------
+    collocation : Collocation
+    z : (variables,) array
+        Variables that satisfy the equations of motion.
+
     Raises
     ------
     SimulationError
@@ -79,23 +86,34 @@ def observable_responses(
     """
 
     def of(iterate: ExperimentIterate) -> ObservableResponse:
+        """Return the changes of the observables of one experiment with its parameters."""
         segment = iterate.segment
         grasp_forces = GraspForces.zeros(
             len(iterate.x),
             len(segment.sensed_dofs),
-            len(segment.dynamic_parameters),
+            columns=len(segment.dynamic_parameters),
         )
         rows = Sweep(segment).sensitivities(
-            iterate.x, iterate.equations, grasp_forces
+            iterate.x, iterate.equations, grasp_forces=grasp_forces
         )
         return iterate.observation.response_of_rows(rows, grasp_forces)
 
-    return map_experiments(of, collocation.iterates(z), collocation.threads)
+    return map_experiments(
+        of, collocation.iterates(z), threads=collocation.threads
+    )
 
 
 def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
-    """Return the derivatives d(markers)/dp of each experiment at its samples, (T, 3M, m),
-    see `ObservableResponse`.
+    """Return the derivatives d(markers)/dp of each experiment at its samples, (T, 3M, m) [m per
+    unit of p].
+
+    The m parameters p are those of `sensitivities`; the M markers are the first measurement of each
+    experiment.
+
+    Raises
+    ------
+    SimulationError
+        If the equations of a step are singular.
     """
     return [
         response.observed_changes[0]
@@ -110,6 +128,24 @@ Mask = NDArray[np.bool_]
 AT_BOUND = 1e-3
 # Largest step of parameters at a bound; exactly zero would leave no interval.
 NO_STEP = 1e-12
+
+
+class Channels(NamedTuple):
+    """Residuals of one measurement, with column 3 m + axis for each axis of marker m.
+
+    Attributes
+    ----------
+    residual : (T, 3M) array
+        Residuals in units of σ, zero where missing.
+    jacobian : (T, 3M, p) array
+        Their derivatives by all p parameters.
+    is_measured : (T, 3M) array of bool
+        Coordinates that exist.
+    """
+
+    residual: Array
+    jacobian: Array
+    is_measured: Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +208,9 @@ class ResidualBlock:
 
     @cached_property
     def is_measured(self) -> Mask:
-        """Mask (T, M, 3) of the coordinates that exist."""
+        """Mask (T, M, 3) of the coordinates that exist: `components`, or all three of each present
+        sample.
+        """
         if self.components is not None:
             return self.components
         return np.repeat(self.is_present[..., None], 3, axis=2)
@@ -180,7 +218,7 @@ class ResidualBlock:
     @property
     def is_outlier(self) -> Mask:
         """Mask (T, M) of the samples whose residual Huber's loss has shortened; all false without
-        Huber's loss.
+        Huber's loss (`misfit` is None).
         """
         if self.misfit is None:
             return np.zeros(self.is_present.shape, dtype=bool)
@@ -192,7 +230,7 @@ class ResidualBlock:
     @property
     def root_weight(self) -> Array:
         """Square root (T, M, 1) of Huber's weights, which residuals and derivatives contain
-        already.
+        already; 1 without Huber's loss.
         """
         if self.misfit is None:
             return np.ones((*self.is_present.shape, 1))
@@ -204,19 +242,19 @@ class ResidualBlock:
 
     @property
     def measurement_count(self) -> int:
-        """Number of scalar measurements that are present."""
+        """Number of coordinates that exist: of scalar measurements in this block."""
         return int(self.is_measured.sum())
 
     @cached_property
-    def channels(self) -> tuple[Array, Array, Mask]:
-        """Residuals (T, 3M), derivatives (T, 3M, p) and presence (T, 3M); column 3 m + axis."""
+    def channels(self) -> Channels:
+        """Residuals, derivatives and presence with one column for each coordinate of a marker."""
         samples, markers = self.is_present.shape
-        return (
+        return Channels(
             self.residual.reshape(samples, 3 * markers),
             self.jacobian.reshape(
                 samples, 3 * markers, self.jacobian.shape[-1]
             ),
-            self.is_measured.reshape(samples, 3 * markers),
+            is_measured=self.is_measured.reshape(samples, 3 * markers),
         )
 
 
@@ -239,7 +277,16 @@ class DerivedModuli:
     def from_bodies(
         cls, constants: Iterable[ThetaMap], q: Array
     ) -> DerivedModuli:
-        """Compute the moduli of several bodies at q."""
+        """Compute the moduli of several bodies at q (nq,); of moduli with the same name, those of
+        the last body count.
+
+        Parameters
+        ----------
+        constants : iterable of ThetaMap
+            Constants of each body as functions of q.
+        q : (nq,) array
+            Shared parameters in the solver's coordinates.
+        """
         values: dict[str, float] = {}
         by_q: dict[str, Array] = {}
         for each in constants:
@@ -252,7 +299,9 @@ class DerivedModuli:
 
 
 def parameter_values(collocation: Collocation, q: Array) -> dict[str, float]:
-    """Return derived moduli and parameters by name, in SI units, at q (nq,)."""
+    """Return derived moduli, then all parameters (fixed ones too) by name, in SI units, at q (nq,)
+    in the solver's coordinates.
+    """
     constants = (segment.constants for segment in collocation.transcriptions)
     return {
         **DerivedModuli.from_bodies(constants, q).values,
@@ -296,14 +345,19 @@ class LinearisedFit:
 
     @property
     def measurement_count(self) -> int:
-        """Number of scalar measurements that are present."""
+        """Number of scalar measurements of all blocks, without priors."""
         return sum(block.measurement_count for block in self.blocks)
 
     def with_disturbances(
         self, samples: Iterable[Array | None]
     ) -> LinearisedFit:
-        """Return the fit with samples (K, T, M, 3) of known errors of the residuals for each block;
-        None for a block without them.
+        """Return the fit with samples of known errors of the residuals, which replace those of
+        before.
+
+        Parameters
+        ----------
+        samples : iterable of (K, T, M, 3) array or None
+            For each block; None for a block without known errors.
         """
         pairs = zip(self.blocks, samples, strict=True)
         return replace(
@@ -313,7 +367,9 @@ class LinearisedFit:
 
     def after_step(self, step: Array) -> LinearisedFit:
         """Return the fit after a step (p,) of all parameters, to first order: with changed
-        residuals and the same derivatives.
+        residuals of measurements and priors and the same derivatives.
+
+        `misfit`, `derived` and `at_bound` are not changed.
         """
         blocks_after = (
             replace(b, residual=b.residual + b.jacobian @ step)
@@ -324,7 +380,9 @@ class LinearisedFit:
 
     @property
     def chi_squared(self) -> float:
-        """Sum of squared residuals of all measurements, without priors."""
+        """Sum of squared residuals of all measurements, shortened as by Huber's loss, without
+        priors.
+        """
         return float(sum(np.sum(block.residual**2) for block in self.blocks))
 
 
@@ -345,6 +403,11 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     ------
     SimulationError
         If the equations of motion are singular.
+
+    Notes
+    -----
+    Residuals of user-defined sensors and wrenches are padded or grouped to three components. The
+    fit has no `disturbances`, see `pose_noise.with_pose_noise`.
     """
     p = collocation.parameters_from(z)
     blocks = []
@@ -409,7 +472,7 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
 
 def _covariance_by_phases(collocation: Collocation) -> Array | None:
     """Return the covariance (nq, nq) of q due to unknown phases of two-phase fields; None if there
-    is no such field, or it has no samples.
+    is no such field, or if none has samples.
     """
     names = [item.name for item in collocation.parameters.free]
     covariance: Array | None = None
@@ -456,22 +519,29 @@ class Information:
 
     @property
     def determined_count(self) -> float:
-        """Number of parameters that the data determine; one that a prior determines counts
-        in part.
+        """Number of parameters that the data determine, Σ tr DᵀD; one that a prior determines
+        counts in part.
         """
         return float(sum(np.sum(slope**2) for slope in self.scaled_jacobians))
 
 
 def factorise_information(fit: LinearisedFit) -> Information:
-    """Return the information of residuals and priors of a fit about all parameters, factorised."""
+    """Return the information of residuals and priors of a fit about all parameters, factorised.
+
+    Directions that neither data nor priors determine are left out. Parameters at a bound are free.
+    """
     all_rows = least_squares_of_fit(fit)
-    slopes = tuple(block.channels[1] @ all_rows.root for block in fit.blocks)
+    slopes = tuple(
+        block.channels.jacobian @ all_rows.root for block in fit.blocks
+    )
     prior = all_rows.root * fit.prior_jacobian[:, None]
     return Information(all_rows, slopes, prior=prior.T @ prior)
 
 
 def least_squares_of_fit(fit: LinearisedFit) -> SquareRootInformation:
-    """Return residuals and priors as a least-squares problem in a step of all parameters."""
+    """Return residuals and priors as a least-squares problem in a step of all p parameters from the
+    answer; bounds are not included.
+    """
     of_all = least_squares_of_blocks(fit, range(len(fit.blocks)))
     return of_all.with_rows(fit.prior_residual, np.diag(fit.prior_jacobian))
 
@@ -479,19 +549,22 @@ def least_squares_of_fit(fit: LinearisedFit) -> SquareRootInformation:
 def least_squares_of_blocks(
     fit: LinearisedFit, indices: Iterable[int]
 ) -> SquareRootInformation:
-    """Return the residuals of some blocks (indices) as a least-squares problem, without priors."""
+    """Return the residuals of some blocks (indices, from 0) as a least-squares problem in a step of
+    all p parameters, without priors.
+    """
     problem = SquareRootInformation.empty(len(fit.names))
     for k in indices:
-        residual, slope, _ = fit.blocks[k].channels
+        channels = fit.blocks[k].channels
+        residual = channels.residual.ravel()
         problem = problem.with_rows(
-            residual.ravel(), slope.reshape(residual.size, slope.shape[2])
+            residual, channels.jacobian.reshape(residual.size, len(fit.names))
         )
     return problem
 
 
 def gauss_newton_step(fit: LinearisedFit) -> Array:
-    """Return the step (p,) to the least squares of the linearised fit; parameters at a
-    bound do not change.
+    """Return the step (p,) to the least squares of the linearised fit, with priors; parameters at a
+    bound do not change (by more than `NO_STEP`), other bounds are ignored.
     """
     free = np.where(fit.at_bound, NO_STEP, np.inf)
     return least_squares_of_fit(fit).minimiser(-free, free)

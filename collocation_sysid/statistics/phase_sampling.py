@@ -95,7 +95,15 @@ class InternalFaces:
 
     @classmethod
     def from_mesh(cls, mesh: TetMesh, cells: Index) -> InternalFaces:
-        """Find the faces between some elements of a mesh, numbered in the order of `cells`."""
+        """Find the faces between some elements of a mesh.
+
+        Parameters
+        ----------
+        mesh : TetMesh
+        cells : (E,) array
+            Indices of the elements; `pairs` has indices into this array. Faces to other elements
+            are left out.
+        """
         corners = mesh.tetrahedra[cells]
         triples = np.sort(
             corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2
@@ -111,12 +119,14 @@ class InternalFaces:
         return cls(
             np.column_stack([cell_of_face[first], cell_of_face[second]]),
             areas / areas.mean(),
-            len(cells),
+            element_count=len(cells),
         )
 
     @property
     def adjacency(self) -> sp.csr_array:
-        """Sparse matrix (E, E) of the weights of the faces between elements."""
+        """Symmetric sparse matrix (E, E) of the weights of the faces between elements, zero where
+        there is no face.
+        """
         i, j = self.pairs.T
         both = (np.r_[self.weights, self.weights], (np.r_[i, j], np.r_[j, i]))
         return sp.csr_array(
@@ -125,7 +135,9 @@ class InternalFaces:
 
     @property
     def jump_operator(self) -> sp.csr_array:
-        """Sparse matrix (F, E) from values in elements to their jump across each face."""
+        """Sparse matrix (F, E) from values in elements to their jump across each face: the value of
+        the first element of the pair less that of the second.
+        """
         faces = np.arange(len(self.pairs))
         ends = np.r_[faces, faces], self.pairs.T.ravel()
         signs = np.repeat([1.0, -1.0], len(faces))
@@ -214,6 +226,11 @@ def initial_phases(
         Volumes of the elements [m³].
     settings : SamplerSettings
         Constants of the algorithm.
+
+    Notes
+    -----
+    The total variation is minimised by `SamplerSettings.sharpenings` reweighted least-squares
+    solves, with p eliminated.
     """
     inverse = np.linalg.pinv(data.of_p, hermitian=True)
     normal = data.of_z - data.mixed @ inverse @ data.mixed.T
@@ -237,7 +254,19 @@ def initial_phases(
 
 def _class_threshold(values: Array, weights: Array) -> float:
     """Return the threshold between two classes of values (E,) with the least weighted variance
-    within (Otsu); the upper class includes it.
+    within (Otsu).
+
+    Parameters
+    ----------
+    values : (E,) array
+        Values, at least two.
+    weights : (E,) array
+        Their weights, all positive.
+
+    Returns
+    -------
+    float
+        The least value of the upper class.
     """
     order = np.argsort(values)
     sorted_values = values[order]
@@ -254,7 +283,8 @@ def sample_phases(
     start: Array,
     settings: SamplerSettings = USUAL,
 ) -> PosteriorDraws:
-    """Draw phases, contrast and parameters from their posterior, by several chains.
+    """Draw phases, contrast and parameters from their posterior, by several chains, whose samples
+    are concatenated.
 
     The same arguments give the same samples.
 
@@ -305,6 +335,13 @@ def _run_chain(
         Seed of the random numbers.
     settings : SamplerSettings
         Constants of the sampler.
+
+    Notes
+    -----
+    Phases flip one at a time: element e is proposed with a probability proportional to the root of
+    the ratio of posteriors with and without the flip (locally balanced), and accepted by Metropolis
+    and Hastings. δp and s are drawn from their normal distribution every `steps_per_draw`
+    proposals.
     """
     rng = np.random.default_rng(seed)
     count = len(start)
@@ -321,8 +358,8 @@ def _run_chain(
     neighbour_sums = neighbours @ phase
 
     def conditional() -> tuple[Array, Array]:
-        """Return the mean of (δp, s) given the phases, and the factor L of their
-        information L Lᵀ.
+        """Return the mean (p + 1,) of (δp, s) given the present phases, and the lower triangular
+        factor L of their information L Lᵀ.
         """
         coupling = data.mixed.T @ phase
         own = phase @ of_z_phase + 1 / data.deviation**2
@@ -337,13 +374,17 @@ def _run_chain(
         return mean, np.asarray(factor, dtype=float)
 
     def drawn() -> tuple[Array, Array]:
-        """Return the mean and a draw of (δp, s)."""
+        """Return the mean and a draw of (δp, s), each (p + 1,), given the present phases."""
         mean, factor = conditional()
         noise = rng.normal(size=len(mean))
         return mean, mean + np.asarray(solve_triangular(factor.T, noise))
 
     def change(signs: Array) -> Array:
-        """Return −ln of the ratio of posteriors (E,) if each phase flips."""
+        """Return, for each element, −ln of the ratio of the posteriors with and without its phase
+        flipped (E,), at the present δp and s.
+
+        `signs` (E,) are 1 for a phase that becomes 1, and −1 for one that becomes 0.
+        """
         force = constant + data.mixed @ both[:-1] + both[-1] * of_z_phase
         own = signs * both[-1] * force + both[-1] ** 2 * diagonal / 2
         return own + settings.face_nats * signs * (degrees - 2 * neighbour_sums)

@@ -64,7 +64,9 @@ class PoseNoise:
 
     @property
     def message(self) -> str:
-        """Message for the user about the assumed pose noise."""
+        """Message for the user: the size of the noise in mm and degrees, and whether it was stated
+        or estimated.
+        """
         how = (
             "estimated from their roughness"
             if self.is_estimated
@@ -77,10 +79,11 @@ class PoseNoise:
 
 
 def estimate_pose_noise(poses: PoseSequence) -> tuple[float, float]:
-    """Estimate the standard deviations [m] and [rad] of white noise in poses.
+    """Estimate the standard deviations of translations [m] and rotations [rad] of white noise in
+    poses, from differences of fifth order, in which a smooth motion hardly shows.
 
-    Uses differences of fifth order, in which a smooth motion hardly shows; zero if rounding of a
-    file explains it, and for too few poses.
+    Robust: the median of the absolute differences decides. Zero for a noise below `LEAST_M` or
+    `LEAST_RAD`, which rounding of a file explains, and for fewer than 20 poses.
     """
     if len(poses.t_s) < 4 * ORDER:
         return 0.0, 0.0
@@ -102,7 +105,9 @@ def estimate_pose_noise(poses: PoseSequence) -> tuple[float, float]:
 def with_pose_noise(
     fit: LinearisedFit, collocation: Collocation, z: Array, seed: int = 0
 ) -> tuple[LinearisedFit, tuple[PoseNoise, ...]]:
-    """Add samples of the effect of pose noise to a fit.
+    """Return a fit with samples of the effect of pose noise, and the noise that matters.
+
+    The fit is not modified. The samples replace the `disturbances` of all its blocks.
 
     Parameters
     ----------
@@ -113,12 +118,14 @@ def with_pose_noise(
     z : (variables,) array
         The optimum.
     seed : int
-        Seed of the random numbers.
+        Seed of the random numbers, used anew for each experiment.
 
     Returns
     -------
     (LinearisedFit, tuple of PoseNoise)
-        The fit with `disturbances` where they matter, and the noise of the grasps concerned.
+        The fit with `disturbances` for all measurements of the experiments in which the RMS effect
+        on a measurement is at least `NEGLIGIBLE` σ, else None; and the noise of the grasps of these
+        experiments, without those of zero noise.
     """
     draws: list[Array | None] = []
     noises: list[PoseNoise] = []
@@ -145,8 +152,8 @@ def with_pose_noise(
 
 
 def _grasp_noise(name: str, grasp: Grasp) -> PoseNoise:
-    """Return the noise of a grasp's poses, as stated or else as estimated; `name` is that of the
-    experiment.
+    """Return the noise of a grasp's poses: for translation and rotation separately as stated, or as
+    estimated if nothing is stated (None); `name` is that of the experiment.
     """
     rough_m, rough_rad = estimate_pose_noise(grasp.poses)
     sigma_m = rough_m if grasp.sigma_m is None else grasp.sigma_m
@@ -161,8 +168,18 @@ def _residual_samples(
     noises: Sequence[PoseNoise],
     rng: np.random.Generator,
 ) -> list[Array]:
-    """Return K samples (K, T, M, 3) of the changes of each measurement's residuals by noise of the
-    poses of each grasp.
+    """Return, for each measurement of an experiment, K samples (K, T, M, 3) of the changes of its
+    residuals by noise of the poses.
+
+    K is `DRAWS`, or less for large bodies, but at least `FEWEST_DRAWS`.
+
+    Parameters
+    ----------
+    iterate : ExperimentIterate
+        Experiment at the answer.
+    noises : sequence of PoseNoise
+        Noise of each grasp, in the order of the experiment.
+    rng : numpy.random.Generator
     """
     segment = iterate.segment
     prescribed = iterate.equations.prescribed
@@ -185,18 +202,23 @@ def _residual_samples(
     solver = Sweep(segment)
     changes = []
     columns = SweepColumns.from_prescribed(
-        solver, iterate.equations, displacements_m
+        solver, iterate.equations, changes_m=displacements_m
     )
-    for reading, motion, values, by in propagate_columns(
-        iterate, solver, columns=columns
-    ):
+    for response in propagate_columns(iterate, solver, columns=columns):
+        reading = response.reading
+        by_noise = response.changes
         for grasp, shifts, rotations in pose_errors:
-            by = by + reading.observable.frame_changes(
-                grasp, motion, iterate.phi, shifts, rotations
+            by_noise = by_noise + reading.observable.frame_changes(
+                grasp,
+                response.motion,
+                phi=iterate.phi,
+                shifts=shifts,
+                rotations=rotations,
             )
-        changes.append(
-            np.moveaxis(reading.residual_changes(values, by, iterate.phi), 3, 0)
+        residual_changes = reading.residual_changes(
+            response.values, by_noise, phi=iterate.phi
         )
+        changes.append(np.moveaxis(residual_changes, 3, 0))
     return changes
 
 
@@ -209,7 +231,7 @@ def _pose_samples(
 ) -> tuple[Array, Array]:
     """Return `count` samples of translation [m] and rotation [rad] errors of the poses of a grasp
     at the N grid times, (N, count, 3) each; zero while the grasp does not hold, and for a single
-    pose.
+    pose. Noise is white at the times of the poses and interpolated to the grid as the poses are.
     """
     t_s = iterate.segment.dynamics.t_s
     samples = np.zeros((2, len(t_s), count, 3))
@@ -219,7 +241,7 @@ def _pose_samples(
         for own, sigma, values in zip(
             samples, (noise.sigma_m, noise.sigma_rad), white, strict=True
         ):
-            between = _interpolate(grasp.poses, sigma * values, t_s[rows])
+            between = _interpolate(grasp.poses, sigma * values, t_s=t_s[rows])
             own[rows] = between.reshape(len(rows), count, 3)
     return samples[0], samples[1]
 
@@ -231,14 +253,16 @@ def _add_displacements(
     shifts: Array,
     rotations: Array,
 ) -> None:
-    """Add the displacements of a grasp's nodes due to pose errors to `displacements_m` (N, g, c)
-    [m], in place.
+    """Add the displacements of a grasp's nodes due to pose errors to `displacements_m`, in place.
 
     Parameters
     ----------
     displacements_m : (N, g, c) array
+        Displacements of the g prescribed dofs at the N grid times in c samples [m].
     iterate : ExperimentIterate
+        Experiment at the answer.
     grasp : Grasp
+        Grasp whose prescribed dofs are displaced, at the times at which it holds.
     shifts, rotations : (N, c, 3) arrays
         Translation [m] and rotation vector [rad] errors.
     """
@@ -260,8 +284,9 @@ def _add_displacements(
 
 
 def _interpolate(poses: PoseSequence, values: Array, t_s: Array) -> Array:
-    """Return values (m, …) at the poses' times, interpolated to the times `t_s` as the poses
-    are.
+    """Return values (m, …) at the poses' times, interpolated to the times `t_s` as the poses are:
+    by cubic splines, linearly, or held; beyond the first and last pose, held values and linear
+    ones stay constant.
     """
     if poses.interpolation == "smooth" and len(poses.t_s) > 3:
         return CubicSpline(poses.t_s, values)(t_s)

@@ -46,9 +46,11 @@ REMEDIES: Mapping[str, str] = {
 
 
 def remedy_for(source: str) -> str:
-    """Return what to measure in order to reduce a source of the budget.
+    """Return what to measure in order to reduce a source of the budget, as an imperative phrase
+    without a full stop.
 
-    Nuisance parameters that are not estimated but budgeted have a common remedy.
+    Any other source, such as a nuisance parameter that is budgeted instead of estimated, gets a
+    phrase with its name.
     """
     fallback = f"measure {source}, or estimate it with its prior in [experiment.nuisance]"
     return REMEDIES.get(source, fallback)

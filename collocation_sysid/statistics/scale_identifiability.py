@@ -35,8 +35,11 @@ LEAST_REMAINDER = 1e-8
 def parameters_of_open_scale(
     experiments: Iterable[Experiment], parameters: Parameters
 ) -> tuple[str, ...]:
-    """Return the names of the parameters of which only ratios can be determined, densities among
-    them; empty if no density is estimated or a known force sets the scale.
+    """Return the names of the estimated parameters, densities among them, of which only ratios can
+    be determined; empty if no density is estimated, or if a known force or a prior sets the
+    scale.
+
+    Experiments for validation are ignored.
     """
     if not any(is_density(item.name) for item in parameters.free):
         return ()
@@ -46,7 +49,10 @@ def parameters_of_open_scale(
 def relative_moduli(
     experiments: Iterable[Experiment], parameters: Parameters
 ) -> tuple[str, ...]:
-    """Return the parameters that are determined relative to the stated densities only."""
+    """Return the names of the estimated parameters that are determined relative to the stated
+    densities only; empty if a known force or a prior sets the scale. Experiments for validation
+    are ignored.
+    """
     return _scaled_parameters(experiments, parameters, includes_declared=True)
 
 
@@ -55,7 +61,9 @@ def scale_concerns(
     parameters: Parameters,
     grade: Grade = "check",
 ) -> list[Concern]:
-    """Return a concern if the scale is not determined."""
+    """Return one concern "scale/unknown" of a grade, as a list, if `parameters_of_open_scale` has
+    names; else empty.
+    """
     names = parameters_of_open_scale(experiments, parameters)
     return (
         [Concern("scale/unknown", grade, data={"names": names})]
@@ -67,8 +75,8 @@ def scale_concerns(
 def relative_scale_note(
     experiments: Iterable[Experiment], parameters: Parameters
 ) -> str | None:
-    """Return the note that moduli are relative to the stated density; None if a force sets
-    the scale, or the scale is open.
+    """Return the note that moduli are relative to the stated density; None if a force or a prior
+    sets the scale, or if the scale is open (`parameters_of_open_scale`).
     """
     names = relative_moduli(experiments, parameters)
     if not names or parameters_of_open_scale(experiments, parameters):
@@ -146,8 +154,8 @@ def _scaled_parameters(
 def _common_scaling(
     body: Body, theta: Array, slope: Array, includes_declared: bool
 ) -> Array | None:
-    """Return the change of θ (k,) if all moduli and densities change by a common factor; None if a
-    density cannot change.
+    """Return the change of θ (k,) if all moduli and densities change by a common factor, to first
+    order: θ for those, zero for other constants; None if a density cannot change.
 
     Parameters
     ----------
@@ -156,7 +164,8 @@ def _common_scaling(
     slope : (k, nq) array
         Derivatives of θ by q.
     includes_declared : bool
-        Whether stated densities count as changeable.
+        Whether stated densities, which do not depend on q, count as multiplied too: they are then
+        left out of the change. If false, a part whose density is not estimated gives None.
     """
     if not includes_declared and not all(
         part.has_free_density for part in body.parts
@@ -182,6 +191,10 @@ LEAST_RESTRAINT = 2.0
 def is_motionless(experiment: Experiment) -> bool:
     """Whether neither grasps, loads nor markers of an experiment change, except for the noise of
     the markers.
+
+    False if a grasp begins or ends within the recording. Markers count as motionless unless a χ²
+    test at the level `RARE` finds their deviations from their means larger than σ; grasped nodes
+    may move by `LEAST_RESTRAINT` times the median σ.
     """
     markers = experiment.markers
     t_s = experiment.t_s
@@ -212,8 +225,11 @@ def is_motionless(experiment: Experiment) -> bool:
 def static_concerns(
     experiments: Iterable[Experiment], parameters: Parameters
 ) -> list[Concern]:
-    """Return a concern if nothing moves in the fitted recordings, so that damping cannot be
-    determined.
+    """Return one concern, as a list, if a damping is estimated and nothing moves in all fitted
+    recordings, so that damping cannot be determined; else empty.
+
+    The code is "information/static" if all recordings are static tests, else "information/still".
+    Experiments for validation are ignored.
     """
     fitted = [
         experiment for experiment in experiments if not experiment.validation

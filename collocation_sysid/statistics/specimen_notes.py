@@ -19,9 +19,11 @@ FEWEST_CONSTANTS = 2
 def one_kind_notes(
     experiments: Sequence[Experiment], parameters: Parameters
 ) -> Iterator[str]:
-    """Yield a note if a law with several constants is fitted to specimens of one kind of test.
+    """Yield one note if a law with several constants is fitted to specimens of one kind of test.
 
-    None is yielded if another kind of test is predicted, or if another recording is fitted.
+    Nothing is yielded if another kind of test is predicted, if another recording is fitted, for
+    biaxial tests, or unless at least `FEWEST_CONSTANTS` elastic constants are estimated, of which
+    one belongs to the law and is no usual modulus (`MODULI`).
 
     Parameters
     ----------

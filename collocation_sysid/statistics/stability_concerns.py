@@ -25,12 +25,9 @@ ROUNDING = 1e-9
 
 
 def rest_stability_concerns(body: Body, theta: Array) -> Iterator[Concern]:
-    """Yield a concern for each part whose material is unstable without any strain.
-
-    Parameters
-    ----------
-    body : Body
-    theta : (k,)
+    """Yield a "doubtful" concern for each part whose material is unstable without any strain, at
+    constants `theta` (k,) of the body; materials that are not examined (`is_examined`) yield
+    none.
     """
     for part, constants in zip(
         body.parts, body.split_theta(theta), strict=True
@@ -65,6 +62,10 @@ def strain_stability_concerns(
     ----------
     iterates : iterable of ExperimentIterate
         Motions at the estimates.
+
+    Notes
+    -----
+    The concerns have the grade "check"; materials that are not examined (`is_examined`) yield none.
     """
     for iterate in iterates:
         experiment = iterate.segment.experiment

@@ -69,6 +69,7 @@ from .residuals.noise_level import (
 )
 from .residuals.recording_scatter import (
     RecordingComparison,
+    RecordingEstimate,
     blocks_by_recording,
     compare_recordings,
     single_fits,
@@ -186,7 +187,9 @@ class Uncertainty(ErrorBasis):
 
     @property
     def reduced_chi_squared(self) -> float:
-        """χ² per degree of freedom; 1 if the residuals are as large as σ."""
+        """χ² per degree of freedom, with at least one degree of freedom; 1 if the residuals are as
+        large as σ.
+        """
         return self.chi_squared / max(1.0, self.degrees_of_freedom)
 
 
@@ -248,6 +251,12 @@ def uncertainty_from_fit(
     ------
     InputError
         If the noise is to be estimated from fewer measurements than parameters.
+
+    Notes
+    -----
+    If several recordings are fitted, each is also fitted alone, by a Gauss–Newton step and with the
+    same assumptions, to compare them. Covariances of a two-phase field's phases are added after the
+    choice of the error model.
     """
     factored = factorise_information(fit)
     shared = fit.shared_count
@@ -257,14 +266,17 @@ def uncertainty_from_fit(
             f"the noise cannot be estimated from {fit.measurement_count} measurements of "
             f"{len(fit.names)} parameters; give sigma_m and use noise = 'given'"
         )
-    all_free, quantiles, basis = _error_bars(fit, factored, error_model)
+    bars = _error_bars(fit, factored, requested=error_model)
+    basis = bars.basis
     of_all, bounded = _reported_covariance(
-        all_free, fit, parameters=parameters, q=q
+        bars.covariance, fit, parameters=parameters, q=q
     )
     scatter = _compare_recordings(fit, parameters, q=q, errors=error_model)
-    of_q, quantiles, wider = _widen_by_scatter(
-        of_all[:shared, :shared], quantiles, scatter=scatter
+    widened = _widen_by_scatter(
+        of_all[:shared, :shared], bars.quantiles, scatter=scatter
     )
+    of_q = widened.covariance
+    quantiles = widened.quantiles
     estimates = user_estimates(
         parameters, q, covariance_q=of_q, at_bound=bounded, quantiles=quantiles
     )
@@ -302,15 +314,46 @@ def uncertainty_from_fit(
             *disagreement_notes(fit, scatter),
         ),
         scatter=scatter,
-        widening=wider,
+        widening=widened.factors,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _ErrorBars:
+    """Error bars of a fit before parameters at a bound and recordings are considered.
+
+    Attributes
+    ----------
+    covariance : (p, p) array
+        Covariance of all parameters, in the solver's coordinates.
+    quantiles : (nq,) array
+        Half widths of the 95 % intervals of shared parameters, in standard deviations.
+    basis : ErrorBasis
+        Error model that was used.
+    """
+
+    covariance: Array
+    quantiles: Array
+    basis: ErrorBasis
 
 
 def _error_bars(
     fit: LinearisedFit, factored: Information, requested: ErrorModel
-) -> tuple[Array, Array, ErrorBasis]:
-    """Return the covariance of all parameters, the quantiles of the shared ones, and the
-    error model used.
+) -> _ErrorBars:
+    """Choose an error model and return the error bars that follow from it.
+
+    Correlated errors are used if they are requested, or with "auto" if tests find them; with the
+    stated σ, and unless requested, only if they widen a standard error by more than `CONSEQUENCE`.
+    With noise "auto", correlated residuals that are smaller than σ do not reduce it.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+        The fit at its answer.
+    factored : Information
+        Its information.
+    requested : ErrorModel
+        Assumptions about the errors.
     """
     level = estimate_noise_level(fit, factored)
     without_outliers, outliers = remove_outliers(fit)
@@ -323,7 +366,9 @@ def _error_bars(
     )
     if requested.noise == "auto" and correlated and level.pooled < 1:
         kind = "given"
-    of_score, freedom = level.score_covariance(kind, factored, fit.shared_count)
+    of_score, freedom = level.score_covariance(
+        kind, factored, shared=fit.shared_count
+    )
     covariance = factored.fit.covariance(of_score)
     used = "independent"
     if correlated:
@@ -345,10 +390,10 @@ def _error_bars(
         covariance[: fit.shared_count, : fit.shared_count] += (
             fit.phase_covariance
         )
-    return (
+    return _ErrorBars(
         covariance,
         student_ppf(0.975, freedom),
-        ErrorBasis(
+        basis=ErrorBasis(
             kind, used, level=level, dependence=dependence, outliers=outliers
         ),
     )
@@ -362,6 +407,20 @@ def _reported_covariance(
 
     Rows and columns of parameters at a bound are NaN; shared parameters that the data do not
     determine have infinite variance.
+
+    Parameters
+    ----------
+    covariance : (p, p) array
+        Covariance of all parameters, those at a bound free; not modified.
+    fit : LinearisedFit
+    parameters : Parameters
+    q : (nq,) array
+        Estimates in the solver's coordinates.
+
+    Notes
+    -----
+    A damping at its bound that the data do not inform about (`_has_no_information`) counts as not
+    determined, not as at its bound.
     """
     reported = covariance.copy()
     shared = fit.shared_count
@@ -381,16 +440,44 @@ def _reported_covariance(
     return reported, bounded
 
 
+@dataclass(frozen=True, eq=False)
+class _WidenedBars:
+    """Error bars of the shared parameters that contain the disagreement of recordings.
+
+    Attributes
+    ----------
+    covariance : (nq, nq) array
+        Covariance of q.
+    quantiles : (nq,) array
+        Half widths of the 95 % intervals in standard deviations.
+    factors : (nq,) array
+        Half widths of the intervals over those without the disagreement; 1 where recordings agree.
+    """
+
+    covariance: Array
+    quantiles: Array
+    factors: Array
+
+
 def _widen_by_scatter(
     covariance_q: Array, quantiles: Array, scatter: RecordingComparison | None
-) -> tuple[Array, Array, Array]:
-    """Return covariance (nq, nq) and quantiles (nq,), larger where recordings disagree, and the
-    factors (nq,) of the standard deviations.
+) -> _WidenedBars:
+    """Widen the error bars of parameters on which recordings disagree.
 
-    Without a comparison (None) they are unchanged.
+    Parameters
+    ----------
+    covariance_q : (nq, nq) array
+        Covariance of q; not modified.
+    quantiles : (nq,) array
+        Half widths of the 95 % intervals in standard deviations; where recordings disagree they are
+        at least those of Student's distribution with the degrees of freedom of the recordings.
+    scatter : RecordingComparison or None
+        Comparison of the recordings; None leaves everything unchanged.
     """
     if scatter is None:
-        return covariance_q, quantiles, np.ones(len(quantiles))
+        return _WidenedBars(
+            covariance_q, quantiles, factors=np.ones(len(quantiles))
+        )
     with np.errstate(invalid="ignore"):
         factors = np.sqrt(
             scatter.widen(np.diag(covariance_q)) / np.diag(covariance_q)
@@ -400,10 +487,10 @@ def _widen_by_scatter(
         quantiles, student_ppf(0.975, np.maximum(scatter.degrees_of_freedom, 1))
     )
     wide = np.where(scatter.is_disagreeing, of_few, quantiles)
-    return (
+    return _WidenedBars(
         covariance_q * np.outer(factors, factors),
-        wide,
-        factors * wide / quantiles,
+        quantiles=wide,
+        factors=factors * wide / quantiles,
     )
 
 
@@ -411,7 +498,9 @@ def _compare_recordings(
     fit: LinearisedFit, parameters: Parameters, q: Array, errors: ErrorModel
 ) -> RecordingComparison | None:
     """Return the comparison of single recordings with their own error bars; None if fewer than two
-    recordings have enough measurements.
+    recordings have more measurements than parameters.
+
+    Each recording is evaluated by `uncertainty_from_fit` with the error model `errors`.
     """
     if len(blocks_by_recording(fit)) < 2:
         return None
@@ -427,10 +516,10 @@ def _compare_recordings(
             least_squares_of_fit(alone).standard_errors[: fit.shared_count] ** 2
         )
         variances = np.diag(uncertainty.covariance) / sizes**2
-        known[alone.blocks[0].name] = (
+        known[alone.blocks[0].name] = RecordingEstimate(
             step[: fit.shared_count],
             variances,
-            independent,
+            independent_variances=independent,
         )
     return compare_recordings(fit, known) if len(known) > 1 else None
 
@@ -438,8 +527,9 @@ def _compare_recordings(
 def _has_no_information(
     parameters: Parameters, q: Array, variances: Array
 ) -> NDArray[np.bool_]:
-    """Return the mask (nq,) of damping parameters that could be a hundred times their usual value
-    without being noticed, from the variances (nq,) of q.
+    """Return the mask (nq,) of damping parameters whose standard deviation exceeds `UNINFORMED`
+    times their usual value, or is NaN, from the variances (nq,) of q; false for all other
+    parameters.
     """
     uninformed = []
     for item, at, variance in zip(parameters.free, q, variances, strict=True):
@@ -454,8 +544,10 @@ def _has_no_information(
 
 
 def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
-    """Return the tests of the residuals for correlation, and whether they show more than
-    known disturbances explain.
+    """Return the tests of the residuals for correlation, and whether they show more than known
+    disturbances, such as noise of the poses, explain.
+
+    The standard deviation of the autocorrelation is increased if the noise of markers differs.
     """
     factored = factorise_information(fit)
     level = estimate_noise_level(fit, factored)
@@ -476,6 +568,10 @@ def _is_explained(
 ) -> bool:
     """Whether known disturbances (such as noise of the poses) explain residuals as correlated as
     those in `result`; false without disturbances.
+
+    `REPLICAS` simulated residuals with disturbances and white noise are tested likewise: the
+    autocorrelation has to lie within their range, and correlations among channels must not be more
+    significant than in all of them. Correlation in space is ignored.
     """
     added = disturbance_samples(fit)
     if not len(added[0]):
@@ -510,16 +606,23 @@ def _is_explained(
 def _correlated_score_covariance(
     fit: LinearisedFit, factored: Information, kind: Noise, level: NoiseLevel
 ) -> tuple[Array, Array]:
-    """Return the covariance (r, r) of the score for correlated errors, and degrees of
-    freedom (shared,).
+    """Return the covariance (r, r) of the score for correlated errors, and degrees of freedom
+    (shared,).
+
+    Notes
+    -----
+    With noise "given", or with known disturbances, the covariance is raised to at least that of
+    independent errors in every direction.
     """
     of_score, freedom = score_covariance(
-        factored, error_processes(fit, factored), fit.shared_count
+        factored, error_processes(fit, factored), shared=fit.shared_count
     )
     if kind == "given" or level.known_score_covariance.any():
         # In no direction less than independent errors of the σ given bring, nor than those found
         # with what is known to add to them: an autoregression may miss that.
-        least, _ = level.score_covariance(kind, factored, fit.shared_count)
+        least, _ = level.score_covariance(
+            kind, factored, shared=fit.shared_count
+        )
         root = np.linalg.cholesky(least + 1e-12 * np.eye(len(least)))
         over = np.linalg.solve(root, np.linalg.solve(root, of_score).T)
         values, vectors = np.linalg.eigh((over + over.T) / 2)
@@ -557,7 +660,9 @@ class MarkerPlace:
 
     @property
     def displacement_m(self) -> float | None:
-        """Distance of the estimate from the stated place [m]; None if there is none."""
+        """Distance of the estimate from the stated place [m], not negative; None if none was
+        stated.
+        """
         declared_m = self.declared_m
         return (
             None
@@ -597,7 +702,7 @@ def _std_errors_m(
     iterate: ExperimentIterate, uncertainty: Uncertainty | None
 ) -> Array | None:
     """Return the standard errors (M, 3) of the coordinates of an experiment's marker places [m],
-    zero for exact places; None without `uncertainty`.
+    along the axes of the body, zero for exact places; None without `uncertainty`.
     """
     if uncertainty is None:
         return None

@@ -70,6 +70,12 @@ def check_damping(
     ------
     AssertionError
         For the first property that fails: which one, where, found and expected value.
+
+    Notes
+    -----
+    `largest_strain` does not change the deformation of the small body. An empty `elements` skips
+    the check of compiled forces. Values of `constants` that neither law nor material declares are
+    ignored; a constant without a value has that of `usual_constants`.
     """
     made = as_damping(law)
     known = as_material(material)
@@ -78,7 +84,7 @@ def check_damping(
         check.fail(
             "it has both or neither of a stress and a potential",
             made,
-            "one of both",
+            expected="one of both",
         )
     values = usual_constants((*known.constants, *made.constants), constants)
     stress = DampingStress(made, known, values=np.array([*values.values()]))
@@ -91,11 +97,11 @@ def check_damping(
             f"at random deformation {number} (strains up to {largest_strain:g})"
         )
         rate = check.rng.standard_normal(9)
-        _check_derivatives(check, stress, F, rate, where)
+        _check_derivatives(check, stress, F=F, rate=rate, where=where)
         if is_dissipative:
-            _check_dissipation(check, stress, F, where)
+            _check_dissipation(check, stress, F=F, where=where)
         if is_objective:
-            _check_objectivity(check, stress, F, rate, where)
+            _check_objectivity(check, stress, F=F, rate=rate, where=where)
     for element in elements:
         check_internal_forces(
             check,
@@ -114,10 +120,34 @@ def check_damping(
     check_pickling(
         check,
         made,
-        evaluate=lambda each: DampingStress(
-            each, known, values=stress.values
-        ).evaluate(F, F)[0],
+        evaluate=lambda each: (
+            DampingStress(each, known, values=stress.values)
+            .evaluate(F, F)
+            .stress
+        ),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class DampingState:
+    """Stress of a damping law at one F and Ḟ, with derivatives; tensors stacked column by column.
+
+    Attributes
+    ----------
+    stress : (9,) array
+        First Piola–Kirchhoff stress P_v [Pa].
+    stated_by_F : (9, 9) array
+        ∂P_v/∂F as the law states it; the automatic derivative if the law has a potential.
+    by_F : (9, 9) array
+        ∂P_v/∂F by automatic differentiation.
+    by_rate : (9, 9) array
+        ∂P_v/∂Ḟ by automatic differentiation.
+    """
+
+    stress: Array
+    stated_by_F: Array
+    by_F: Array
+    by_rate: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +168,9 @@ class DampingStress:
 
     @cached_property
     def _function(self) -> ca.Function:
-        """Function of F and Ḟ: P_v, the stated ∂P_v/∂F, and both automatic derivatives."""
+        """Function of F (9,) and Ḟ (9,) at the values of the constants: P_v, the stated ∂P_v/∂F
+        (the automatic one if the law states none), and the automatic ∂P_v/∂F and ∂P_v/∂Ḟ.
+        """
         F = ca.SX.sym("F", 9)
         rate = ca.SX.sym("rate", 9)
         count = len(self.material.constants)
@@ -146,7 +178,7 @@ class DampingStress:
             ca.SX(ca.DM(each)) for each in np.split(self.values, [count])
         ]
         stress, stated = damping_stress(
-            self.law, self.material, [F, rate, *constants]
+            self.law, self.material, symbols=[F, rate, *constants]
         )
         by_F = ca.jacobian(stress, F)
         by_rate = ca.jacobian(stress, rate)
@@ -155,14 +187,17 @@ class DampingStress:
             "damping", [F, rate], [ca.densify(each) for each in outputs]
         )
 
-    def evaluate(
-        self, F: Array, rate: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """Return P_v (9,), the stated and the automatic ∂P_v/∂F, and ∂P_v/∂Ḟ, each (9, 9)."""
-        stress, stated, by_F, by_rate = (
-            o.full() for o in self._function.call([F, rate])
+    def evaluate(self, F: Array, rate: Array) -> DampingState:
+        """Return stress and derivatives at F (9,) and its rate Ḟ (9,) [1/s], column after
+        column.
+        """
+        outputs = [o.full() for o in self._function.call([F, rate])]
+        return DampingState(
+            stress=outputs[0].ravel(),
+            stated_by_F=outputs[1],
+            by_F=outputs[2],
+            by_rate=outputs[3],
         )
-        return stress.ravel(), stated, by_F, by_rate
 
 
 def _check_derivatives(
@@ -172,30 +207,33 @@ def _check_derivatives(
     rate: Array,
     where: str,
 ) -> None:
-    """Require linearity in the rate, a symmetric ∂P_v/∂Ḟ, and the right ∂P_v/∂F."""
-    value, stated, by_F, by_rate = stress.evaluate(F, rate)
+    """Require at one deformation a P_v that is linear in the rate, a symmetric ∂P_v/∂Ḟ, and a
+    stated ∂P_v/∂F that agrees with the automatic one and with central differences.
+    """
+    state = stress.evaluate(F, rate)
+    by_rate = state.by_rate
     check.require_equal(
         by_rate, by_rate.T, statement=f"∂P_v/∂Ḟ is not symmetric {where}"
     )
     check.require_equal(
-        value,
+        state.stress,
         by_rate @ rate,
         statement=f"P_v is not linear in the rate Ḟ {where}",
     )
     check.require_equal(
-        stress.evaluate(F, -2.5 * rate)[0],
-        -2.5 * value,
+        stress.evaluate(F, -2.5 * rate).stress,
+        -2.5 * state.stress,
         statement=f"P_v is not linear in the rate Ḟ {where}",
     )
     check.require_equal(
-        stated,
-        by_F,
+        state.stated_by_F,
+        state.by_F,
         statement=f"the stated ∂P_v/∂F is not the automatic derivative of P_v {where}",
     )
     check.require_derivative(
-        lambda at: stress.evaluate(at, rate)[0],
-        stated,
-        F,
+        lambda at: stress.evaluate(at, rate).stress,
+        state.stated_by_F,
+        point=F,
         statement=f"∂P_v/∂F is wrong {where}",
         scale=0.1,
     )
@@ -204,15 +242,17 @@ def _check_derivatives(
 def _check_dissipation(
     check: PropertyCheck, stress: DampingStress, F: Array, where: str
 ) -> None:
-    """Require that no eigenvalue of ∂P_v/∂Ḟ is negative: P_v:Ḟ ≥ 0 for every rate."""
-    by_rate = stress.evaluate(F, np.zeros(9))[3]
+    """Require that no eigenvalue of the symmetric part of ∂P_v/∂Ḟ at F (9,) is negative beyond
+    rounding: P_v:Ḟ ≥ 0 for every rate.
+    """
+    by_rate = stress.evaluate(F, np.zeros(9)).by_rate
     powers = np.linalg.eigvalsh((by_rate + by_rate.T) / 2)
     if not powers[0] >= -ROUNDING * np.abs(powers).max():
         check.fail(
             f"it adds energy {where}: the smallest dissipated power P_v:Ḟ of a rate with "
             "‖Ḟ‖ = 1/s is negative",
             powers[0],
-            "at least 0 W/m³",
+            expected="at least 0 W/m³",
         )
 
 
@@ -223,19 +263,21 @@ def _check_objectivity(
     rate: Array,
     where: str,
 ) -> None:
-    """Require P_v(QF, Q(Ḟ + ΩF)) = Q P_v(F, Ḟ) for a rotation Q and a spin Ω."""
-    value = stress.evaluate(F, rate)[0]
+    """Require P_v(QF, Q(Ḟ + ΩF)) = Q P_v(F, Ḟ) for one random rotation Q and one random spin Ω
+    (skew-symmetric).
+    """
+    value = stress.evaluate(F, rate).stress
     Q = random_rotation(check.rng)
     spin = np.asarray(ca.skew(3 * check.rng.standard_normal(3)), dtype=float)
     gradient, gradient_rate = (
         each.reshape(3, 3, order="F") for each in (F, rate)
     )
     spinning = Q @ (gradient_rate + spin @ gradient)
-    found = stress.evaluate(
+    rotated = stress.evaluate(
         (Q @ gradient).ravel(order="F"), spinning.ravel(order="F")
-    )[0]
+    ).stress
     check.require_equal(
-        found.reshape(3, 3, order="F"),
+        rotated.reshape(3, 3, order="F"),
         Q @ value.reshape(3, 3, order="F"),
         statement=f"a spinning rotation changes the stress in the body's axes {where}",
         tolerance=1e-8,

@@ -31,10 +31,17 @@ def directional_derivative(
         Size of a large change of `point`.
     step : float
         Step of s.
+
+    Returns
+    -------
+    array
+        Shape of the values of `function`, which is called four times, at ± one and ± two steps.
     """
 
     def evaluate_at(steps: int) -> Array:
-        """Return the function a number of steps along the direction."""
+        """Return the function at `point` plus a number of steps along `direction`, which may be
+        negative.
+        """
         return np.asarray(
             function(np.asarray(point) + steps * step * direction)
         )
@@ -54,7 +61,7 @@ def assert_derivative(
     scale: ArrayLike = 1.0,
     directions: int = 2,
 ) -> None:
-    """Compare a derivative with differences of the function in random directions.
+    """Compare a derivative with central differences of the function in random normal directions.
 
     Parameters
     ----------
@@ -79,10 +86,10 @@ def assert_derivative(
     """
     for _ in range(directions):
         direction = np.asarray(scale) * rng.standard_normal(np.shape(point))
-        expected = directional_derivative(function, point, direction)
-        found = np.asarray(jacobian_times(direction))
-        assert found.shape == expected.shape
-        error = np.linalg.norm(found - expected)
+        expected = directional_derivative(function, point, direction=direction)
+        product = np.asarray(jacobian_times(direction))
+        assert product.shape == expected.shape
+        error = np.linalg.norm(product - expected)
         size = np.linalg.norm(expected)
         assert error <= tolerance * size, (
             f"off by {error:.3g}, the derivative's norm is {size:.3g}"
@@ -90,7 +97,10 @@ def assert_derivative(
 
 
 def relative_error(found: ArrayLike, expected: ArrayLike) -> float:
-    """Return the largest error of an entry, relative to the largest expected entry.
+    """Return the largest absolute error of an entry, divided by the largest absolute expected
+    entry.
+
+    0 for empty arrays; infinite or NaN if all expected entries are zero.
 
     Raises
     ------
@@ -106,5 +116,12 @@ def relative_error(found: ArrayLike, expected: ArrayLike) -> float:
 
 
 def observed_order(steps: ArrayLike, errors: ArrayLike) -> float:
-    """Return the slope of log(error) over log(step): the order of convergence."""
+    """Return the slope of log(error) over log(step), fitted to all points: the order of
+    convergence.
+
+    Parameters
+    ----------
+    steps, errors : (k,) array
+        Step sizes and the errors with them, all positive; k ≥ 2.
+    """
     return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])

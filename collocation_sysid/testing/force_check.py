@@ -104,6 +104,12 @@ def check_force(
     InputError
         If the law cannot be evaluated, has the wrong shape or is not finite at rest, or if an
         energy is given for a force on faces.
+
+    Notes
+    -----
+    An `energy` is compared only at random states of a node, with velocity zero. `is_zero_at_rest`
+    is checked at the first place, to 1e-9 N. With `file`, the function that the problem file names
+    is the ``__name__`` of the law.
     """
     made = force if isinstance(force, NodeForce) else NodeForce.from_law(force)
     check = PropertyCheck(f"force {made.name!r}")
@@ -119,11 +125,11 @@ def check_force(
     ]
     for number, state in enumerate(states):
         where = f"at random state {number}"
-        _check_derivatives(check, law, state, where)
+        _check_derivatives(check, law, state=state, where=where)
         if energy is not None:
-            _check_energy(check, law, state, energy, where)
+            _check_energy(check, law, state=state, energy=energy, where=where)
         if is_dissipative:
-            _check_dissipation(check, law, state, where)
+            _check_dissipation(check, law, state=state, where=where)
     if is_zero_at_rest:
         u, data = law.state_at_rest(states[0])
         found = law.evaluate_plain(u, data)[: law.dofs]
@@ -134,8 +140,8 @@ def check_force(
             scale=1.0,
         )
     unplaced = replace(made, nodes=None)
-    _check_messages(check, unplaced, values)
-    _check_round_trips(check, law, states[0], file)
+    _check_messages(check, unplaced, values=values)
+    _check_round_trips(check, law, state=states[0], file=file)
     small = body or Body(
         uneven_box(1), density_kg_m3=DENSITY_KG_M3, forces=[unplaced]
     )
@@ -143,7 +149,9 @@ def check_force(
 
 
 def _places(rng: np.random.Generator, positions_m: ArrayLike | None) -> Array:
-    """Return the places (k, 3) at which a force is checked."""
+    """Return the places (k, 3) at which a force is checked: the given ones, or `STATES` random ones
+    in a box of 0.1 m if `positions_m` is None [m].
+    """
     if positions_m is None:
         return rng.uniform(0.01, 0.1, (STATES, 3))
     return np.asarray(positions_m, dtype=float).reshape(-1, 3)
@@ -161,6 +169,12 @@ class ForceLaw:
     force : NodeForce
     values : (k,) array
         Values of its constants.
+
+    Notes
+    -----
+    n dofs are 3 for a force on nodes and 9 for one on faces, corner after corner. u is (n
+    positions, n velocities, constants, internal variables of the previous evaluation); the outputs
+    are n forces [N], then the internal variables of this evaluation.
     """
 
     force: NodeForce
@@ -168,12 +182,14 @@ class ForceLaw:
 
     @property
     def dofs(self) -> int:
-        """Number of dofs of a node, or of a triangle."""
+        """Number of dofs of one node (3) or of the three corners of a face (9)."""
         return 3 if self.force.on == "nodes" else 9
 
     @cached_property
     def generated(self) -> GeneratedFunction:
-        """Force as the programs evaluate it, with generated derivatives."""
+        """Force as the programs evaluate it, as a function of u and data with generated
+        derivatives.
+        """
         return GeneratedFunction(
             self.force.expression,
             self.force.input_size(self.dofs),
@@ -184,7 +200,12 @@ class ForceLaw:
     def random_state(
         self, rng: np.random.Generator, place: Array
     ) -> tuple[Array, Array]:
-        """Return inputs u and data of a random state near a place (3,)."""
+        """Return inputs u and data of a random state near a place (3,) [m], after the start.
+
+        Corners of a face are the place and points at `FACE_EDGE_M` from it along x and y, all
+        displaced at random, as are the velocities, the normal and the previous internal variables.
+        The state is returned as two (k,) arrays.
+        """
         corners = np.zeros((self.dofs // 3, 3))
         corners[1:] = FACE_EDGE_M * np.eye(3)[: self.dofs // 3 - 1]
         x = (
@@ -210,7 +231,12 @@ class ForceLaw:
         )
 
     def state_at_rest(self, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        """Return the state of an undeformed body at the start, without velocity."""
+        """Return the state (u, data) of an undeformed body at the start (`is_start` is 1), without
+        velocity.
+
+        Place and context are those of `state`, which is not modified; previous internal variables
+        are zero.
+        """
         u = np.zeros_like(state[0])
         data = state[1].copy()
         u[: self.dofs] = np.tile(data[1:4], self.dofs // 3)
@@ -223,10 +249,18 @@ class ForceLaw:
     def plain(self, u: Any, data: Any) -> Any:
         """Return forces on node or corners, then the internal variables, by calling the law.
 
+        On a face the law is called with mean position and velocity of the corners and with the
+        current area and normal of the triangle; each corner gets a third of the result.
+
         Parameters
         ----------
         u, data : DM or SX
             Inputs and data, as columns.
+
+        Returns
+        -------
+        DM or SX, like the arguments
+            Column of `dofs` forces [N], then the internal variables of this evaluation.
         """
         dofs = self.dofs
         constants = len(self.values)
@@ -252,14 +286,16 @@ class ForceLaw:
         return ca.vertcat(*[result[0] / corners] * corners, *result[1:])
 
     def evaluate_plain(self, u: Array, data: Array) -> Array:
-        """Return the plain law, called with numbers."""
+        """Return the outputs of `plain` at u and data of numbers, as a (k,) array."""
         return np.ravel(
             ca.evalf(ca.SX(self.plain(ca.DM(u), ca.DM(data)))).full()
         )
 
     @cached_property
     def automatic(self) -> ca.Function:
-        """Function of u, data and weights: ∂y/∂u and ∂²(wᵀy)/∂u² by automatic differentiation."""
+        """Function of u, data and weights w: ∂y/∂u and ∂²(wᵀy)/∂u² by automatic differentiation,
+        where y is the output of `plain`.
+        """
         u = ca.SX.sym("u", self.force.input_size(self.dofs))
         data = ca.SX.sym("data", CONTEXT_SIZE)
         y = self.plain(u, data)
@@ -270,14 +306,18 @@ class ForceLaw:
 
 
 def _column(values: Any) -> Any:
-    """Return a list of expressions, or an expression, as a column."""
+    """Return a list or tuple of expressions as a column; any other value unchanged."""
     return ca.vertcat(*values) if isinstance(values, list | tuple) else values
 
 
 def _check_derivatives(
     check: PropertyCheck, law: ForceLaw, state: tuple[Array, Array], where: str
 ) -> None:
-    """Compare value and derivatives of the generated force with the plain law."""
+    """Compare value and derivatives of the generated force with the plain law and with differences.
+
+    First and second derivatives are compared with automatic differentiation and with central
+    differences, by all entries of u.
+    """
     u, data = state
     columns = data[:, None]
     y, jacobian = law.generated.evaluate_with_jacobian(u[:, None], columns)
@@ -306,7 +346,7 @@ def _check_derivatives(
     check.require_derivative(
         lambda at: law.evaluate_plain(at, data),
         jacobian[..., 0],
-        u,
+        point=u,
         statement=f"the derivative of the force by (x, v, constants) is wrong {where}",
         scale=scale,
     )
@@ -318,7 +358,7 @@ def _check_derivatives(
             ]
         ),
         hessian,
-        u,
+        point=u,
         statement=f"the second derivative of the force by (x, v, constants) is wrong {where}",
         scale=scale,
     )
@@ -331,7 +371,9 @@ def _check_energy(
     energy: Callable[..., Any],
     where: str,
 ) -> None:
-    """Require that the force without velocity is minus the gradient of the energy."""
+    """Require that the force on a node without velocity is minus the gradient of the energy, both
+    by automatic differentiation of `energy` and by central differences of its values.
+    """
     u = state[0].copy()
     u[3:6] = 0.0
     force = law.evaluate_plain(u, state[1])[:3]
@@ -353,7 +395,7 @@ def _check_energy(
             ca.evalf(ca.SX(energy(ca.DM(place), at, **named))).full()
         ),
         -force,
-        u[:3],
+        point=u[:3],
         statement=statement,
         scale=DISPLACEMENT_M,
     )
@@ -362,7 +404,9 @@ def _check_energy(
 def _check_dissipation(
     check: PropertyCheck, law: ForceLaw, state: tuple[Array, Array], where: str
 ) -> None:
-    """Require that the part of the force that depends on the velocity never adds energy."""
+    """Require (f(x, v) − f(x, 0))·v ≤ 0 at one state for `VELOCITIES` random velocities of
+    different size.
+    """
     u = state[0].copy()
     velocity = slice(law.dofs, 2 * law.dofs)
     u[velocity] = 0.0
@@ -383,14 +427,24 @@ def _check_dissipation(
         check.fail(
             f"it adds energy {where}: the power (f(x, v) − f(x, 0))·v is positive",
             max(powers),
-            "at most 0 W",
+            expected="at most 0 W",
         )
 
 
 def _check_messages(
     check: PropertyCheck, force: NodeForce, values: dict[str, float]
 ) -> None:
-    """Require that a missing constant and a misspelt definition are refused by their names."""
+    """Require that a definition of a constant that the law does not have, and a problem that lacks
+    the value of a constant, are refused by the name of the constant.
+
+    Parameters
+    ----------
+    check : PropertyCheck
+    force : NodeForce
+        Force on all nodes or faces.
+    values : dict of str to float
+        Constants of the force; if it has none, only the first message is checked.
+    """
     misspelt = f"no_{next(iter(values), 'constant')}"
     check.require_refusal(
         lambda: NodeForce.from_law(
@@ -411,7 +465,9 @@ def _check_round_trips(
     state: tuple[Array, Array],
     file: str | Path | None,
 ) -> None:
-    """Require the same forces after pickling and from a problem file."""
+    """Require the same forces at one state after pickling and, unless `file` is None, from a
+    problem file that names the law in this Python file.
+    """
 
     def evaluate(force: NodeForce) -> Array:
         """Return the force at a state."""

@@ -51,6 +51,11 @@ def damping_stress(
     -------
     tuple
         The second entry is None if the law has a potential, whose derivatives are all generated.
+
+    Raises
+    ------
+    AssertionError
+        If the law has neither stress nor potential.
     """
     F, rate, material_values, law_values = symbols
     psi = material.psi(ca.reshape(F, 3, 3), material_values)
@@ -60,6 +65,25 @@ def damping_stress(
         return ca.SX(stress), ca.SX(slope)
     assert law.potential is not None
     return ca.gradient(law.potential(psi, F, rate, **named), F), None
+
+
+@dataclass(frozen=True, eq=False)
+class ForceDerivatives:
+    """Force f on all nodes at one state, and derivatives by u = (x, v, θ), of U = 6n + k numbers.
+
+    Attributes
+    ----------
+    force : (3n,) array
+        f [N].
+    first : (3n, U) array
+        ∂f/∂u.
+    second : (U, U) array
+        ∂²(wᵀf)/∂u² for the weights w of the forces.
+    """
+
+    force: Array
+    first: Array
+    second: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +100,9 @@ class PlainInternalForce:
 
     @cached_property
     def _symbols(self) -> list[ca.SX]:
-        """Symbols x, v, w of an element, the geometry of its points, constants of its laws."""
+        """Symbols of one element: x, v and weights w (3·nodes,), geometry (columns: points; rows:
+        shape gradients, then the volume), and the constants of material and damping law.
+        """
         _, points, width = self.body.geometry.shape
         size = 3 * self.body.element.nodes
         part = self.body.parts[0]
@@ -90,7 +116,9 @@ class PlainInternalForce:
 
     @cached_property
     def _element_force(self) -> ca.SX:
-        """Force (3·nodes,) of one element."""
+        """Symbolic force (3·nodes,) of one element on its nodes, elastic and viscous, without
+        mass-proportional damping.
+        """
         x, v, _, geometry, constants = self._symbols
         part = self.body.parts[0]
         nodes = self.body.element.nodes
@@ -110,24 +138,37 @@ class PlainInternalForce:
         return force
 
     def _split(self, material: Material) -> list[int]:
-        """Return the offsets of the constants of the material and of the damping law."""
+        """Return the offsets of the constants of the material and of the damping law in those of an
+        element, and their total number: the argument of `casadi.vertsplit`.
+        """
         count = len(material.constants)
         return [0, count, self._symbols[-1].numel()]
 
     def _stress(self, F: ca.SX, rate: ca.SX, constants: list[ca.SX]) -> ca.SX:
-        """Return the first Piola–Kirchhoff stress (9,) of material and damping law."""
+        """Return the first Piola–Kirchhoff stress (9,) of material and damping law at F (9,) and
+        its rate (9,).
+
+        Parameters
+        ----------
+        F, rate : (9,) SX
+            Deformation gradient and its rate, column after column.
+        constants : list of two SX
+            Constants of the material, and of the damping law.
+        """
         part = self.body.parts[0]
         symbols = [ca.SX.sym("F", 9), ca.SX.sym("rate", 9)]
         psi = part.material.psi(ca.reshape(symbols[0], 3, 3), constants[0])
         viscous, _ = damping_stress(
-            part.damping, part.material, [*symbols, *constants]
+            part.damping, part.material, symbols=[*symbols, *constants]
         )
         total = ca.gradient(psi, symbols[0]) + viscous
         return ca.substitute(total, ca.vertcat(*symbols), ca.vertcat(F, rate))
 
     @cached_property
     def _functions(self) -> tuple[ca.Function, ca.Function]:
-        """Functions of an element: force with first derivatives, and second derivatives of wᵀ f."""
+        """Two functions of the symbols of an element: force and its first derivatives by u = (x, v,
+        constants); second derivatives of wᵀ f by u.
+        """
         x, v, w, _, constants = self._symbols
         u = ca.vertcat(x, v, constants)
         force = self._element_force
@@ -142,8 +183,9 @@ class PlainInternalForce:
 
     def evaluate(
         self, x: Array, v: Array, w: Array, theta: Array
-    ) -> tuple[Array, Array, Array]:
-        """Return f (3n,), ∂f/∂u (3n, u) and ∂²(wᵀf)/∂u² (u, u) by u = (x, v, θ), of one state.
+    ) -> ForceDerivatives:
+        """Return force and derivatives of one state by u = (x, v, θ), with mass-proportional
+        damping.
 
         Parameters
         ----------
@@ -180,7 +222,7 @@ class PlainInternalForce:
         jacobian[:, -1] -= self.body.dof_mass * v
         hessian[size : 2 * size, -1] -= self.body.dof_mass * w
         hessian[-1, size : 2 * size] -= self.body.dof_mass * w
-        return force, jacobian, hessian
+        return ForceDerivatives(force, jacobian, second=hessian)
 
 
 def check_internal_forces(
@@ -217,6 +259,11 @@ def check_internal_forces(
     ------
     AssertionError
         If a force or derivative differs.
+
+    Notes
+    -----
+    The body is one box of six elements without grasps, memory or field; that the compiled force
+    without velocities is minus the gradient of the compiled energy is required too.
     """
     body = Body(
         uneven_box(1),
@@ -235,17 +282,24 @@ def check_internal_forces(
     w = check.rng.standard_normal(x.size)
     plain = None if body.element.mean_dilatation else PlainInternalForce(body)
     first = _check_derivatives(
-        check, body, [x, v, w], theta, plain=plain, where=""
+        check, body, state=[x, v, w], theta=theta, plain=plain, where=""
     )
     at_rest = [body.nodes_m.ravel(), np.zeros_like(v), w]
     _check_derivatives(
-        check, body, at_rest, theta, plain=plain, where=" undeformed"
+        check,
+        body,
+        state=at_rest,
+        theta=theta,
+        plain=plain,
+        where=" undeformed",
     )
-    _check_energy(check, body, x, theta)
+    _check_energy(check, body, x=x, theta=theta)
     if is_objective:
-        _check_objectivity(check, body, x, v, theta)
+        _check_objectivity(check, body, x=x, v=v, theta=theta)
     if is_dissipative:
-        _check_dissipation(check, body, first[:, x.size : 2 * x.size])
+        _check_dissipation(
+            check, body, by_velocity=first[:, x.size : 2 * x.size]
+        )
 
 
 def _check_derivatives(
@@ -281,7 +335,7 @@ def _check_derivatives(
     elements = f"{where} {body.element.name} elements".strip()
     force = body.force(x, v, theta)[0]
     first = _first_derivatives(body, x, v=v, theta=theta)
-    second = _second_derivatives(body, state, theta)
+    second = _second_derivatives(body, state, theta=theta)
     # Forces of an undeformed body are zero; what counts is their change by a large change of x.
     size = max(
         float(np.abs(force).max()),
@@ -295,22 +349,27 @@ def _check_derivatives(
     )
     if plain is not None:
         expected = plain.evaluate(x, v, w, theta)
-        names = (
-            "force",
-            "first derivative of the force",
-            "second derivative of the force",
+        difference = (
+            f"of {elements} differs from the plain formula with automatic "
+            "derivatives"
         )
-        for name, found, value in zip(
-            names, (force, first, second), expected, strict=True
-        ):
-            check.require_equal(
-                found,
-                value,
-                statement=f"the compiled {name} of {elements} differs from the plain "
-                "formula with automatic derivatives",
-                tolerance=SECOND_DERIVATIVES if value is expected[2] else EXACT,
-                scale=size if value is expected[0] else None,
-            )
+        check.require_equal(
+            force,
+            expected.force,
+            statement=f"the compiled force {difference}",
+            scale=size,
+        )
+        check.require_equal(
+            first,
+            expected.first,
+            statement=f"the compiled first derivative of the force {difference}",
+        )
+        check.require_equal(
+            second,
+            expected.second,
+            statement=f"the compiled second derivative of the force {difference}",
+            tolerance=SECOND_DERIVATIVES,
+        )
     _check_differences(
         check, body, state=state, theta=theta, derivatives=(first, second)
     )
@@ -320,7 +379,9 @@ def _check_derivatives(
 def _check_energy(
     check: PropertyCheck, body: Body, x: Array, theta: Array
 ) -> None:
-    """Require that the compiled force without velocities is minus the gradient of the energy."""
+    """Require that the compiled force without velocities is minus the gradient of the compiled
+    energy, in one random direction, by central differences.
+    """
     named = dict(zip(body.constants, theta, strict=True))
     constants = {
         c.name: named[c.name] for c in body.parts[0].material.constants
@@ -330,8 +391,8 @@ def _check_energy(
     check.require_product(
         lambda at: np.atleast_1d(body.energy(at, **constants)),
         np.atleast_1d(-force @ direction),
-        x,
-        direction,
+        point=x,
+        direction=direction,
         statement=f"the compiled force of {body.element.name} elements is not minus the gradient "
         "of the compiled energy",
     )
@@ -340,17 +401,19 @@ def _check_energy(
 def _check_objectivity(
     check: PropertyCheck, body: Body, x: Array, v: Array, theta: Array
 ) -> None:
-    """Require f(Qx, Q(v + ω × x)) = Q f(x, v) without mass-proportional damping."""
+    """Require f(Qx, Q(v + ω × x)) = Q f(x, v) for a random rotation Q and spin ω, with γ_m, the
+    last entry of `theta`, set to zero in a copy.
+    """
     constants = theta.copy()
     constants[-1] = 0.0
     Q = Rotation.from_quat(check.rng.standard_normal(4)).as_matrix()
     spin = SPIN_RAD_S * check.rng.standard_normal(3)
     places, velocities = (field.reshape(-1, 3) for field in (x, v))
     spinning = velocities + np.cross(spin, places)
-    found = body.force(places @ Q.T, spinning @ Q.T, constants)[0]
+    rotated = body.force(places @ Q.T, spinning @ Q.T, constants)[0]
     expected = body.force(places, velocities, constants)[0].reshape(-1, 3) @ Q.T
     check.require_equal(
-        found,
+        rotated,
         expected.ravel(),
         statement=f"a spinning rotation changes the force of {body.element.name} elements in the "
         "body's axes",
@@ -361,14 +424,16 @@ def _check_objectivity(
 def _check_dissipation(
     check: PropertyCheck, body: Body, by_velocity: Array
 ) -> None:
-    """Require that no velocity increases the energy: no eigenvalue of ∂f/∂v is positive."""
+    """Require that no velocity increases the energy: no eigenvalue of the symmetric part of ∂f/∂v
+    `by_velocity` (3n, 3n) is positive beyond rounding.
+    """
     powers = np.linalg.eigvalsh((by_velocity + by_velocity.T) / 2)
     if not powers[-1] <= EXACT * np.abs(powers).max():
         check.fail(
             f"the damping of {body.element.name} elements adds energy: the largest eigenvalue of "
             "∂f/∂v is positive",
             powers[-1],
-            "at most 0 N s/m",
+            expected="at most 0 N s/m",
         )
 
 
@@ -380,7 +445,19 @@ def _check_differences(
     theta: Array,
     derivatives: tuple[Array, Array],
 ) -> None:
-    """Compare first and second derivatives of compiled forces with differences in one direction."""
+    """Compare first and second derivatives of compiled forces with differences in one direction.
+
+    Parameters
+    ----------
+    check : PropertyCheck
+    body : Body
+    state : list of (3n,) array
+        Positions, velocities, and weights w of the forces.
+    theta : (k,) array
+        Constants of the body.
+    derivatives : two arrays
+        Compiled ∂f/∂u and ∂²(wᵀf)/∂u² at u = (x, v, θ).
+    """
     x, v, w = state
     size = len(x)
     point = np.concatenate([x, v, theta])
@@ -403,21 +480,21 @@ def _check_differences(
     check.require_product(
         force_at,
         derivatives[0] @ direction,
-        point,
-        direction,
+        point=point,
+        direction=direction,
         statement=f"the first derivative {where}",
     )
     check.require_product(
         weighted_derivative_at,
         derivatives[1] @ direction,
-        point,
-        direction,
+        point=point,
+        direction=direction,
         statement=f"the second derivative {where}",
     )
 
 
 def _first_derivatives(body: Body, x: Array, v: Array, theta: Array) -> Array:
-    """Return the compiled ∂f/∂(x, v, θ), (3n, 6n + k), at one state."""
+    """Return the compiled ∂f/∂(x, v, θ) at one state as a full matrix (3n, 6n + k)."""
     at = body.linearise(x, v, theta)
     by_x = full_matrix(
         body.pattern, at.by_position[0], skew=at.by_position_skew[0]
@@ -427,7 +504,9 @@ def _first_derivatives(body: Body, x: Array, v: Array, theta: Array) -> Array:
 
 
 def _second_derivatives(body: Body, state: list[Array], theta: Array) -> Array:
-    """Return the compiled second derivatives of wᵀ f by (x, v, θ) at a state x, v, w."""
+    """Return the compiled second derivatives of wᵀ f by (x, v, θ) at a state [x, v, w], as a full
+    symmetric matrix (6n + k, 6n + k); those by v twice are zero.
+    """
     x, v, w = state
     at = body.second_derivatives(x, v, w, theta)
     none = np.zeros(0)

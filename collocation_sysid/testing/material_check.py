@@ -95,6 +95,11 @@ def check_material(
         For the first property that fails: which one, where, found and expected value.
     InputError
         If the energy is no function of CasADi operations, or is not zero at F = I.
+
+    Notes
+    -----
+    An empty `elements` skips the check of compiled forces. The missing and the misspelt constant
+    are those of this material; entries of `constants` that it does not declare are ignored.
     """
     made = as_material(material)
     check = PropertyCheck(f"material {made.name!r}")
@@ -102,11 +107,11 @@ def check_material(
     law = EnergyDerivatives(made, np.array([*values.values()]))
     _check_undeformed(check, law)
     for where, F in _deformations(check.rng, largest_strain):
-        _check_derivatives(check, law, F, where)
+        _check_derivatives(check, law, F=F, where=where)
         if is_objective:
-            _check_objectivity(check, law, F, where)
-    _check_messages(check, made, values)
-    _check_round_trips(check, made, values, file, function)
+            _check_objectivity(check, law, F=F, where=where)
+    _check_messages(check, made, values=values)
+    _check_round_trips(check, made, values=values, file=file, function=function)
     for element in elements:
         check_internal_forces(
             check,
@@ -125,6 +130,28 @@ def check_material(
 
 
 @dataclass(frozen=True, eq=False)
+class StressState:
+    """Energy density and its derivatives at one F; tensors are stacked column after column.
+
+    Attributes
+    ----------
+    psi : (1,) array
+        Energy density ψ [J/m³].
+    stress : (9,) array
+        First Piola–Kirchhoff stress P = ∂ψ/∂F [Pa].
+    tangent : (9, 9) array
+        ∂P/∂F [Pa].
+    by_constants : (9, k) array or None
+        ∂P/∂θ by the k constants of the material; None if it was not computed.
+    """
+
+    psi: Array
+    stress: Array
+    tangent: Array
+    by_constants: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class EnergyDerivatives:
     """Energy density, stress and stiffness of a material as numbers.
 
@@ -140,7 +167,9 @@ class EnergyDerivatives:
 
     @cached_property
     def _function(self) -> ca.Function:
-        """Function of F (9,), column after column."""
+        """Function of F (9,), column after column, at the values of the constants: ψ, P = ∂ψ/∂F and
+        ∂P/∂F by automatic differentiation.
+        """
         F = ca.SX.sym("F", 9)
         psi = self.material.psi(ca.reshape(F, 3, 3), ca.SX(ca.DM(self.values)))
         tangent, stress = ca.hessian(psi, F)
@@ -148,12 +177,14 @@ class EnergyDerivatives:
 
     @cached_property
     def _kernel_function(self) -> ca.Function:
-        """Function of F (9,) and the constants, differentiated as in kernels: by a chain rule."""
+        """Function of F (9,) and the constants: ψ, P, ∂P/∂F and ∂P/∂θ, differentiated as in
+        kernels, by the chain rule of the material's invariants.
+        """
         F = ca.SX.sym("F", 9)
         values = ca.SX.sym("values", len(self.values))
         gradient = ca.reshape(F, 3, 3)
         rule = self.material.chain_rule(gradient, values)
-        psi = self.material.psi_in(rule, gradient, values)
+        psi = self.material.psi_in(rule, gradient, values=values)
         stress = rule.gradient(psi, F)
         outputs = [
             psi,
@@ -163,17 +194,17 @@ class EnergyDerivatives:
         ]
         return ca.Function("kernel", [F, values], rule.eliminate(outputs))
 
-    def evaluate(self, F: Array) -> tuple[Array, Array, Array]:
-        """Return ψ (1,), P (9,) and ∂P/∂F (9, 9) at F (9,), stacked column after column."""
-        psi, stress, tangent = (
-            output.full() for output in self._function.call([F])
+    def evaluate(self, F: Array) -> StressState:
+        """Return energy, stress and stiffness at F (9,), stacked column after column."""
+        outputs = [output.full() for output in self._function.call([F])]
+        return StressState(
+            outputs[0].ravel(), outputs[1].ravel(), tangent=outputs[2]
         )
-        return psi.ravel(), stress.ravel(), tangent
 
     def evaluate_kernel(
         self, F: Array, values: Array | None = None
-    ) -> tuple[Array, Array, Array, Array]:
-        """Return ψ, P and ∂P/∂F like `evaluate`, and ∂P/∂θ (9, k), as kernels differentiate.
+    ) -> StressState:
+        """Return energy, stress, stiffness and `by_constants`, differentiated as in kernels.
 
         Parameters
         ----------
@@ -182,14 +213,20 @@ class EnergyDerivatives:
             Values of the constants in place of those of this object.
         """
         constants = self.values if values is None else values
-        outputs = (
+        outputs = [
             each.full() for each in self._kernel_function.call([F, constants])
+        ]
+        return StressState(
+            outputs[0].ravel(),
+            outputs[1].ravel(),
+            tangent=outputs[2],
+            by_constants=outputs[3],
         )
-        psi, stress, tangent, by_constants = outputs
-        return psi.ravel(), stress.ravel(), tangent, by_constants
 
     def evaluate_plain(self, F: Array) -> Array:
-        """Return ψ (1,) by calling the energy function with numbers."""
+        """Return ψ (1,) at F (9,), column after column, by calling the energy function of the
+        material with numbers.
+        """
         named = {
             c.name: float(v)
             for c, v in zip(self.material.constants, self.values, strict=True)
@@ -201,14 +238,15 @@ class EnergyDerivatives:
 def deformation_gradients(
     rng: np.random.Generator, count: int, largest_strain: float
 ) -> Iterator[Array]:
-    """Return random deformation gradients (9,), column after column, with det F > 0.
+    """Yield `count` random deformation gradients (9,), column after column, with det F ≥ 0.1.
 
     Parameters
     ----------
     rng : numpy.random.Generator
     count : int
     largest_strain : float
-        Largest entry of F − I.
+        Entries of F − I are uniform between minus and plus this; draws with a smaller determinant
+        are repeated.
     """
     for _ in range(count):
         F = np.eye(3) + rng.uniform(-largest_strain, largest_strain, (3, 3))
@@ -220,7 +258,10 @@ def deformation_gradients(
 def _deformations(
     rng: np.random.Generator, largest_strain: float
 ) -> Iterator[tuple[str, Array]]:
-    """Return descriptions and deformation gradients (9,): random ones, then equal stretches."""
+    """Yield pairs of a description and a deformation gradient (9,): `DEFORMATIONS` random ones,
+    then a uniaxial and a volumetric stretch of 1 + `largest_strain`, and both of 1 −
+    `largest_strain`.
+    """
     for number, F in enumerate(
         deformation_gradients(rng, DEFORMATIONS, largest_strain=largest_strain)
     ):
@@ -240,37 +281,39 @@ def _deformations(
 
 
 def random_rotation(rng: np.random.Generator) -> Array:
-    """Return a random rotation matrix (3, 3)."""
+    """Return a rotation matrix (3, 3), uniformly distributed."""
     return Rotation.from_quat(rng.standard_normal(4)).as_matrix()
 
 
 def _check_undeformed(check: PropertyCheck, law: EnergyDerivatives) -> None:
-    """Require no energy and stress at F = I, and resistance to every small strain."""
-    psi, stress, tangent = law.evaluate(np.eye(3).ravel())
-    stiffness = max(float(np.abs(tangent).max()), np.finfo(float).tiny)
+    """Require zero energy and stress at F = I, relative to the largest stiffness, and a stiffness
+    that is positive for every symmetric strain.
+    """
+    state = law.evaluate(np.eye(3).ravel())
+    stiffness = max(float(np.abs(state.tangent).max()), np.finfo(float).tiny)
     zero = np.zeros(9)
     where = "of the undeformed material is not zero"
     check.require_equal(
-        psi, zero[:1], statement=f"the energy {where}", scale=stiffness
+        state.psi, zero[:1], statement=f"the energy {where}", scale=stiffness
     )
     check.require_equal(
-        stress, zero, statement=f"the stress {where}", scale=stiffness
+        state.stress, zero, statement=f"the stress {where}", scale=stiffness
     )
     shears = [
-        (np.outer(a, b) + np.outer(b, a)) / np.sqrt(2) for a, b in _pairs()
+        (np.outer(a, b) + np.outer(b, a)) / np.sqrt(2) for a, b in _axis_pairs()
     ]
     strains = np.array([each.ravel() for each in (*DIAGONAL, *shears)])
-    smallest = np.linalg.eigvalsh(strains @ tangent @ strains.T)[0]
+    smallest = np.linalg.eigvalsh(strains @ state.tangent @ strains.T)[0]
     if not smallest > 0:
         check.fail(
             "the undeformed material does not resist every strain",
             smallest,
-            "above 0 Pa",
+            expected="above 0 Pa",
         )
 
 
-def _pairs() -> list[tuple[Array, Array]]:
-    """Return the pairs of different axes."""
+def _axis_pairs() -> list[tuple[Array, Array]]:
+    """Return the three pairs of different coordinate axes, as unit vectors (3,)."""
     axes = np.eye(3)
     return [(axes[0], axes[1]), (axes[0], axes[2]), (axes[1], axes[2])]
 
@@ -278,30 +321,32 @@ def _pairs() -> list[tuple[Array, Array]]:
 def _check_derivatives(
     check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str
 ) -> None:
-    """Require that stress and stiffness are the derivatives of the energy."""
-    psi, stress, tangent = law.evaluate(F)
-    if not np.isfinite(psi).all():
+    """Require that the energy is finite and equal to its function called with numbers, that stress
+    and stiffness are its derivatives by central differences, and that those of kernels agree.
+    """
+    state = law.evaluate(F)
+    if not np.isfinite(state.psi).all():
         check.fail(
             f"the energy is not finite {where}",
-            psi[0],
-            "a finite energy, or a smaller largest_strain",
+            state.psi[0],
+            expected="a finite energy, or a smaller largest_strain",
         )
     check.require_equal(
-        psi,
+        state.psi,
         law.evaluate_plain(F),
         statement=f"the energy differs from its function {where}",
     )
     check.require_derivative(
-        lambda at: law.evaluate(at)[0],
-        stress,
-        F,
+        lambda at: law.evaluate(at).psi,
+        state.stress,
+        point=F,
         statement=f"P is not ∂ψ/∂F {where}",
         scale=0.1,
     )
     check.require_derivative(
-        lambda at: law.evaluate(at)[1],
-        tangent,
-        F,
+        lambda at: law.evaluate(at).stress,
+        state.tangent,
+        point=F,
         statement=f"∂P/∂F is wrong {where}",
         scale=0.1,
     )
@@ -311,16 +356,22 @@ def _check_derivatives(
 def _check_kernel_derivatives(
     check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str
 ) -> None:
-    """Require that the derivatives of kernels are those of the energy by F and the constants."""
+    """Require that energy, stress and stiffness of kernels are those of
+    `EnergyDerivatives.evaluate`, and that ∂P/∂θ agrees with central differences by the
+    constants.
+    """
     plain = law.evaluate(F)
-    *kernel, by_constants = law.evaluate_kernel(F)
+    kernel = law.evaluate_kernel(F)
+    assert kernel.by_constants is not None
     # Stress and energy may vanish, in a volumetric stretch for instance.
-    stiffness = float(np.abs(plain[2]).max())
-    for name, found, expected in zip(
-        ("ψ", "P", "∂P/∂F"), kernel, plain, strict=True
+    stiffness = float(np.abs(plain.tangent).max())
+    for name, value, expected in (
+        ("ψ", kernel.psi, plain.psi),
+        ("P", kernel.stress, plain.stress),
+        ("∂P/∂F", kernel.tangent, plain.tangent),
     ):
         check.require_equal(
-            found,
+            value,
             expected,
             statement=f"{name} of kernels differs from the energy's {where}",
             tolerance=CHAIN_RULE,
@@ -328,9 +379,9 @@ def _check_kernel_derivatives(
         )
     sizes = np.maximum(np.abs(law.values), np.finfo(float).tiny)
     check.require_derivative(
-        lambda values: law.evaluate_kernel(F, values)[1],
-        by_constants,
-        law.values,
+        lambda values: law.evaluate_kernel(F, values).stress,
+        kernel.by_constants,
+        point=law.values,
         statement=f"∂P/∂θ is wrong {where}",
         scale=sizes,
     )
@@ -339,20 +390,19 @@ def _check_kernel_derivatives(
 def _check_objectivity(
     check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str
 ) -> None:
-    """Require ψ(QF) = ψ(F) and P(QF) = Q P(F)."""
-    psi, stress, _ = law.evaluate(F)
+    """Require ψ(QF) = ψ(F) and P(QF) = Q P(F) at one F (9,) for one random rotation Q."""
+    state = law.evaluate(F)
     Q = random_rotation(check.rng)
-    rotated = (Q @ F.reshape(3, 3, order="F")).ravel(order="F")
-    rotated_psi, rotated_stress, _ = law.evaluate(rotated)
+    rotated = law.evaluate((Q @ F.reshape(3, 3, order="F")).ravel(order="F"))
     check.require_equal(
-        rotated_psi,
-        psi,
+        rotated.psi,
+        state.psi,
         statement=f"a rotation changes the energy {where}",
         tolerance=1e-8,
     )
     check.require_equal(
-        rotated_stress.reshape(3, 3, order="F"),
-        Q @ stress.reshape(3, 3, order="F"),
+        rotated.stress.reshape(3, 3, order="F"),
+        Q @ state.stress.reshape(3, 3, order="F"),
         statement=f"the stress does not rotate with the body {where}",
         tolerance=1e-8,
     )
@@ -361,7 +411,9 @@ def _check_objectivity(
 def _check_messages(
     check: PropertyCheck, material: Material, values: dict[str, float]
 ) -> None:
-    """Require that a missing constant and a misspelt definition are refused by their names."""
+    """Require that a definition of a constant that the energy does not have, and a problem that
+    lacks the value of the last constant, are refused by the name of the constant.
+    """
     misspelt = f"no_{material.constants[0].name}"
     check.require_refusal(
         lambda: Material.from_energy(
@@ -380,7 +432,20 @@ def _check_round_trips(
     file: str | Path | None,
     function: str | None,
 ) -> None:
-    """Require the same energies after pickling and from a problem file."""
+    """Require the same energies at small strains after pickling and, unless `file` is None, from a
+    problem file that names the energy function in this Python file.
+
+    Parameters
+    ----------
+    check : PropertyCheck
+    material : Material
+    values : dict of str to float
+        Values of all constants of the material.
+    file : str, Path or None
+        Python file with the energy function.
+    function : str or None
+        Name of the function in the file; None means the ``__name__`` of the energy function.
+    """
     constants = np.array([*values.values()])
     deformations = [
         *deformation_gradients(
@@ -389,7 +454,7 @@ def _check_round_trips(
     ]
 
     def evaluate(made: Material) -> Array:
-        """Return ψ at a few deformations."""
+        """Return ψ (`DEFORMATIONS`,) at the same few small deformations in every call."""
         law = EnergyDerivatives(made, constants)
         return np.concatenate([law.evaluate_plain(F) for F in deformations])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -66,6 +67,12 @@ def check_method(
     ------
     AssertionError
         For the first property that fails: which one, where, found and expected value.
+
+    Notes
+    -----
+    The method is called twice: with `watch`, and with its own answer as `start`. What it changes in
+    the program is seen by its guess, bounds and values at one point. A method that raises an error
+    lets the check raise it.
     """
     name = getattr(method, "name", None) or getattr(
         method, "__name__", type(method).__name__
@@ -100,23 +107,27 @@ def check_method(
 
 
 def small_recording() -> Collocation:
-    """Return the program of a simulated swing of a foam block without noise, with two unknowns."""
+    """Return the program of a simulated swing of a foam block without noise, with the constants of
+    `GUESSES` to be estimated and all others at their values in `TRUTH`.
+    """
     body = Body(
         box_mesh((0.05, 0.05, 0.1), (1, 1, 2)), density_kg_m3=DENSITY_KG_M3
     )
     experiment = swung_experiment(body)
-    seen = with_markers(
+    recorded = with_markers(
         experiment,
         simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m,
     )
     unknowns: Mapping[str, Any] = TRUTH | {
         name: Unknown(value) for name, value in GUESSES.items()
     }
-    return Collocation([seen], Parameters.from_mapping(unknowns))
+    return Collocation([recorded], Parameters.from_mapping(unknowns))
 
 
 def _fingerprint(collocation: Collocation) -> Array:
-    """Return numbers that change if a method changes the program in place."""
+    """Return numbers that change if a method changes the program in place: guess, objective,
+    constraints, gradient and bounds at a rigid motion; infinite ones count as zero.
+    """
     p = collocation.guess_p
     rigid = [
         s.experiment.rigid_positions(s.dynamics.t_s)
@@ -140,53 +151,96 @@ def _check_answer(
     largest_error: float,
     where: str = "",
 ) -> None:
-    """Require convergence to the truth, within the bounds, with the equations satisfied."""
+    """Require convergence to the truth, within the bounds, with the equations satisfied.
+
+    Parameters
+    ----------
+    check : PropertyCheck
+    solution : Solution
+        What the method returned; any other type fails.
+    is_exact : bool
+        Whether the equations of motion have to hold.
+    largest_error : float
+        Largest relative error of an estimate.
+    where : str
+        End of the sentences, with a space in front, or nothing.
+    """
     if not isinstance(solution, Solution):
         check.fail(
-            "it does not return a Solution", type(solution).__name__, "Solution"
+            "it does not return a Solution",
+            type(solution).__name__,
+            expected="Solution",
         )
     if not solution.status.converged:
         check.fail(
-            f"it does not converge{where}", solution.status.value, "converged"
+            f"it does not converge{where}",
+            solution.status.value,
+            expected="converged",
         )
     for name in GUESSES:
         value = solution.parameters[name]
         if not abs(value / TRUTH[name] - 1) <= largest_error:
             check.fail(
-                f"the estimate of {name} is wrong{where}", value, TRUTH[name]
+                f"the estimate of {name} is wrong{where}",
+                value,
+                expected=TRUTH[name],
             )
     low, high = solution.collocation.bounds()
     excess = float(
         np.maximum(low - solution.z, solution.z - high).max(initial=0.0)
     )
     if not excess <= 1e-9:
-        check.fail(f"a variable is outside its bounds{where}", excess, "0")
+        check.fail(
+            f"a variable is outside its bounds{where}", excess, expected="0"
+        )
     violation = solution.max_violation_relative
     if is_exact and not violation <= LARGEST_VIOLATION:
         check.fail(
             f"the equations of motion do not hold{where}: residual over the largest force",
             violation,
-            f"at most {LARGEST_VIOLATION:g}",
+            expected=f"at most {LARGEST_VIOLATION:g}",
         )
 
 
 def _check_history(
     check: PropertyCheck, solution: Solution, lines: list[Iteration]
 ) -> None:
-    """Require a history that `watch` got line by line, and that ends below its begin."""
+    """Require a history that `watch` got line by line, with losses that decrease, and a finite
+    loss.
+
+    Losses are compared between lines about the complete recording: the last of them must not
+    exceed the first.
+
+    Parameters
+    ----------
+    check : PropertyCheck
+    solution : Solution
+        Answer with its history.
+    lines : list of Iteration
+        Lines that `watch` received, in order.
+    """
     if not solution.history:
-        check.fail("the history of the solve is empty", 0, "at least one line")
+        check.fail(
+            "the history of the solve is empty", 0, expected="at least one line"
+        )
     if lines != list(solution.history):
         check.fail(
             "watch did not get every line of the history",
             len(lines),
-            len(solution.history),
+            expected=len(solution.history),
         )
-    first, last = solution.history[0].loss, solution.history[-1].loss
-    whole = [line.loss for line in solution.history if line.share >= 1.0]
-    if not (whole and min(last, *whole) <= max(first, *whole)):
+    complete = [line.loss for line in solution.history if line.share >= 1.0]
+    if not complete:
         check.fail(
-            "the last line of the history has not the lowest loss", last, first
+            "no line of the history is about the complete recording",
+            solution.history[-1].share,
+            expected=1.0,
+        )
+    if not complete[-1] <= complete[0]:
+        check.fail(
+            "the loss of the last line of the history is above that of the first",
+            complete[-1],
+            expected=complete[0],
         )
     expected = (
         solution.collocation.objective(solution.z)
@@ -194,12 +248,20 @@ def _check_history(
     )
     if not np.isfinite(expected):
         check.fail(
-            "the loss of the answer is not finite", expected, "a finite loss"
+            "the loss of the answer is not finite",
+            expected,
+            expected="a finite loss",
         )
 
 
 def _check_options(check: PropertyCheck, method: Any) -> None:
-    """Require that wrong options are refused by name, and a round trip through a problem file."""
+    """Require that wrong options of a method are refused by name, and a round trip through a
+    problem file.
+
+    An unknown option, and the text "text" as the value of each option that is a number or boolean,
+    must be refused. Options that are None or callable are left out of the problem file; tuples are
+    written as lists.
+    """
     kind = type(method)
     key = f"solver.{method.name}"
     check.require_refusal(
@@ -211,28 +273,28 @@ def _check_options(check: PropertyCheck, method: Any) -> None:
     for name, value in options.items():
         if isinstance(value, bool | int | float):
             check.require_refusal(
-                lambda name=name: method_from_options(
-                    kind, {name: "text"}, key=key
-                ),
+                partial(method_from_options, kind, {name: "text"}, key=key),
                 naming=f"{key}.{name}",
                 statement=f"the text 'text' as the option {name}",
             )
-    stated = {
+    written = {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in options.items()
         if value is not None and not callable(value)
     }
     try:
         read = method_from_options(
-            kind, tomllib.loads(tomli_w.dumps(stated)), key=key
+            kind, tomllib.loads(tomli_w.dumps(written)), key=key
         )
     except InputError as error:
         check.fail(
             "its options from a problem file are refused",
             error,
-            "the same method",
+            expected="the same method",
         )
     if read != method:
         check.fail(
-            "its options from a problem file give another method", read, method
+            "its options from a problem file give another method",
+            read,
+            expected=method,
         )

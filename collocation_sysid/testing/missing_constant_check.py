@@ -15,6 +15,8 @@ def check_missing_constant(
 ) -> None:
     """Require that values without the last constant of an extension are refused by its name.
 
+    All other constants of a small box with the extension are stated.
+
     Parameters
     ----------
     check : PropertyCheck

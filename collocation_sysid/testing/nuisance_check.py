@@ -83,13 +83,15 @@ def check_nuisance(
         check.fail(
             f"the recording {base.name!r} does not have it",
             "no value",
-            "at least one value",
+            expected="at least one value",
         )
     collocation = program_of(changed, {})
     data = collocation.transcriptions[0].nuisance
-    _check_round_trips(check, row, data, file, name_in_file)
+    _check_round_trips(
+        check, row, data=data, file=file, name_in_file=name_in_file
+    )
     if row not in KINDS:
-        _check_messages(check, row, base)
+        _check_messages(check, row, experiment=base)
     if row.reading is not None:
         _check_reading(check, row, collocation=collocation)
     if row.clock is not None:
@@ -98,7 +100,12 @@ def check_nuisance(
 
 
 def _with_row(experiment: Experiment, row: NuisanceRow) -> Experiment:
-    """Return the experiment in which the parameter of a row is estimated."""
+    """Return the experiment in which the parameter of a row is estimated; the argument is not
+    modified.
+
+    A row of the package gets its usual standard deviation, or else the considered one, or else
+    `USUAL_SIGMA`; another row is added to the own ones of the experiment.
+    """
     nuisance = experiment.nuisance
     if row not in KINDS:
         return replace(
@@ -109,14 +116,31 @@ def _with_row(experiment: Experiment, row: NuisanceRow) -> Experiment:
 
 
 def _value_count(row: NuisanceRow) -> int:
-    """Return the number of values of one component of a row."""
+    """Return the number of values of one component of a row: the number of its axes, 1 without
+    axes.
+    """
     return len(row.axes.split()) or 1
 
 
 def _read(
     row: NuisanceRow, y: Array, values: Array, t_s: float, data: NuisanceMap
 ) -> Array:
-    """Return the reading (3,) or the delay (1,) of a row by calling its function with numbers."""
+    """Return the reading (3,) of a row, or the delay (1,) of its clock if it has no reading, by
+    calling its function with numbers.
+
+    Parameters
+    ----------
+    row : NuisanceRow
+        Row with a reading or a clock.
+    y : (3,) array
+        Position of a marker [m]; not used by a clock.
+    values : array
+        Physical values of the parameter, not in standard deviations.
+    t_s : float
+        Time of the sample [s].
+    data : NuisanceMap
+        Data of the recording that the function may use.
+    """
     argument = ca.DM(values)
     result = (
         row.reading(ca.DM(y), argument, t_s, data)
@@ -129,7 +153,12 @@ def _read(
 def _check_reading(
     check: PropertyCheck, row: NuisanceRow, collocation: Collocation
 ) -> None:
-    """Require no effect of zero, right derivatives, and the reading in predicted markers."""
+    """Require that zero has no effect, that derivatives are right, and that predicted markers are
+    the reading.
+
+    First and second derivatives of the row's reading by position and values are compared with
+    central differences at one random place, at the mean time of the recording.
+    """
     assert row.reading is not None
     (transcription,) = collocation.transcriptions
     data = transcription.nuisance
@@ -162,14 +191,14 @@ def _check_reading(
     check.require_derivative(
         lambda at: _read(row, at[:3], values=at[3:], t_s=t_s, data=data),
         jacobian,
-        u,
+        point=u,
         statement="the first derivative of the reading is wrong",
         scale=scale,
     )
     check.require_derivative(
         lambda at: weights @ derivatives.call([at])[0].full(),
         hessian,
-        u,
+        point=u,
         statement="the second derivative of the reading is wrong",
         scale=scale,
     )
@@ -177,7 +206,9 @@ def _check_reading(
 
 
 def _marker_residual(collocation: Collocation) -> MarkerResidual:
-    """Return the measurement model of the markers of a small recording."""
+    """Return the measurement model of the markers of a small recording, which must have exactly one
+    experiment with markers.
+    """
     (transcription,) = collocation.transcriptions
     (markers,) = (
         r for r in transcription.residuals if isinstance(r, MarkerResidual)
@@ -188,7 +219,11 @@ def _marker_residual(collocation: Collocation) -> MarkerResidual:
 def _check_predicted_reading(
     check: PropertyCheck, row: NuisanceRow, collocation: Collocation
 ) -> None:
-    """Require that predicted markers are the reading of those without the parameter."""
+    """Require that predicted markers are the reading of those without the parameter, at every
+    sample.
+
+    Values of the parameter of all markers so far are random; others are zero.
+    """
     residual = _marker_residual(collocation)
     data = residual.nuisance
     x = _smooth_motion(check, collocation)
@@ -225,7 +260,9 @@ def _check_predicted_reading(
 def _check_clock(
     check: PropertyCheck, row: NuisanceRow, collocation: Collocation
 ) -> None:
-    """Require no delay at zero, and markers of a known motion at the later time."""
+    """Require no delay at zero, and the first marker of a known motion at the later time, at all
+    samples from `FIRST_INNER_SAMPLE` on.
+    """
     residual = _marker_residual(collocation)
     data = residual.nuisance
     count = _value_count(row)
@@ -264,7 +301,17 @@ def _check_clock(
 def _smooth_motion(
     check: PropertyCheck, collocation: Collocation, shift_s: float = 0.0
 ) -> Array:
-    """Return grid positions (N, 3n) of a motion that is affine in space and quadratic in time."""
+    """Return grid positions (N, 3n) of a motion that is affine in space and quadratic in time.
+
+    Parameters
+    ----------
+    check : PropertyCheck
+        Not used.
+    collocation : Collocation
+        Program of one recording.
+    shift_s : float
+        Time that is added to the grid times [s]; the same motion later if positive.
+    """
     (transcription,) = collocation.transcriptions
     nodes_m = transcription.body.nodes_m
     rates = np.random.default_rng(3).standard_normal((2, 3, 3))
@@ -280,7 +327,7 @@ def _smooth_motion(
 def _check_messages(
     check: PropertyCheck, row: NuisanceRow, experiment: Experiment
 ) -> None:
-    """Require that a repeated name and a prior without width are refused by the name."""
+    """Require that a repeated name and a prior without width are refused by the name of the row."""
     nuisance = experiment.nuisance
     check.require_refusal(
         lambda: replace(nuisance, own=(*nuisance.own, row, row)),
@@ -301,7 +348,20 @@ def _check_round_trips(
     file: str | Path | None,
     name_in_file: str | None,
 ) -> None:
-    """Require the same effect and prior after pickling and from a problem file."""
+    """Require the same effect and prior after pickling and, unless `file` is None, from a problem
+    file that names the row in this Python file.
+
+    Parameters
+    ----------
+    check : PropertyCheck
+    row : NuisanceRow
+    data : NuisanceMap
+        Data of the recording for reading or clock.
+    file : str, Path or None
+        Python file with the row.
+    name_in_file : str or None
+        Name of the row in the file; None means its own name.
+    """
     y = np.array([0.03, 0.05, 0.02])
     values = (row.sigma or USUAL_SIGMA) * np.linspace(
         0.3, 0.5, _value_count(row)
@@ -309,7 +369,9 @@ def _check_round_trips(
     t_s = float(np.mean(data.recorded_s))
 
     def evaluate(each: NuisanceRow) -> Array:
-        """Return prior, limits and effect of a row."""
+        """Return prior standard deviation (0 if None), limits (0 if infinite) and effect of a row
+        at one state; a row without reading and clock has no effect.
+        """
         has_effect = each.reading is not None or each.clock is not None
         effect = (
             _read(each, y, values=values, t_s=t_s, data=data)

@@ -32,13 +32,21 @@ def check_program(check: PropertyCheck, collocation: Collocation) -> None:
     ------
     AssertionError
         If a derivative differs.
+
+    Notes
+    -----
+    Each is compared at one random point, which satisfies no equation, along one random direction
+    for the parameters, the positions, the nuisance parameters and the lifted variables; blocks
+    without variables are skipped. The collocation is not modified.
     """
     program = collocation.with_lifted_variables()
     z = shaken_variables(program, check.rng)
     multipliers = check.rng.normal(size=program.constraint_count)
 
     def lagrangian_gradient(at: Array) -> Array:
-        """Return the gradient of the Lagrangian by z."""
+        """Return the gradient of the Lagrangian by z: `LOSS_WEIGHT` times that of the loss and Jᵀ
+        times the multipliers.
+        """
         return (
             LOSS_WEIGHT * program.gradient(at)
             + program.jacobian(at).T @ multipliers
@@ -57,29 +65,31 @@ def check_program(check: PropertyCheck, collocation: Collocation) -> None:
         check.require_product(
             lambda at: np.atleast_1d(program.objective(at)),
             np.atleast_1d(gradient @ direction),
-            z,
-            direction,
+            point=z,
+            direction=direction,
             statement=f"the gradient of the loss by {meaning} is wrong in a small program",
         )
         check.require_product(
             program.constraint_values,
             jacobian @ direction,
-            z,
-            direction,
+            point=z,
+            direction=direction,
             statement=f"the Jacobian of the equations of motion by {meaning} is wrong "
             "in a small program",
         )
         check.require_product(
             lagrangian_gradient,
             hessian @ direction,
-            z,
-            direction,
+            point=z,
+            direction=direction,
             statement=f"the Hessian of the Lagrangian by {meaning} is wrong in a small program",
         )
 
 
 def _blocks(program: Collocation) -> list[tuple[slice, str]]:
-    """Return the blocks of variables of a program with their meaning."""
+    """Return the slices of the variables z of a program with lifted variables, each with its
+    meaning for a sentence; a slice may be empty.
+    """
     return [
         (slice(program.nq), "the parameters"),
         (slice(program.nq, program.phi_columns.start), "the positions"),

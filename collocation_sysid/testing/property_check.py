@@ -45,14 +45,19 @@ class PropertyCheck:
     )
 
     def fail(self, statement: str, found: Any, expected: Any) -> NoReturn:
-        """Raise the `AssertionError` of a property.
+        """Raise the `AssertionError` of a property, always.
 
         Parameters
         ----------
         statement : str
             The failed property, and where it fails.
         found, expected : object
-            Values for the sentence.
+            Values for the sentence; floats are rounded to six digits.
+
+        Raises
+        ------
+        AssertionError
+            With the subject, the statement and both values.
         """
         raise AssertionError(
             f"{self.subject}: {statement}; found {_shown(found)}, expected {_shown(expected)}"
@@ -78,12 +83,14 @@ class PropertyCheck:
         tolerance : float
             Largest difference, relative to `scale`.
         scale : float, optional
-            Size of the quantity; by default the largest expected entry.
+            Size of the quantity; by default the largest absolute expected entry. With a size of
+            zero the entries must be equal.
 
         Raises
         ------
         AssertionError
-            If they differ, or an entry of `found` is not finite.
+            If shapes or values differ, or an entry of either array is NaN. Empty arrays of one
+            shape are equal.
         """
         values = np.asarray(found, dtype=float)
         references = np.asarray(expected, dtype=float)
@@ -134,6 +141,12 @@ class PropertyCheck:
         ------
         AssertionError
             If they differ.
+
+        Notes
+        -----
+        The largest entry is not taken below `ROUNDING` times the largest value of the function. Of
+        the differences with the `STEPS`, the closest to the derivative count. `derivative` may have
+        any shape of m n entries.
         """
         steps = np.broadcast_to(np.asarray(scale, dtype=float), point.shape)
         found = (
@@ -143,7 +156,9 @@ class PropertyCheck:
         def differences(step: float) -> Array:
             """Return the derivative by differences, times the scale."""
             columns = [
-                directional_derivative(function, point, direction, step)
+                directional_derivative(
+                    function, point, direction=direction, step=step
+                )
                 for direction in np.diag(steps)
             ]
             return np.stack([np.ravel(column) for column in columns], axis=1)
@@ -185,13 +200,19 @@ class PropertyCheck:
         ------
         AssertionError
             If they differ.
+
+        Notes
+        -----
+        The largest entry is not taken below `ROUNDING` times the largest value of the function.
+        `direction` is a large change of `point`; of the differences with the `STEPS`, the closest
+        to the product count.
         """
         found = np.asarray(product, dtype=float)
         size = _size(found, function(point))
         expected = _closest(
             found,
             lambda step: directional_derivative(
-                function, point, direction, step
+                function, point, direction=direction, step=step
             ),
             tolerance=tolerance * size,
         )
@@ -247,7 +268,7 @@ class PropertyCheck:
 def _closest(
     found: Array, differences: Callable[[float], Array], *, tolerance: float
 ) -> Array:
-    """Return the differences that are closest to a derivative.
+    """Return, of the differences with each of the `STEPS`, those closest to a derivative.
 
     Parameters
     ----------
@@ -257,6 +278,12 @@ def _closest(
         Differences with a step of this relative size.
     tolerance : float
         Largest error of an entry with which no other step is tried.
+
+    Returns
+    -------
+    array
+        Differences with the least largest error; NaN counts as infinite, as does another shape than
+        that of `found`. If all are infinite, those with the first step.
     """
     candidates = []
     distances = []
@@ -275,7 +302,9 @@ def _closest(
 
 
 def _size(derivative: Array, value: ArrayLike) -> float:
-    """Return the size of a derivative, not less than the rounding of the function's value."""
+    """Return the largest absolute entry of a derivative, but not less than `ROUNDING` times the
+    largest absolute value of the function, nor less than the smallest positive float.
+    """
     largest = float(np.abs(derivative).max(initial=0.0))
     return max(
         largest,
@@ -285,7 +314,7 @@ def _size(derivative: Array, value: ArrayLike) -> float:
 
 
 def _shown(value: Any) -> str:
-    """Return a value as part of a sentence."""
+    """Return a value as part of a sentence: floats with six digits, others as `str` shows them."""
     return (
         f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
     )

@@ -25,8 +25,8 @@ def check_pickling(
     """Require that a copy of an extension, as a worker of a cluster gets it, has the same values.
 
     Functions without a name in a module are pickled with cloudpickle, as on a Dask cluster. Where
-    cloudpickle is not installed, there is no such cluster, and extensions that need it are not
-    checked.
+    cloudpickle is not installed, the standard pickler is tried, and an extension that it cannot
+    pickle is not checked.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def check_pickling(
         check.fail(
             "pickling fails, so that no cluster can evaluate it",
             f"{type(error).__name__}: {error}",
-            "a function that refers to no open file, lock or CasADi symbol",
+            expected="a function that refers to no open file, lock or CasADi symbol",
         )
     check.require_equal(
         evaluate(copy),
@@ -93,6 +93,11 @@ def check_problem_file(
     ------
     AssertionError
         If the file gives another extension, or a wrong name in it is not refused.
+
+    Notes
+    -----
+    `InputError`, if the table or the file is refused, is not caught. The file is run once for each
+    of the two loads.
     """
     loader = CodeLoader(Path(file).parent, is_allowed=True)
     written = tomllib.loads(tomli_w.dumps(table))

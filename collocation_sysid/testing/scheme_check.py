@@ -51,7 +51,8 @@ def check_scheme(scheme: str | Scheme) -> None:
     use no point before the start. An undamped oscillation does not grow. The error of an
     oscillator, computed in plain NumPy from the table, decreases with the stated order. A
     simulated motion of a small body satisfies every row of the table, evaluated in plain NumPy,
-    and gradient, Jacobian and Hessian of its program agree with central differences.
+    and gradient, Jacobian and Hessian of its program agree with central differences. An unknown
+    start rule is refused by its name. The scheme can be pickled.
 
     Parameters
     ----------
@@ -67,7 +68,7 @@ def check_scheme(scheme: str | Scheme) -> None:
     check = PropertyCheck(f"scheme {made.name!r}")
     _check_regular(check, made.regular)
     for row, stencil in enumerate(made.start, start=1):
-        _check_start(check, stencil, row)
+        _check_start(check, stencil, row=row)
     _check_stability(check, made)
     _check_order(check, made)
     _check_simulation(check, made)
@@ -80,12 +81,16 @@ def check_scheme(scheme: str | Scheme) -> None:
 
 
 def _moment(coefficients: tuple[float, ...], power: int) -> float:
-    """Return Σ_i c_i (−i)^power: the stencil's value of (t / Δt)^power at time zero."""
+    """Return Σ_i c_i (−i)^power over all coefficients: the stencil's value of (t / Δt)^power at
+    time zero, i steps back.
+    """
     return sum(c * (-float(i)) ** power for i, c in enumerate(coefficients))
 
 
 def _check_regular(check: PropertyCheck, stencil: Stencil) -> None:
-    """Require that the regular stencil reproduces a parabola."""
+    """Require that the regular stencil reproduces constants, straight lines and parabolas, that its
+    weights of forces add to 1, and that it does not use the start velocity.
+    """
     expected = {
         "the position ξ of a constant (Σ p)": (_moment(stencil.p, 0), 1.0),
         "the velocity ν of a constant (Σ q)": (_moment(stencil.q, 0), 0.0),
@@ -100,7 +105,15 @@ def _check_regular(check: PropertyCheck, stencil: Stencil) -> None:
 
 
 def _check_start(check: PropertyCheck, stencil: Stencil, row: int) -> None:
-    """Require that the stencil of a first row is consistent and uses no point before the start."""
+    """Require that the stencil of a first row is consistent and uses no point before the start.
+
+    Parameters
+    ----------
+    check : PropertyCheck
+    stencil : Stencil
+    row : int
+        Number of the row: the first row after the start, which computes x_1, is row 1.
+    """
     expected = {
         "the position ξ of a constant (Σ p)": (_moment(stencil.p, 0), 1.0),
         "the velocity ν of a constant (Σ q)": (_moment(stencil.q, 0), 0.0),
@@ -117,21 +130,32 @@ def _check_start(check: PropertyCheck, stencil: Stencil, row: int) -> None:
         check.fail(
             f"the stencil of row {row} uses points before the start",
             f"{max(points, len(stencil.s))} points",
-            f"at most {row + 1}",
+            expected=f"at most {row + 1}",
         )
 
 
 def _check_values(
     check: PropertyCheck, expected: dict[str, tuple[float, float]], where: str
 ) -> None:
-    """Compare found and expected moments by name."""
-    for name, (found, value) in expected.items():
-        if not abs(found - value) <= ROUNDING:
-            check.fail(f"{name} in {where} is wrong", found, value)
+    """Require that values agree with expected ones to an absolute error of `ROUNDING`.
+
+    Parameters
+    ----------
+    check : PropertyCheck
+    expected : dict of str to (float, float)
+        Value of the stencil and expected value, by the name of the quantity.
+    where : str
+        Name of the stencil for the sentence.
+    """
+    for name, (moment, value) in expected.items():
+        if not abs(moment - value) <= ROUNDING:
+            check.fail(f"{name} in {where} is wrong", moment, expected=value)
 
 
 def _check_stability(check: PropertyCheck, scheme: Scheme) -> None:
-    """Require that no solution of the regular rows of an undamped oscillation grows."""
+    """Require that no solution of the regular rows of an undamped oscillator grows, for ωΔt of
+    `RESOLVED_STEPS`: no root of their characteristic polynomial exceeds 1 + `LARGEST_GROWTH`.
+    """
     stencil = scheme.regular
     for step in RESOLVED_STEPS:
         force = step**2 * np.convolve(stencil.w, stencil.p)
@@ -144,7 +168,7 @@ def _check_stability(check: PropertyCheck, scheme: Scheme) -> None:
             check.fail(
                 f"it adds energy: per step, an undamped oscillation with ωΔt = {step:g} grows by",
                 largest,
-                "at most a factor of 1",
+                expected="at most a factor of 1",
             )
 
 
@@ -156,10 +180,13 @@ class PlainRows:
     ----------
     scheme : Scheme
     force : callable
-        ``force(xi, nu, t_index)`` → force of one evaluation.
+        ``force(xi, nu)`` → force at a position ξ and a velocity ν of one evaluation.
     mass : float or array
+        Mass of each dof.
     timestep_s : float
+        Step Δt [s].
     start_velocity : float or array
+        Velocity at the start.
     """
 
     scheme: Scheme
@@ -169,7 +196,16 @@ class PlainRows:
     start_velocity: float | Array
 
     def residual(self, x: Array, row: int) -> Any:
-        """Return c_t of a row at positions x (rows + 1, …)."""
+        """Return c_t of a row, force minus mass times acceleration, at positions x (T, …) from the
+        start on.
+
+        Parameters
+        ----------
+        x : (T, …) array
+            Positions at the grid times, at least row + 1 of them; later ones are ignored.
+        row : int
+            Number of the row, from 1 on; it is the equation for x[row].
+        """
         stencil = self.scheme.stencil(row)
         total: Any = 0.0
         for lag, weight in enumerate(stencil.w):
@@ -186,7 +222,9 @@ class PlainRows:
 
 
 def _check_order(check: PropertyCheck, scheme: Scheme) -> None:
-    """Require that the error of a damped oscillator decreases with the stated order."""
+    """Require that the largest error of a damped oscillator decreases with the stated order, within
+    `ORDER_TOLERANCE`.
+    """
     omega = ANGULAR_FREQUENCY_RAD_S
     errors = []
     for count in STEP_COUNTS:
@@ -215,12 +253,14 @@ def _check_order(check: PropertyCheck, scheme: Scheme) -> None:
         check.fail(
             "the error of an oscillator has another order than stated",
             order,
-            scheme.order,
+            expected=scheme.order,
         )
 
 
 def _check_simulation(check: PropertyCheck, scheme: Scheme) -> None:
-    """Require that a simulated motion satisfies the rows; check its program's derivatives."""
+    """Require that a simulated motion of a small body, swung by a grasp from its undeformed shape,
+    satisfies every row of the table at its free dofs; check its program by `check_program`.
+    """
     body = Body(
         box_mesh((0.05, 0.05, 0.1), (1, 1, 2)), density_kg_m3=DENSITY_KG_M3
     )
@@ -231,7 +271,9 @@ def _check_simulation(check: PropertyCheck, scheme: Scheme) -> None:
             experiment, values, scheme, substeps=1
         ).positions_m.reshape(-1, 3 * len(body.nodes_m))
     except SimulationError as error:
-        check.fail("a small body cannot be simulated", error, "a motion")
+        check.fail(
+            "a small body cannot be simulated", error, expected="a motion"
+        )
     theta = np.array([*values.values()])
     weight = np.tile(experiment.gravity_m_s2, len(body.nodes_m)) * body.dof_mass
     rows = PlainRows(

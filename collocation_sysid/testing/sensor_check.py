@@ -75,12 +75,19 @@ def check_sensor(
     ------
     AssertionError
         For the first property that fails: which one, where, found and expected value.
+
+    Notes
+    -----
+    The prediction for a known motion is checked only for sensors on points. Values of `sensor` and
+    its times are ignored; a sensor on any grasp is placed on the only grasp of the small recording.
     """
     check = PropertyCheck(f"sensor {sensor.name!r}")
     expression = SensorExpression(sensor)
     for number in range(STATES):
         u = expression.random_state(check.rng)
-        _check_derivatives(check, expression, u, f"at random state {number}")
+        _check_derivatives(
+            check, expression, u=u, where=f"at random state {number}"
+        )
     check.require_refusal(
         lambda: replace(
             sensor, unknowns={**sensor.unknowns, "no_such_unknown": 1.0}
@@ -88,7 +95,7 @@ def check_sensor(
         naming="no_such_unknown",
         statement="an unknown that the expression does not have",
     )
-    _check_round_trips(check, sensor, file, function)
+    _check_round_trips(check, sensor, file=file, function=function)
     collocation = _small_program(sensor)
     if sensor.grasp is None:
         _check_prediction(check, expression, collocation=collocation)
@@ -108,7 +115,9 @@ class SensorExpression:
 
     @property
     def inputs(self) -> dict[str, Array]:
-        """Undeformed values of the inputs by name: (3, P) for points, (3,) at a grasp."""
+        """Undeformed values of the inputs by name: for a sensor on P points positions and zeros of
+        velocity and acceleration, (3, P) each; at a grasp ones (3, 1) for force and torque.
+        """
         if self.sensor.grasp is not None:
             return {name: np.ones((3, 1)) for name in GRASP_INPUTS}
         points = np.asarray(self.sensor.points_m).T
@@ -123,7 +132,9 @@ class SensorExpression:
         return 2.5 * TIMESTEP_S
 
     def random_state(self, rng: np.random.Generator) -> Array:
-        """Return inputs near the undeformed ones, and unknowns of the size of their priors."""
+        """Return u (k,): inputs near the undeformed ones, with deviations of `SIZES`, and unknowns
+        of the size of their priors.
+        """
         changed = [
             (each + SIZES[name] * rng.standard_normal(each.shape)).ravel(
                 order="F"
@@ -137,7 +148,9 @@ class SensorExpression:
 
     @property
     def scale(self) -> Array:
-        """Size of a large change of each entry of u."""
+        """Size of a large change of each entry of u (k,): `SIZES` for inputs, the prior standard
+        deviation for unknowns.
+        """
         sizes = [
             np.full(each.size, SIZES[name])
             for name, each in self.inputs.items()
@@ -147,7 +160,8 @@ class SensorExpression:
         )
 
     def evaluate_plain(self, u: Array, t_s: float | None = None) -> Array:
-        """Return the numbers of the sensor by calling its expression with numbers.
+        """Return the numbers (c,) of the sensor by calling its expression with numbers; a matrix
+        column after column.
 
         Parameters
         ----------
@@ -169,17 +183,19 @@ class SensorExpression:
             self.t_s if t_s is None else t_s,
             **dict(zip(self.inputs, values, strict=True)),
         )
-        numbers = self.sensor.expression(at, **named)
+        reading = self.sensor.expression(at, **named)
         column = (
-            ca.vertcat(*numbers)
-            if isinstance(numbers, list | tuple)
-            else numbers
+            ca.vertcat(*reading)
+            if isinstance(reading, list | tuple)
+            else reading
         )
         return np.ravel(ca.evalf(ca.SX(column)).full(), order="F")
 
     @cached_property
     def automatic(self) -> ca.Function:
-        """Function of u and weights: y, ∂y/∂u and ∂²(wᵀy)/∂u², from the expression in SX."""
+        """Function of u and weights w: y, ∂y/∂u and ∂²(wᵀy)/∂u², from the expression in SX at the
+        time `t_s`.
+        """
         symbols = [
             ca.SX.sym(name, *each.shape) for name, each in self.inputs.items()
         ]
@@ -196,7 +212,9 @@ class SensorExpression:
 def _check_derivatives(
     check: PropertyCheck, expression: SensorExpression, u: Array, where: str
 ) -> None:
-    """Compare value and derivatives of the expression in SX with the one called with numbers."""
+    """Compare value and derivatives of the expression in SX at u with the expression called with
+    numbers and its central differences.
+    """
     plain = expression.evaluate_plain(u)
     weights = check.rng.standard_normal(len(plain))
     y, jacobian, hessian = (
@@ -210,21 +228,23 @@ def _check_derivatives(
     check.require_derivative(
         expression.evaluate_plain,
         jacobian,
-        u,
+        point=u,
         statement=f"the first derivative of the expression is wrong {where}",
         scale=expression.scale,
     )
     check.require_derivative(
         lambda at: weights @ expression.automatic.call([at, weights])[1].full(),
         hessian,
-        u,
+        point=u,
         statement=f"the second derivative of the expression is wrong {where}",
         scale=expression.scale,
     )
 
 
 def _small_program(sensor: Gauge) -> Collocation:
-    """Return the program of a small recording with a sensor, whose body contains its points."""
+    """Return the program of a small recording with the sensor, whose body is a box that contains
+    the sensor's points with a margin; a sensor on a grasp is on that of the box.
+    """
     points = np.asarray(sensor.points_m).reshape(-1, 3)
     low = (
         points.min(axis=0, initial=0.0)
@@ -245,7 +265,10 @@ def _small_program(sensor: Gauge) -> Collocation:
 def _check_prediction(
     check: PropertyCheck, expression: SensorExpression, collocation: Collocation
 ) -> None:
-    """Require the expression's value for a motion that is affine in space and quadratic in time."""
+    """Require that the predicted numbers are the expression's value at exact positions, velocities
+    and accelerations, for a motion that is affine in space and quadratic in time, with random
+    unknowns.
+    """
     transcription = collocation.transcriptions[0]
     rates = [
         scale * check.rng.standard_normal((3, 3)) for scale in (0.05, 1.0, 20.0)
@@ -253,7 +276,9 @@ def _check_prediction(
     identity = np.eye(3)
 
     def gradient_at(t: float) -> list[Array]:
-        """Return the matrix of the motion, its velocity and its acceleration at a time."""
+        """Return the matrix (3, 3) of the motion x = A(t) X at a time [s], with its first and
+        second derivative by time.
+        """
         zero, one, two = rates
         return [
             identity + zero + one * t + two * t**2,
@@ -295,7 +320,18 @@ def _check_round_trips(
     file: str | Path | None,
     function: str | None,
 ) -> None:
-    """Require the same readings after pickling and from a problem file."""
+    """Require the same numbers at one random state after pickling and, unless `file` is None, from
+    a problem file that names the expression in this Python file.
+
+    Parameters
+    ----------
+    check : PropertyCheck
+    sensor : Gauge
+    file : str, Path or None
+        Python file with the expression.
+    function : str or None
+        Name of the function in the file; None means the ``__name__`` of the expression.
+    """
     u = SensorExpression(sensor).random_state(check.rng)
 
     def evaluate(each: Gauge) -> Array:

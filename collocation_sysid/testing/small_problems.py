@@ -30,7 +30,8 @@ STEPS = 6
 
 
 def uneven_box(divisions: int) -> TetMesh:
-    """Return the mesh of a box [m] of which no two elements are alike.
+    """Return the mesh of a box of about 0.10 × 0.12 × 0.09 m with randomly displaced nodes, so that
+    no two elements are alike; every call gives the same mesh.
 
     Parameters
     ----------
@@ -50,25 +51,32 @@ def smooth_poses(
     turn_rad: Sequence[float] = (0.2, -0.15, 0.3),
     angular_frequency_rad_s: float = 20.0,
 ) -> PoseSequence:
-    """Return a motion that starts at rest from the identity, sampled from its formula.
+    """Return a periodic motion that starts at rest from the identity, sampled from its formula.
+
+    Translation and rotation vector are (1 − cos ωt) times `sway_m` and `turn_rad`.
 
     Parameters
     ----------
     t_s : (T,) array
-        Times.
+        Times [s].
     sway_m, turn_rad : three floats
-        Half the largest translation and rotation vector.
+        Half the largest translation [m] and rotation vector [rad].
     angular_frequency_rad_s : float
+        ω [rad/s].
     """
     share = 1 - np.cos(angular_frequency_rad_s * t_s)
-    turns = Rotation.from_rotvec(np.outer(share, turn_rad))
-    return PoseSequence(t_s, np.outer(share, sway_m), turns.as_quat())
+    rotations = Rotation.from_rotvec(np.outer(share, turn_rad))
+    positions_m = np.outer(share, sway_m)
+    return PoseSequence(t_s, positions_m, quaternions_xyzw=rotations.as_quat())
 
 
 def usual_constants(
     constants: Sequence[Constant], values: Mapping[str, float] | None
 ) -> dict[str, float]:
-    """Return values of constants: those stated, else those of a soft foam, else 1.
+    """Return values of constants by name, in their order: those stated, else those of a soft foam,
+    else 1.
+
+    Stated values of other names are ignored.
 
     Parameters
     ----------
@@ -76,15 +84,17 @@ def usual_constants(
     values : mapping of name to value, optional
         Stated values.
     """
-    stated = dict(values or {})
+    known = dict(values or {})
     return {
-        c.name: float(stated.get(c.name, _usual_constant(c.name)))
+        c.name: float(known.get(c.name, _usual_constant(c.name)))
         for c in constants
     }
 
 
 def _usual_constant(name: str) -> float:
-    """Return a value of a constant at which all terms of its law count."""
+    """Return a value of a constant at which all terms of its law count: that of a soft foam, 1 if
+    unknown, and `SMALL_MODULUS_PA` for a modulus that is zero in a soft foam.
+    """
     value = usual_value(name, YOUNG_PA, poisson=POISSON)
     if value is None:
         return 1.0
@@ -92,9 +102,12 @@ def _usual_constant(name: str) -> float:
 
 
 def highest_nodes(points_m: Array) -> Index:
-    """Return the indices of the nodes in the upper third of a body."""
-    low, high = points_m[:, 2].min(), points_m[:, 2].max()
-    return np.flatnonzero(points_m[:, 2] > high - (high - low) / 3)
+    """Return the indices of the nodes in the upper third of the height (z) of a body with nodes (n,
+    3) [m].
+    """
+    heights_m = points_m[:, 2]
+    third_m = np.ptp(heights_m) / 3
+    return np.flatnonzero(heights_m > heights_m.max() - third_m)
 
 
 def swung_experiment(body: Body, **changes: Any) -> Experiment:
@@ -105,6 +118,11 @@ def swung_experiment(body: Body, **changes: Any) -> Experiment:
     body : Body
     changes : Any
         Arguments of `Experiment` that replace those of this one.
+
+    Notes
+    -----
+    There are no nuisance parameters and no air. The markers are on up to four nodes; their tracks
+    are constant, at the undeformed positions, not those of the motion.
     """
     t_s: Array = TIMESTEP_S * np.arange(STEPS + 1, dtype=np.float64)
     points_m = body.nodes_m[:: max(1, len(body.nodes_m) // 4)][:4]
@@ -112,7 +130,9 @@ def swung_experiment(body: Body, **changes: Any) -> Experiment:
     names = [f"m{k}" for k in range(len(points_m))]
     arguments: dict[str, Any] = {
         "grasps": [Grasp(highest_nodes(body.nodes_m), smooth_poses(t_s))],
-        "markers": Markers(t_s, tracks, 1e-2, names, points_m),
+        "markers": Markers(
+            t_s, tracks, sigma_m=1e-2, names=names, places_m=points_m
+        ),
         "nuisance": Nuisance.none(),
         "air_density_kg_m3": "none",
         "name": "check",
@@ -130,6 +150,10 @@ def program_of(
     experiment : Experiment
     values : mapping of name to float
         Guesses; constants without one have the values of a soft foam.
+
+    Notes
+    -----
+    A constant whose value is zero is fixed instead, because it has no scale.
     """
     constants = usual_constants(
         tuple(experiment.body.constants.values()), values
@@ -148,11 +172,15 @@ def _unknown(value: float) -> Unknown | float:
 def shaken_variables(
     collocation: Collocation, rng: np.random.Generator
 ) -> Array:
-    """Return variables z that satisfy no equation: rigid motions and parameters with noise.
+    """Return variables z of a program that satisfy no equation: rigid motions, parameters and
+    lifted variables with random errors.
+
+    Lags of sensors are positive. The collocation is not modified.
 
     Parameters
     ----------
     collocation : Collocation
+        Program, with or without lifted variables.
     rng : numpy.random.Generator
     """
     positions = []

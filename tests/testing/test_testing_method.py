@@ -74,6 +74,23 @@ def meddling(collocation, watch=None, start=None):
     return solution
 
 
+def with_history(solution, history, watch):
+    for line in history if watch is not None else ():
+        watch(line)
+    return replace(solution, history=type(solution.history)(history))
+
+
+def ascending(collocation, watch=None, start=None):
+    solution = REDUCED(collocation, None, start)
+    return with_history(solution, solution.history[::-1], watch)
+
+
+def partial(collocation, watch=None, start=None):
+    solution = REDUCED(collocation, None, start)
+    lines = [replace(line, share=0.5) for line in solution.history]
+    return with_history(solution, lines, watch)
+
+
 @pytest.mark.parametrize(
     ("method", "sentence"),
     [
@@ -96,6 +113,14 @@ def meddling(collocation, watch=None, start=None):
         (
             forgetful,
             "it does not converge from its own answer; found iteration-limit",
+        ),
+        (
+            ascending,
+            "the loss of the last line of the history is above that of the first",
+        ),
+        (
+            partial,
+            "no line of the history is about the complete recording; found 0.5",
         ),
         (
             meddling,

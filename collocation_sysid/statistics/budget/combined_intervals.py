@@ -30,7 +30,7 @@ class CombinedEstimate:
     Attributes
     ----------
     value : float
-        The estimate, corrected for the known discretisation error.
+        The estimate, corrected for the known discretisation error and effects of known size.
     statistical_std_error : float or None
         Standard error due to noise and nuisance parameters; None if it has none.
     statistical95 : (lower, upper) or None
@@ -40,7 +40,8 @@ class CombinedEstimate:
     combined95 : (lower, upper) or None
         95 % interval due to all contributions; None if unknown.
     known_correction : float or None
-        Part of `value` that corrects for known effects; None if there are none.
+        Part of `value` that corrects for effects of known size, before bounds are applied; None if
+        there are none. The correction of the discretisation error is not contained.
     """
 
     value: float
@@ -86,6 +87,12 @@ def combine(
     Returns
     -------
     CombinedEstimate
+        Without a statistical interval of `estimate` there is no combined one.
+
+    Notes
+    -----
+    The coordinate is linear as well if the estimate or an end of an interval is not positive, see
+    `IntervalCoordinate.for_estimate`. Intervals are shifted with the value.
     """
     if estimate.at_bound:
         return CombinedEstimate(estimate.value, None, statistical95=None)
@@ -94,7 +101,9 @@ def combine(
     corrections = (
         () if error is None else (error.extrapolated, *(error.interval95 or ()))
     )
-    at = IntervalCoordinate.for_estimate(name, (*known, *corrections), linear)
+    at = IntervalCoordinate.for_estimate(
+        name, (*known, *corrections), linear=linear
+    )
     optimum = at.from_value(estimate.value)
     centre = optimum if error is None else at.from_value(error.extrapolated)
     centre += known_effect
@@ -169,7 +178,7 @@ def widened_interval(
 
 
 def _clip(bounds: Interval, value: float) -> float:
-    """Return a value clipped to bounds."""
+    """Return a value clipped to bounds (lower, upper), which may be infinite."""
     low, high = bounds
     return float(min(max(value, low), high))
 
@@ -177,5 +186,7 @@ def _clip(bounds: Interval, value: float) -> float:
 def _interval(
     at: IntervalCoordinate, low: float, high: float, bounds: Interval
 ) -> Interval:
-    """Return the interval between two coordinates as values, clipped to bounds."""
+    """Return the interval between two coordinates, `low` and `high`, as values clipped to
+    bounds.
+    """
     return _clip(bounds, at.to_value(low)), _clip(bounds, at.to_value(high))

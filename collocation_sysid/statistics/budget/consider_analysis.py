@@ -55,8 +55,8 @@ class _EffectColumns(SweepColumns):
         Changes of the equations of motion [N].
     """
 
-    forces_n: Array = field(default_factory=lambda: np.zeros(0))  # (N, 3n, c)
-    rows_n: Array = field(default_factory=lambda: np.zeros(0))  # (N, 3n, c)
+    forces_n: Array = field(kw_only=True)
+    rows_n: Array = field(kw_only=True)
 
     def right_hand_sides(
         self,
@@ -66,10 +66,11 @@ class _EffectColumns(SweepColumns):
         residual: Array | None,
         free: Index,
     ) -> tuple[Array, Array]:
-        """Return R (k, free, c) and F_R (k, 3n, c) [N], copies of the stored changes of these rows.
+        """Return R (k, free, c) and F_R (k, 3n, c) [N], copies of the stored changes of the
+        equations and the forces in k rows.
 
-        The arguments are those of `SweepColumns.right_hand_sides`; `at`, `acceleration` and
-        `residual` are not used.
+        `rows` selects the time steps and `free` the dofs of R; the other arguments, those of
+        `SweepColumns.right_hand_sides`, are not used.
         """
         return self.rows_n[rows][:, free].copy(), self.forces_n[rows].copy()
 
@@ -89,8 +90,8 @@ class ResidualChanges(NamedTuple):
     blocks: list[Array]
 
     def without(self, assumptions: Iterable[str]) -> ResidualChanges:
-        """Return the changes without the assumptions of these names, each with all its
-        components.
+        """Return the changes without the assumptions of these names (without component), each with
+        all its components; names that do not occur are ignored.
         """
         excluded = set(assumptions)
         remaining = [
@@ -119,6 +120,12 @@ def changes_of_assumptions(
     deviations : mapping of str to float or None
         Standard deviations of assumptions and nuisance parameters by name, in place of those of the
         tables; None for what is exact.
+
+    Notes
+    -----
+    Assumptions without an entry have the deviation of their table; those that are None there are
+    left out. The entry for `CORRELATION_KEY` is the correlation length of the surface's error, by
+    default `CORRELATION`. Columns of `ASSUMPTIONS` come first, then those of nuisance parameters.
     """
     rows = [(row, deviations.get(row.name, row.sigma)) for row in ASSUMPTIONS]
     assumptions = [(row, s) for row, s in rows if s is not None]
@@ -145,10 +152,19 @@ def changes_of_nuisances(
         Variables at the answer.
     deviations : mapping
         Standard deviation by the name of the nuisance parameter; None for an exact one. For those
-        not given the standard deviation of the kind is used.
+        without an entry the standard deviation of the kind is used, if it has one.
+
+    Returns
+    -------
+    ResidualChanges
+        One column for each value of these parameters in each experiment, zero in the blocks of
+        other experiments, with the name of the kind. Huber's weights are not applied.
     """
 
     def with_added_nuisances(experiment: Experiment) -> Experiment:
+        """Return the experiment in which the parameters that are not estimated are
+        estimated too.
+        """
         nuisance = experiment.nuisance
         sigmas = {
             row: deviations.get(row.name, row.considered) for row in KINDS
@@ -219,6 +235,11 @@ def changed_residuals(
         Assumptions with their standard deviations, in the unit of each.
     surface_correlation : float
         Correlation length of the surface's error over the longest extent of the body.
+
+    Returns
+    -------
+    ResidualChanges
+        Not multiplied by Huber's weights.
     """
     names = tuple(name for row, _ in assumptions for name in row.components)
     changes: list[Array] = []
@@ -246,7 +267,7 @@ def changed_residuals(
 def _changes_by_effects(
     fitted: ExperimentAtAnswer, effects: Sequence[tuple[Effect | None, float]]
 ) -> Iterator[Array]:
-    """Yield the changes (T, M, 3, a) of the residuals of each measurement by a effects.
+    """Yield the changes (T, M, 3, a) of the residuals of each measurement by a effects, in σ.
 
     Parameters
     ----------
@@ -287,15 +308,38 @@ def _changes_by_effects(
         count,
         has_parameters=False,
         prescribed=PrescribedColumns.from_columns(
-            solver, prescribed.dofs, displacements_m
+            solver, prescribed.dofs, columns=displacements_m
         ),
         forces_n=forces,
         rows_n=rows,
     )
-    for reading, _, observation, by in propagate_columns(
+    for response in propagate_columns(
         part, solver, columns=columns, inertia_n=rows[:, segment.sensed_dofs]
     ):
-        yield reading.residual_changes(observation, by, part.phi)
+        yield response.reading.residual_changes(
+            response.values, response.changes, phi=part.phi
+        )
+
+
+class ColumnResponse(NamedTuple):
+    """Response of one measurement to columns of a forward substitution.
+
+    Attributes
+    ----------
+    reading : MeasurementResidual
+        Measurement model.
+    motion : ObservedMotion
+        Its motion with the changes by the columns.
+    values : array
+        Values of its observable at its samples.
+    changes : array
+        Changes of `values` by the c columns, with the columns as last axis.
+    """
+
+    reading: MeasurementResidual
+    motion: ObservedMotion
+    values: Array
+    changes: Array
 
 
 def propagate_columns(
@@ -303,11 +347,9 @@ def propagate_columns(
     solver: Sweep,
     columns: SweepColumns,
     inertia_n: Array | float = 0.0,
-) -> Iterator[tuple[MeasurementResidual, ObservedMotion, Array, Array]]:
-    """Propagate columns of a forward substitution to the observables.
-
-    Yields, for each measurement: the measurement model, its motion, the values of its observable,
-    and their changes by the columns.
+) -> Iterator[ColumnResponse]:
+    """Propagate columns of a forward substitution to the observables; yield one response for each
+    measurement of the experiment, in their order.
 
     Parameters
     ----------
@@ -324,7 +366,9 @@ def propagate_columns(
     segment = iterate.segment
     x = iterate.x
     phi = iterate.phi
-    sensed = GraspForces.zeros(len(x), len(segment.sensed_dofs), columns.count)
+    sensed = GraspForces.zeros(
+        len(x), len(segment.sensed_dofs), columns=columns.count
+    )
     response = iterate.observation.response_of_rows(
         ForwardSubstitution(solver, columns, grasp_forces=sensed).iterate_rows(
             x
@@ -341,15 +385,23 @@ def propagate_columns(
         values, slopes = reading.observable.linearise(
             motion, phi, columns_numbered, size
         )
-        yield reading, motion, values, slopes.by_common[..., : columns.count]
+        yield ColumnResponse(
+            reading,
+            motion,
+            values=values,
+            changes=slopes.by_common[..., : columns.count],
+        )
 
 
 def _without_row_changes(
     motion: ObservedMotion, inertia_n: Array | float
 ) -> ObservedMotion:
-    """Return the motion with `inertia_n` subtracted from the changes of its reaction forces."""
+    """Return the motion with `inertia_n` (N, g, c) [N], or a number, subtracted from the changes of
+    its reaction forces when these are evaluated; `motion` is not modified.
+    """
 
     def forced() -> ReactionForces:
+        """Return the reaction forces of the motion with changed derivatives by the columns."""
         lacking = motion.reactions
         assert lacking.reaction_by is not None  # along columns
         return replace(lacking, reaction_by=lacking.reaction_by - inertia_n)

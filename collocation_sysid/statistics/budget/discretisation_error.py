@@ -76,7 +76,9 @@ class DiscretisationError:
 
 
 def known_kinds(errors: Iterable[DiscretisationError]) -> tuple[str, ...]:
-    """Return which discretisation errors are known for some estimate: "step", "mesh"."""
+    """Return which discretisation errors are known for at least one estimate: "step", "mesh", both
+    in this order, or none.
+    """
     known = tuple(errors)
     of_step = any(error.step is not None for error in known)
     of_mesh = any(error.mesh is not None for error in known)
@@ -129,8 +131,8 @@ class Refinement:
 
     @property
     def contributions(self) -> tuple[str, ...]:
-        """Contributions that its intervals contain: "noise", and of "step" and "mesh" what
-        is known.
+        """Contributions that its intervals contain: "noise", then "step" and "mesh" if they are
+        known for at least one estimate.
         """
         return ("noise", *known_kinds(self.errors.values()))
 
@@ -149,6 +151,13 @@ class Refinement:
         std_errors : mapping of str to float or None, optional
             Standard errors to compare with; the statistical ones of `estimates` by default.
             Estimates without one are left out.
+
+        Returns
+        -------
+        (str, float)
+            Name, and the absolute correction over the standard error. Of equal ratios the first in
+            `errors` counts. An error whose name is missing in `std_errors`, or has None or 0 there,
+            is left out.
         """
         if std_errors is None:
             std_errors = {
@@ -177,6 +186,11 @@ class Refinement:
             Estimates before the correction.
         order : float
             Order of the scheme.
+
+        Notes
+        -----
+        Small means at most `LITTLE` statistical standard errors. Without a correction the number is
+        1.
         """
         many = self.largest_correction(estimates)[1]
         return max(1, ceil(min((many / LITTLE) ** (1 / order), MOST_SUBSTEPS)))
@@ -232,11 +246,11 @@ class _Extrapolation:
             remaining = last / (2**order - 1)
             slow_remaining = last / (2**least - 1) - remaining
             sides = sorted((-2 * remaining, slow_remaining))
-            return cls(last + remaining, -sides[0], sides[1])
+            return cls(last + remaining, -sides[0], above=sides[1])
         ratio = float(changes[-2] / last) if last else np.inf
         if not ratio > 2**LEAST_ORDER:
             largest = float(np.abs(changes).max())
-            return cls(float(changes.sum()), largest, largest)
+            return cls(float(changes.sum()), largest, above=largest)
         # No faster than in theory: a change that vanishes by chance promises nothing.
         observed_order = float(np.log2(ratio))
         remaining = last / (2 ** min(observed_order, order) - 1)
@@ -244,8 +258,8 @@ class _Extrapolation:
         return cls(
             float(changes.sum()) + remaining,
             uncertainty,
-            uncertainty,
-            observed_order,
+            above=uncertainty,
+            order=observed_order,
         )
 
 
@@ -271,6 +285,12 @@ def discretisation_error(
         Order of the scheme.
     linear : bool
         Whether the parameter is its own coordinate.
+
+    Notes
+    -----
+    The order of the mesh is `MESH_ORDER`. All values are compared in one coordinate, which is
+    linear if any of them is not positive. `step` and `mesh` of the result are the changes of the
+    value itself with the first halving.
     """
     known = (
         estimate.value,
@@ -278,13 +298,13 @@ def discretisation_error(
         *by_step,
         *by_mesh,
     )
-    at = IntervalCoordinate.for_estimate(name, known, linear)
+    at = IntervalCoordinate.for_estimate(name, known, linear=linear)
     x = at.from_value(estimate.value)
     step = _Extrapolation.from_values(
-        [x, *map(at.from_value, by_step)], step_order, step_order / 2
+        [x, *map(at.from_value, by_step)], step_order, least=step_order / 2
     )
     mesh = _Extrapolation.from_values(
-        [x, *map(at.from_value, by_mesh)], MESH_ORDER, LEAST_ORDER
+        [x, *map(at.from_value, by_mesh)], MESH_ORDER, least=LEAST_ORDER
     )
     limit = x + step.change + mesh.change
     interval = None
@@ -344,14 +364,15 @@ def discretisation_errors(
 def change_in_observations(
     fit: LinearisedFit, residual_changes: Sequence[Array]
 ) -> Array:
-    """Return the change (p,) of the parameters, to first order, if the residuals change.
+    """Return the change (p,) of all parameters, to first order, if the residuals change; parameters
+    at a bound do not change.
 
     Parameters
     ----------
     fit : LinearisedFit
         The fit.
     residual_changes : sequence of (T, M, 3) arrays
-        Changes of the residuals of each block, in units of σ.
+        Changes of the residuals of each block, in units of σ, without Huber's weights.
     """
     return estimate_changes(
         fit, [each[..., None] for each in residual_changes]
@@ -368,7 +389,7 @@ def estimate_changes(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
         The fit.
     changes : sequence of (T, M, 3, a) arrays
         Changes of the residuals of each block, in units of σ; where nothing is measured they are
-        ignored.
+        ignored. Huber's weights are applied here.
     """
     free = np.flatnonzero(~fit.at_bound)
     count = changes[0].shape[-1] if changes else 0

@@ -76,6 +76,11 @@ def surface_modes(
         Nodes of the mesh near which the surface is known, such as contact areas.
     correlation : float
         Correlation length over the longest extent.
+
+    Notes
+    -----
+    Near `known` nodes they vanish. There are `SURFACE_MODES` modes; if the surface has fewer nodes,
+    the others are zero.
     """
     corners = ElementNodes.corners(body.mesh)
     area_m2, normals = surface_shares(corners)
@@ -102,11 +107,24 @@ def surface_modes(
 def _correlation_modes(
     points_m: Array, weights: Array, length_m: float
 ) -> Array:
-    """Return the strongest modes (n, SURFACE_MODES or fewer) of a random field with unit variance
-    and correlation length `length_m` at points (n, 3), scaled by their standard deviations.
+    """Return the strongest modes of a random field with unit variance and Gaussian correlation,
+    scaled by their standard deviations.
 
-    `weights` (n,) are the areas of the points. Of more than `MOST_NODES` points a random subset
-    determines the modes.
+    Of more than `MOST_NODES` points a random subset, the same in every call, determines the modes.
+
+    Parameters
+    ----------
+    points_m : (n, 3) array
+        Points [m].
+    weights : (n,) array
+        Areas of the points, of which the shares count.
+    length_m : float
+        Correlation length [m].
+
+    Returns
+    -------
+    (n, m) array
+        `SURFACE_MODES` modes, or n if that is less, the strongest first.
     """
     count = min(len(points_m), MOST_NODES)
     chosen = np.sort(
@@ -114,6 +132,7 @@ def _correlation_modes(
     )
 
     def covariance(a: Array, b: Array) -> Array:
+        """Return the covariances (k, l) of the field between points a (k, 3) and b (l, 3)."""
         squares = np.sum((a[:, None] - b[None]) ** 2, axis=2)
         return np.asarray(np.exp(-0.5 * squares / length_m**2))
 
@@ -130,8 +149,10 @@ def _correlation_modes(
 def _harmonic_extension(
     nodes: ElementNodes, surface: Index, values: Array
 ) -> Array:
-    """Return values (n, m) at the corners with those inside the surface (indices of nodes) replaced
+    """Return a copy of values (n, m) at the corners in which those inside the surface are replaced
     by the solution of Laplace's equation on the mesh graph.
+
+    `surface` has the indices of the nodes whose values remain.
     """
     count = len(nodes.points_m)
     extended = values.copy()
@@ -167,10 +188,10 @@ def _extend_to_all_nodes(body: Body, corner_fields: Array) -> Array:
 
 
 def standing_nodes(body: Body, gravity_m_s2: Array) -> Index:
-    """Return the indices of the lowest nodes of the undeformed body, on which it stands if nothing
-    grips it.
+    """Return the indices of the lowest nodes of the undeformed body, up to `STANDING` of its
+    height, on which it stands if nothing grips it.
 
-    Down is the direction of gravity (3,); that of −z if there is no gravity.
+    Down is the direction of gravity (3,) [m/s²]; that of −z if there is no gravity.
     """
     points_m = body.nodes.points_m
     length = float(np.linalg.norm(gravity_m_s2))
@@ -203,6 +224,11 @@ def sag_m(body: Body, theta: Array, support_dofs: Index, axis: int) -> Array:
         Dofs that were supported.
     axis : int
         Index of the axis along which gravity acted.
+
+    Notes
+    -----
+    Gravity of 9.81 m/s² acts towards positive coordinates of the axis; the other sign gives the
+    opposite difference. Air is ignored.
     """
     own = body.nodes.points_m.size
     x = np.asarray(body.nodes_m, dtype=float)

@@ -30,7 +30,7 @@ class FirstContact:
     Attributes
     ----------
     row : int
-        Index of the row in the grid.
+        Index of the row in the grid, from 0.
     place_m : (3,) array
         Mean of the points in contact, weighted by their pressure, in the row before [m].
     normal : (3,) array
@@ -45,6 +45,9 @@ class FirstContact:
     def from_motion(cls, contact: Contact, x: Array) -> FirstContact:
         """Return the first contact in a motion x (N, 3n) [m], or the nearest approach if there is
         none.
+
+        Contact begins where a gap is less than the width of the contact law. Without pressure in
+        that row, the point with the smallest gap counts.
         """
         law = contact.law_of_contact
         nearest_m = np.inf
@@ -84,7 +87,9 @@ class FirstContact:
             + contact.points.vectors(x[before : before + 1])[:3, 0] @ weights
         )
         return cls(
-            row, place_m, normal / max(float(np.linalg.norm(normal)), 1e-9)
+            row,
+            place_m,
+            normal=normal / max(float(np.linalg.norm(normal)), 1e-9),
         )
 
 
@@ -96,6 +101,11 @@ def obstacle_shifts_m(
     The body scales about the middle of its grasps. Along axes that no grasp prescribes, it scales
     about the place of its first contact; if several obstacles touch it at the same time, about that
     of the one that moves least.
+
+    Notes
+    -----
+    Nothing is yielded without obstacles. The shift is along the obstacle's normal at first contact,
+    moves with the rotation of the obstacle, and is in world axes at the N grid times.
     """
     experiment = iterate.segment.experiment
     forces = iterate.equations.dynamics.forces

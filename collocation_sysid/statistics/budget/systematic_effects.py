@@ -126,30 +126,30 @@ class ExperimentAtAnswer:
 
     @property
     def gravity(self) -> Array:
-        """Gravity at each dof (3n,) [m/s²]."""
+        """Acceleration of gravity at each dof (3n,) [m/s²], at the answer."""
         return self.dynamics.forces.weight.gravity
 
     @cached_property
     def own_mass_kg(self) -> Array:
-        """Masses (3n,) of the body without point masses [kg]."""
+        """Masses (3n,) of the dofs of the body at the answer, without point masses and air [kg]."""
         return self.body.mass_of_dofs(self.theta)
 
     @cached_property
     def acceleration(self) -> Array:
-        """Accelerations (N, 3n) of the rows [m/s²]."""
+        """Accelerations (N, 3n) that the scheme assigns to the rows [m/s²]."""
         return self.dynamics.acceleration(self.iterate.x)
 
     @cached_property
     def states(self) -> tuple[Array, Array]:
-        """States ξ [m] and velocities ν [m/s] at the evaluations, (N, 3n) each; zero before the
-        first evaluation.
+        """States ξ [m] and velocities ν [m/s] at the evaluations of the forces, (N, 3n) each,
+        padded by zeros before the first evaluation.
         """
         xi, nu = self.dynamics.evaluation_states(self.iterate.x)
         return self.pad_rows(xi), self.pad_rows(nu)
 
     def pad_rows(self, evaluated: Array) -> Array:
-        """Return values (N, 3n) of all rows from those of the evaluations, zero before the
-        first.
+        """Return values (N, 3n) of all rows from those of the evaluations (N − first row, 3n), zero
+        before the first; a new array.
         """
         return np.concatenate(
             [np.zeros((self.dynamics.first_row, evaluated.shape[1])), evaluated]
@@ -173,7 +173,12 @@ class ExperimentAtAnswer:
         theta : (k,) array, optional
             Constants of the body; those of the answer by default.
         body : Body, optional
-            Body with another stress-free shape.
+            Body with another stress-free shape; that of the experiment by default.
+
+        Notes
+        -----
+        Damping by γ_r and the memory of the answer's motion are contained; the memory is that at
+        unscaled lengths.
         """
         undamped = (self.theta if theta is None else theta).copy()
         undamped[list(self.body.tied_shares)] = 0.0
@@ -194,14 +199,18 @@ class ExperimentAtAnswer:
 
     @cached_property
     def internal_force_n(self) -> Array:
-        """Forces (N, 3n) of the material at the answer, without γ_m [N]."""
+        """Forces (N, 3n) of the material at the answer with its stress-free shape, without
+        γ_m [N].
+        """
         return self.internal_n(
             body=self.body.with_stress_free(self.stress_free_m)
         )
 
     @cached_property
     def stress_free_m(self) -> Array:
-        """Stress-free positions (n, 3) of the nodes, without nodes of obstacle frames [m]."""
+        """Stress-free positions (n, 3) of the nodes, without nodes of obstacle frames [m]: those of
+        the mesh, or those that follow from a mesh made under gravity.
+        """
         body = self.body
         return (
             body.nodes.points_m
@@ -211,13 +220,16 @@ class ExperimentAtAnswer:
 
     @cached_property
     def _rest_shape(self) -> RestShape:
-        """Stress-free shape that follows from a mesh made under gravity."""
+        """Stress-free shape that follows from a mesh made under gravity; only for a body with such
+        a mesh.
+        """
         assert self.body.inverse_equilibrium is not None
         return self.body.inverse_equilibrium.solve(self.theta)
 
     def force_change_by_reference(self, moved_m: Array) -> Array:
         """Return the first-order change (N, 3n) [N] of the material's forces if the stress-free
-        positions change by `moved_m` (n, 3) [m].
+        positions change by `moved_m` (n, 3) [m], by a difference; zero if nothing moves. Rows of
+        obstacle frames are ignored.
         """
         largest = float(np.abs(moved_m).max(initial=0.0))
         if not largest:
@@ -228,8 +240,8 @@ class ExperimentAtAnswer:
         return (self.internal_n(body=other) - self.internal_force_n) / step
 
     def force_change_by_scan_weight(self) -> Array:
-        """Return the change (N, 3n) of forces per relative change of the weight during the
-        scan; zero unless the mesh was made under gravity.
+        """Return the change (N, 3n) [N] of the material's forces per relative change of the weight
+        during the scan; zero unless the mesh was made under gravity.
         """
         if self.body.inverse_equilibrium is None:
             return np.zeros_like(self.iterate.x)
@@ -258,8 +270,9 @@ class ExperimentAtAnswer:
 
     @cached_property
     def likely_support_dofs(self) -> Index:
-        """Dofs that were probably supported while the mesh was made: those prescribed in the
-        recording or, if these leave rigid motions, those of the lowest nodes.
+        """Dofs (k,) that were probably supported while the mesh was made: those prescribed in the
+        recording, without obstacles, or, if these leave rigid motions, all three of each of the
+        lowest nodes.
         """
         prescribed = self.iterate.equations.prescribed.dofs
         own = prescribed[prescribed < self.body.nodes.points_m.size]
@@ -271,8 +284,8 @@ class ExperimentAtAnswer:
         return own
 
     def weight_and_drag(self, mass_kg: Array) -> Array:
-        """Return the weight and the mass-proportional damping (N, 3n) [N] of masses (3n,) or (N,
-        3n) [kg].
+        """Return the weight and the mass-proportional damping −γ_m m v at the evaluations (N, 3n)
+        [N] of masses (3n,) or (N, 3n) [kg], without air.
         """
         return mass_kg * (
             self.gravity
@@ -302,7 +315,9 @@ class ExperimentAtAnswer:
 
     @cached_property
     def grasp_force_n(self) -> Array:
-        """Reaction forces (N, g) on the grasped dofs [N]; zero while they are not prescribed."""
+        """Reaction forces (N, g) of the grasps on the g prescribed dofs of the body [N]; zero while
+        they are not prescribed.
+        """
         dofs = self.iterate.equations.prescribed.dofs
         x = self.iterate.x
         force = forces_on_dofs(self.dynamics, x, dofs=dofs)
@@ -321,7 +336,9 @@ class ExperimentAtAnswer:
 
     @cached_property
     def contacts(self) -> dict[int, Contact]:
-        """Contact forces with an energy, by their index in `Forces.external_terms`."""
+        """Contact forces with an energy (without complementarity), by their index in
+        `Forces.external_terms`; empty without obstacles.
+        """
         further = enumerate(self.dynamics.forces.external_terms)
         return {
             k: each
@@ -356,7 +373,7 @@ class ExperimentAtAnswer:
 
     @cached_property
     def young_pa(self) -> float:
-        """Young's modulus of the softest part at small strain [Pa]."""
+        """Young's modulus of the softest part at small strain, at the answer [Pa]."""
         return min(
             engineering_constants(*moduli)[0]
             for moduli in self.body.lame(self.theta).values()
@@ -365,7 +382,7 @@ class ExperimentAtAnswer:
 
 def _dof_mask(dofs: Index, nodes: int) -> NDArray[np.bool_]:
     """Return the mask (n, 3) of the coordinates that are among the dofs (k,), for n = `nodes`
-    nodes.
+    nodes; dof 3 i + axis belongs to node i.
     """
     mask = np.zeros(3 * nodes, dtype=bool)
     mask[dofs] = True
@@ -389,7 +406,7 @@ class Assumption:
         Description.
     effect : callable
         Returns the effect of one unit, from an experiment at the answer and the index of the
-        component; None if there is no effect in this experiment.
+        component, from 0; None if there is no effect in this experiment.
     component_names : str
         Names of components with independent errors, separated by spaces; empty if there is one.
     of_specimens : bool
@@ -406,7 +423,9 @@ class Assumption:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """Names of the components, each after that of the assumption."""
+        """Names of the components, each after that of the assumption and a space; the name alone if
+        there is one component.
+        """
         return tuple(
             f"{self.name} {a}" for a in self.component_names.split()
         ) or (self.name,)
@@ -416,7 +435,8 @@ class Assumption:
 
 
 def _size(at: ExperimentAtAnswer, _: int) -> Effect:
-    """Return the effect of a body that is larger by a share: f = s² f(x/s, v/s).
+    """Return the effect of a body that is larger by a share, per unit of that share: f = s² f(x/s,
+    v/s).
 
     From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths. Goals of grasped nodes scale
     about the middle of the grasps; obstacles keep their size and are moved so that they first touch
@@ -464,7 +484,9 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
 
 
 def _mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Effect of a body that is heavier by a share; None if a density is estimated."""
+    """Return the effect of a body that is heavier by a share, per unit; None if a density is
+    estimated. The weight during a scan under gravity grows with it.
+    """
     if any(part.has_free_density for part in at.body.parts):
         return None
     return Effect(
@@ -474,8 +496,8 @@ def _mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _density_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
-    """Effect of a density that increases along an axis (index) of the body, by a share at one end,
-    and decreases as much towards the other.
+    """Return the effect of a density that increases along an axis (index) of the body, by a share
+    at the end farther from the centre of mass, linearly through zero there.
     """
     place = at.body.nodes_m[:, axis]
     middle = np.average(place, weights=at.own_mass_kg[::3])
@@ -486,8 +508,8 @@ def _density_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
 
 
 def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
-    """Effect of a stiffness that is higher along one axis (index) by a share of E: the energy ½ E
-    e² of the strain e along it.
+    """Return the effect of a stiffness that is higher along one axis (index) by a share of E, the
+    Young's modulus of the softest part: the energy ½ E e² of the strain e along it.
 
     Rayleigh damping K(x) v follows by its time derivative. For specimens e is such that its stress
     at large stretches λ, (λ − 1/λ²) / 3, is a constant share of that of Neo-Hooke's law.
@@ -523,15 +545,17 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
 
 
 def _drift(at: ExperimentAtAnswer, _: int) -> Effect:
-    """Effect of a stiffness that is higher at the end than at the beginning, by a share."""
+    """Return the effect of a stiffness that grows linearly in time, at the end higher by a share
+    than at the beginning, and unchanged at the mean time.
+    """
     t_s = at.dynamics.evaluated_s
     since = (t_s - t_s.mean()) / max(np.ptp(t_s), 1e-300)
     return Effect(at.internal_n() * since[:, None])
 
 
 def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Effect of clocks that are fast by a share, so that less time passes than they show;
-    None for a static experiment.
+    """Return the effect of clocks that are fast by a share, so that less time passes than they
+    show; None for a static experiment.
     """
     if at.iterate.segment.experiment.is_static:
         return None
@@ -549,8 +573,8 @@ def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Effect of a larger Poisson's ratio where it is stated (fixed, or tied to a fixed one); None
-    if there is none.
+    """Return the effect of a larger Poisson's ratio, per unit, where it is stated (fixed, or tied
+    to a fixed one), in all such parts together; None if there is none.
     """
     items = {item.name: item for item in at.parameters.items}
     constants = {
@@ -577,8 +601,8 @@ def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Effect of a compliant layer of the body's own material between body and grippers; None
-    without a gripper.
+    """Return the effect of a compliant layer of the body's own material between body and grippers,
+    per metre of thickness; None without a gripper.
 
     A grasp that prescribes some axes only is a platen or a plane of symmetry, not a gripper.
     """
@@ -609,8 +633,11 @@ def _is_driven(at: ExperimentAtAnswer) -> NDArray[np.bool_]:
 
 
 def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Effect of the compliance of a test bench: displacements are measured behind its frame. None
-    for dynamic experiments, and if no prescribed position changes.
+    """Return the effect of the compliance of a test bench, per m/N: displacements are measured
+    behind its frame.
+
+    Each grasp that is moved along an axis lags behind by its force along it. Specimens are treated
+    by `_machine_of_specimen`.
     """
     experiment = at.iterate.segment.experiment
     prescribed = at.iterate.equations.prescribed
@@ -635,10 +662,7 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
 def _machine_of_specimen(
     at: ExperimentAtAnswer, deformation: HomogeneousDeformation
 ) -> Effect | None:
-    """Effect of the compliance C of a test bench on a homogeneous specimen of area A and length L,
-    whose strain is smaller than the displacement over the length by C A P / L, with its nominal
-    stress P. None if the strain was measured on the specimen.
-    """
+    """Return the effect of the compliance C of a test bench on a homogeneous specimen."""
     if not deformation.area_over_length_m:
         return None
     dofs = at.iterate.equations.prescribed.dofs
@@ -654,8 +678,8 @@ def _machine_of_specimen(
 
 
 def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Effect of friction on nodes that slide along platens, perpendicular to the loading axis; None
-    for a dynamic experiment and without platens.
+    """Return the effect of friction on nodes that slide along platens, perpendicular to the loading
+    axis, per unit of the coefficient; None for a dynamic experiment and without platens.
 
     Friction has the size of the normal force and is opposite to the displacement. Planes of
     symmetry have no normal force in the loading direction, and no friction.
@@ -688,8 +712,8 @@ def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Effect of rigid contact in place of the pressure law, to first order; None without contact
-    that has an energy.
+    """Return the effect of rigid contact in place of the pressure law, to first order; None without
+    contact that has an energy (with complementarity contact is rigid already).
     """
     if not at.contacts:
         return None
@@ -710,8 +734,8 @@ def _buoyancy(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _added_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Effect of more added mass, as a share of that in the model; None in a vacuum and for a static
-    experiment.
+    """Return the effect of more added mass, as a share of that in the model; None in a vacuum and
+    for a static experiment.
     """
     if at.iterate.segment.experiment.is_static or not at.added_mass_kg.any():
         return None
@@ -728,11 +752,21 @@ def _air_drag(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
-    """Effect of replacing the stated damping law by another (its name in `DAMPINGS`) with the same
-    γ_r.
+    """Return the effect of replacing the stated damping law by another with the same γ_r: the
+    difference of the forces along the answer.
 
     Parts with a custom law keep it, and so do parts of linear material, for which all laws agree.
-    None if there is no difference, or the experiment is static.
+
+    Parameters
+    ----------
+    at : ExperimentAtAnswer
+    law : str
+        Name of the other law in `DAMPINGS`.
+
+    Returns
+    -------
+    Effect or None
+        None if no part has another law, no γ_r is above zero, or the experiment is static.
     """
     body = at.body
     names = body.constants.items()
@@ -766,19 +800,22 @@ def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
 
 
 def _objective_damping(at: ExperimentAtAnswer, index: int) -> Effect | None:
-    """Effect of another objective damping law, by its index in `OBJECTIVE_DAMPINGS`."""
+    """Return the effect of another objective damping law, by its index in `OBJECTIVE_DAMPINGS`;
+    None if it is the stated one in all parts, see `_other_damping`.
+    """
     return _other_damping(at, OBJECTIVE_DAMPINGS[index])
 
 
 def _rayleigh_damping(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Effect of Rayleigh damping, which is not objective, instead of the stated law."""
+    """Return the effect of Rayleigh damping, which is not objective, instead of the stated law, see
+    `_other_damping`.
+    """
     return _other_damping(at, "rayleigh")
 
 
 def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
-    """Effect of a mesh that was made under the body's own weight along one of its axes (index).
-
-    None if the problem states the rest shape.
+    """Return the effect of a mesh that was made under the body's own weight along one of its axes
+    (index); None if the problem states the rest shape.
     """
     if at.body.rest_shape is not None:
         return None
@@ -795,8 +832,8 @@ def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
 
 
 def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
-    """Effect of an error of the surface along its normal, by one mode (index) of a smooth random
-    field; grasped nodes move with the surface.
+    """Return the effect of an error of the surface along its normal, by one mode (index from 0) of
+    a smooth random field, in units of the thickness; grasped nodes move with the surface.
     """
     moved_m = at.surface_modes_m[mode]
     prescribed_motion = at.iterate.segment.prescribed_motion
@@ -1152,7 +1189,7 @@ class Assumptions(Options):
 
     @classmethod
     def exact(cls) -> Assumptions:
-        """Return the table with all assumptions exactly true ("none"), as for a simulated
+        """Return a new table with all assumptions exactly true ("none"), as for a simulated
         recording.
         """
         exact: dict[str, Literal["none"]] = dict.fromkeys(
@@ -1162,7 +1199,9 @@ class Assumptions(Options):
 
     @property
     def deviations(self) -> dict[str, float | None]:
-        """Standard deviations by name; None for what is exact."""
+        """Standard deviations by name, of all fields; None for what is exact, the deviation about
+        the mean for a known effect.
+        """
         by_name: dict[str, float | None] = {}
         for name, deviation in vars(self).items():
             known = (

@@ -73,6 +73,11 @@ class BudgetLine:
             Its standard deviation in the coordinate of the estimate.
         coordinate : IntervalCoordinate
             That coordinate.
+
+        Notes
+        -----
+        The source counts as systematic. Bounds are not applied. A source of this name in `shares`
+        is replaced, although its variance remains in the total.
         """
         low, high = map(coordinate.from_value, self.combined95)
         known_variance = ((high - low) / 2 / NORMAL_95) ** 2
@@ -113,7 +118,7 @@ class VarianceSources:
     covariance_known : (nq, nq) array
         Covariance of q for the stated noise, with known nuisance parameters.
     derivatives : mapping of str to (nq,) array
-        Derivatives of each estimate.
+        Derivatives of each estimate by q.
     widening : (nq,) array
         Factor by which intervals are widened because recordings disagree.
     recording_sensitivities : (nq, b) array
@@ -161,6 +166,10 @@ class VarianceSources:
             Statistical uncertainty of the fit.
         means : mapping of str to float, optional
             Known effects over their standard deviations; None if there are none.
+
+        Notes
+        -----
+        Rows and columns of parameters at a bound are zero.
         """
         free = np.flatnonzero(~fit.at_bound)
         shared = free[free < fit.shared_count]
@@ -186,13 +195,13 @@ class VarianceSources:
         return cls(
             assumed.names,
             moved,
-            all_free,
-            known,
-            by_q,
-            wider,
-            between,
-            freedom,
-            known_effects,
+            covariance_free=all_free,
+            covariance_known=known,
+            derivatives=by_q,
+            widening=wider,
+            recording_sensitivities=between,
+            freedom=freedom,
+            means=known_effects,
         )
 
     def noise_shares(self, by_q: Array) -> tuple[float, float]:
@@ -203,7 +212,7 @@ class VarianceSources:
         -------
         (float, float)
             Share that would remain with known nuisance parameters; and share that would remain if
-            recordings agreed. Both are 1 if the variance is 0 or not finite.
+            recordings agreed, 1 if they do. Both are 1 if the variance is 0 or not finite.
         """
         scaled_by_noise = self.widening * by_q
         known, all_free, all_scaled_by_noise = (
@@ -239,6 +248,11 @@ class VarianceSources:
             Variance of all other sources.
         counted : float
             Variance between recordings that is counted already.
+
+        Returns
+        -------
+        float
+            The excess over `counted`, enlarged; 0 if there is none.
         """
         more = max(
             0.0,
@@ -251,7 +265,8 @@ class VarianceSources:
 
     def known_effect(self, by_q: Array) -> float:
         """Return the change of an estimate with the derivative `by_q` (nq,) by all known effects,
-        to first order.
+        to first order; 0 without known effects. Of an assumption with several components each
+        has the effect.
         """
         sizes = [
             self.means.get(name.partition(" ")[0], 0.0) for name in self.names
@@ -289,6 +304,10 @@ def budget(
         Discretisation errors; estimates without an entry have none, or an unknown one.
     parameters : Parameters
         The parameters of the problem, with their coordinates and bounds.
+
+    Notes
+    -----
+    Estimates that do not depend on q, such as fixed ones, are left out.
     """
     lines = {}
     for name, estimate in {
@@ -322,10 +341,16 @@ def _line(
         Name of the estimate.
     estimate : Estimate
     sources : VarianceSources
+        Covariances and sensitivities of the fit.
     error : DiscretisationError or None
         None if the discretisation error is not known.
     parameters : Parameters
         Provides scale and bounds.
+
+    Notes
+    -----
+    Sources without variance have no share. The variance for noise is divided into noise, nuisance
+    parameters and differences between recordings.
     """
     assert estimate.statistical95 is not None
     linear, bounds = parameters.scale_and_bounds(name)
@@ -333,7 +358,7 @@ def _line(
     if error is not None and error.interval95 is not None:
         ends = error.interval95
     at = IntervalCoordinate.for_estimate(
-        name, (estimate.value, *estimate.statistical95, *ends), linear
+        name, (estimate.value, *estimate.statistical95, *ends), linear=linear
     )
     noise = _variance(at, estimate.value, ends=estimate.statistical95)
     middle = estimate.value if error is None else error.extrapolated
@@ -345,7 +370,9 @@ def _line(
     by_coordinate = by_q * at.derivative(estimate.value)
     by_assumption = sources.variances_of_assumptions(by_coordinate)
     others = sum(parts.values()) + sum(by_assumption.values())
-    between = sources.variance_between_recordings(by_coordinate, others, excess)
+    between = sources.variance_between_recordings(
+        by_coordinate, others, counted=excess
+    )
     systematic = float(np.sqrt(sum(by_assumption.values()) + between))
     variances = parts | {BETWEEN: excess + between} | by_assumption
     total = sum(variances.values())
@@ -378,8 +405,18 @@ def _line(
 
 
 def _variance(at: IntervalCoordinate, middle: float, ends: Interval) -> float:
-    """Return the variance, in the coordinate of the interval, of a 95 % interval about a middle
-    value, one end of which may be cut off by a bound: the mean of both sides.
+    """Return the variance of a 95 % interval, in the coordinate of the interval.
+
+    If both sides are equal, half the interval counts as 1.96 standard deviations; else, as where
+    one end is cut off by a bound, it is the mean of the variances of both sides.
+
+    Parameters
+    ----------
+    at : IntervalCoordinate
+    middle : float
+        Value between the ends.
+    ends : (lower, upper)
+        Interval, as values.
     """
     centre = at.from_value(middle)
     low, high = map(at.from_value, ends)
@@ -396,7 +433,7 @@ def _variance(at: IntervalCoordinate, middle: float, ends: Interval) -> float:
 
 
 def _ranked(shares: Mapping[str, float]) -> dict[str, float]:
-    """Sort shares of a variance, the largest first."""
+    """Return a copy of shares of a variance, the largest first; equal shares keep their order."""
     return dict(sorted(shares.items(), key=lambda part: -part[1]))
 
 
@@ -419,8 +456,8 @@ def _estimate_derivatives(
 def main_sources(
     shares: Mapping[str, Mapping[str, float]], minimum_share: float
 ) -> list[str]:
-    """Return the sources with at least a share `minimum_share` in the variance of some estimate,
-    the largest first.
+    """Return the sources whose share in the variance of at least one estimate is `minimum_share` or
+    more, by their largest share, the largest first.
 
     Parameters
     ----------
@@ -441,7 +478,9 @@ def main_sources(
 
 
 def source_label(source: str) -> str:
-    """Return the name of a source as text, without unit suffix."""
+    """Return the name of a source as text for messages: without a unit suffix such as "_rad", and
+    with spaces for underscores.
+    """
     unit = next(
         (
             u

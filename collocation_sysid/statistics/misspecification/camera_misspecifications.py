@@ -70,7 +70,9 @@ class CameraDescription:
 
 
 def _scaled(seeing: CameraDescription, factor: float) -> CameraDescription:
-    """Return the description with the translation of the camera's pose multiplied by a factor."""
+    """Return a copy of the description with the translation of the camera's pose multiplied by a
+    factor.
+    """
     pose = seeing.pose.copy()
     pose[:3, 3] *= factor
     return replace(seeing, pose=pose)
@@ -79,8 +81,8 @@ def _scaled(seeing: CameraDescription, factor: float) -> CameraDescription:
 def _rotated(
     seeing: CameraDescription, rotation: list[list[int]]
 ) -> CameraDescription:
-    """Return the description with the camera's frame rotated by a matrix (3, 3), about its own
-    axes.
+    """Return a copy of the description with the camera's frame rotated by a matrix (3, 3), about
+    its own axes: the rotation of the pose is multiplied by it on the right.
     """
     pose = seeing.pose.copy()
     pose[:3, :3] = pose[:3, :3] @ np.array(rotation, dtype=float)
@@ -95,7 +97,7 @@ def _with_transposed_rotation(seeing: CameraDescription) -> CameraDescription:
 
 
 def _with_factor(seeing: CameraDescription, factor: float) -> CameraDescription:
-    """Return the description with another factor of the points."""
+    """Return a copy of the description with another factor of the points, in place of its own."""
     return replace(seeing, factor=factor)
 
 
@@ -145,10 +147,16 @@ POWERS: dict[str, Undo] = {
 
 
 def require_depth_units(experiment: Experiment) -> None:
-    """Raise InputError if the unit of a depth camera's points is wrong by a power of ten.
+    """Raise `InputError` if the unit of a depth camera's points is wrong by a power of ten.
 
     That is the case if hardly any of the body has points nearby, and most of it would have if all
     distances were a power of ten larger or smaller.
+
+    Notes
+    -----
+    Hardly any is a share below `HARDLY` of the surface facing the camera, most a share of at least
+    `WELL` (`HARDLY` for clouds of few points); factors up to 10 to the power `LARGEST_POWER` are
+    tried.
     """
     for depth in experiment.depths:
         view = _CameraTrial(experiment, depth)
@@ -176,8 +184,11 @@ def require_depth_units(experiment: Experiment) -> None:
 
 
 def camera_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield hypotheses for each depth camera of an experiment that sees hardly anything of the
-    body: one mistake or two that explain it, or none.
+    """Yield one hypothesis for each depth camera of an experiment that sees less than `HARDLY` of
+    the body.
+
+    Its code is "camera/likely", with the mistakes (one, or else two at a time) that explain it in
+    the data, or "camera" if none does. The strength is one over the visible share.
     """
     for depth in experiment.depths:
         view = _CameraTrial(experiment, depth)
@@ -208,6 +219,12 @@ class _CameraTrial:
         Median distances of the points and of the undeformed body from the camera [m].
     collapsed : bool
         Whether too few points are left to be near much of the body.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    depth : Depth
+        Depth camera of the experiment; the first sample with points is used.
     """
 
     declared: CameraDescription
@@ -248,7 +265,8 @@ class _CameraTrial:
 
     def visible_share(self, seeing: CameraDescription) -> float:
         """Return the share, from 0 to 1, of the surface facing the camera that has points of the
-        first image nearby, for a description of the camera; 0 if nothing faces it.
+        first sample with points within `within_m`, for a description of the camera; 0 if nothing
+        faces it. For a camera without a matrix the whole visible surface counts as facing.
         """
         motion = seeing.carrier @ seeing.pose
         turn = motion[:3, :3]
@@ -269,10 +287,11 @@ class _CameraTrial:
 
     def best_corrections(self) -> list[tuple[str, ...]]:
         """Return the combinations of one mistake, or else of two, whose correction makes the body
-        visible, best first.
+        visible, best first, as tuples of keys of `MISTAKES` and `POWERS`.
 
-        All combinations that do nearly as well are returned, because a body that looks alike from
-        two sides does not distinguish them. Empty if none does.
+        All combinations whose share is at least `WELL`, and within `EQUIVALENT_MISFIT` of the best,
+        are returned, because a body that looks alike from two sides does not distinguish them.
+        Empty if none does.
         """
         for count in (1, 2):
             alone = (POWERS,) if count == 1 else ()
@@ -287,8 +306,8 @@ class _CameraTrial:
         return []
 
     def _corrected(self, mistakes: tuple[str, ...]) -> CameraDescription:
-        """Return the stated description with some mistakes, given by name, corrected one after the
-        other.
+        """Return the stated description with some mistakes, keys of `MISTAKES` or `POWERS`,
+        corrected one after the other.
         """
         undo = dict(
             chain.from_iterable(kind.items() for kind in (*MISTAKES, POWERS))

@@ -81,6 +81,10 @@ def find_misspecifications(
     """Return hypotheses of what is described wrongly, likeliest first; empty where the residuals
     are noise.
 
+    Hypotheses about wrenches, signs of loads and specimens are always tested; others only if the
+    markers of an experiment miss by more than `NOISE` σ, for the one with the largest misfit, and
+    refits only if none of these hypotheses is nearly certain (`CERTAIN`).
+
     Parameters
     ----------
     solution : Solution
@@ -158,6 +162,12 @@ def _refit_hypotheses(
     budget : int or None
         Largest number of sweeps for all refits together; None for the default, see
         `find_misspecifications`.
+
+    Notes
+    -----
+    Only the first `MOST_SAMPLES` samples are fitted. Tested are a clock lag (not in a static
+    experiment), a marker that slips, directions of gravity, and grasps one layer deeper or less
+    deep.
     """
     first = first_samples(experiment, MOST_SAMPLES)
     alone = _Refitter(solution, first, sweeps=budget)
@@ -173,7 +183,9 @@ def _refit_hypotheses(
     )
     of = f"'{experiment.name}'"
     lags = (
-        [] if first.is_static else _clock_hypotheses(alone, first, fitted_m, of)
+        []
+        if first.is_static
+        else _clock_hypotheses(alone, first, fitted_m=fitted_m, of=of)
     )
     comparison = ModalComparison.from_experiment(first, solution.parameters)
     turned = (
@@ -183,7 +195,7 @@ def _refit_hypotheses(
         *trial.accepted(
             [
                 *lags,
-                *_slip_hypotheses(first, fitted_m, of),
+                *_slip_hypotheses(first, fitted_m, of=of),
                 *turned,
                 *_grasp_layer_hypotheses(first, of),
             ]
@@ -194,7 +206,9 @@ def _refit_hypotheses(
 def _gravity_hypotheses(
     declared: Experiment, comparison: ModalComparison
 ) -> Iterator[Hypothesis]:
-    """Yield the direction of gravity that suits the natural modes best, as a hypothesis."""
+    """Yield the direction of gravity that suits the natural modes best, as a hypothesis with the
+    experiment `declared` in it as its correction; nothing if there is no other direction.
+    """
     others = gravity_hypotheses(comparison.declared)
     nearest = min(
         others,
@@ -211,8 +225,8 @@ def _gravity_hypotheses(
 def _grasp_layer_hypotheses(
     declared: Experiment, of: str
 ) -> Iterator[Hypothesis]:
-    """Yield hypotheses, about the subject `of`, of grasps one layer of elements deeper or less
-    deep, where that is possible.
+    """Yield hypotheses, about the subject `of`, of all grasps one layer of elements deeper, and one
+    less deep, where that is possible; `corrected` is the changed experiment.
     """
     for deeper, deep in ((True, "deeper"), (False, "less deep")):
         if (layered := _with_shifted_grasps(declared, deeper)) is not None:
@@ -224,9 +238,19 @@ def _grasp_layer_hypotheses(
 def _slip_hypotheses(
     declared: Experiment, fitted_m: Array, of: str
 ) -> Iterator[Hypothesis]:
-    """Yield the hypothesis, about the subject `of`, that the marker whose residuals change most
-    abruptly slipped; `corrected` is the experiment without it. None if no change is abrupt, or too
-    few markers remain.
+    """Yield the hypothesis that the marker whose residuals change most abruptly slipped;
+    `corrected` is the experiment without it.
+
+    Nothing is yielded if two means explain no marker's residuals better than one by the factor
+    `SLIP`, or for a single marker.
+
+    Parameters
+    ----------
+    declared : Experiment
+    fitted_m : (T, M, 3) array
+        Markers of its fit [m].
+    of : str
+        Subject of the hypothesis.
     """
     residual = _residual(declared, fitted_m)
     described = DeclaredMotion.from_experiment(declared)
@@ -272,6 +296,16 @@ def _largest_step(residual: Array) -> tuple[float, int]:
 class _Refitter:
     """Fits of one experiment at a time from the problem's guess, with a limited number of
     sweeps.
+
+    Parameters
+    ----------
+    solution : Solution
+        Fit of the problem.
+    declared : Experiment
+        Experiment as stated; if the problem consists of it alone, its fit is known already.
+    sweeps : int or None
+        Sweeps that are allowed for all fits together; None for `EFFORT` times the work of the fit,
+        at most `BUDGET`.
     """
 
     def __init__(
@@ -290,19 +324,30 @@ class _Refitter:
             self.known[declared] = solution.readings_m[0]
 
     def fit(self, experiment: Experiment) -> Array | None:
-        """Return the fitted markers (T, M, 3) [m]; None if there is no fit. Results are cached."""
+        """Return the fitted markers (T, M, 3) [m] of an experiment; None if there is no fit, or no
+        sweeps are left. Results are cached.
+        """
         if experiment not in self.known:
             self.known[experiment] = self._fit(experiment)
         return self.known[experiment]
 
     def misfit_after_refit(self, experiment: Experiment) -> float | None:
-        """Return the misfit after a refit; None if there is no fit."""
+        """Return the misfit of the markers after a refit, in standard deviations; None if there is
+        no fit.
+        """
         fitted_m = self.fit(experiment)
         return None if fitted_m is None else _misfit(experiment, fitted_m)
 
     def _fit(self, experiment: Experiment) -> Array | None:
         """Return the markers (T, M, 3) [m] of a fit of one experiment, and subtract its sweeps from
-        those allowed; None if none are left, or the fit fails.
+        those allowed.
+
+        None if none are left, or the fit fails; a fit that reaches its limit of iterations counts.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            If the fit is interrupted.
         """
         if self.sweeps <= 0:
             return None
@@ -327,7 +372,8 @@ class _Refitter:
 def _clock_hypotheses(
     alone: _Refitter, declared: Experiment, fitted_m: Array, of: str
 ) -> Iterator[Hypothesis]:
-    """Yield the clock lag for which residuals and velocities agree best, after a few refits.
+    """Yield the clock lag for which residuals and velocities agree best, after a few refits, as one
+    hypothesis; nothing if no lag decreases the misfit.
 
     Parameters
     ----------
@@ -363,7 +409,8 @@ def _clock_hypotheses(
 
 def with_pose_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
     """Return the experiment with its poses `lag_s` [s] later (negative: earlier); None if fewer
-    than three samples remain, or the result is no valid experiment.
+    than three samples remain, or the result is no valid experiment. Samples after the last delayed
+    pose are left out.
     """
     t_s = experiment.t_s
     is_covered = t_s <= t_s[-1] + min(lag_s, 0.0) + 1e-9
@@ -389,7 +436,11 @@ def with_pose_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
 
 
 def _delayed_poses(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
-    """Return the poses of a grasp, `lag_s` later [s]."""
+    """Return the poses of a grasp, `lag_s` later [s]; a single pose is unchanged.
+
+    If they are later, the first pose is repeated at the first of the times `t_s` (or its own), so
+    that the grasp rests until it begins to move.
+    """
     poses = grasp.poses
     if len(poses.t_s) < 2:
         return poses
@@ -411,9 +462,11 @@ def _delayed_poses(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
 
 
 def _marker_lag_s(experiment: Experiment, predicted_m: Array) -> float:
-    """Return by how much the markers lag behind predicted tracks (T, M, 3) [m], in seconds: Σ r·v /
-    Σ v·v of residuals (fitted less measured) and velocities; 0 without motion. Missing samples are
-    ignored.
+    """Return by how much the markers lag behind predicted tracks (T, M, 3) [m], in seconds, to
+    first order; negative if they are early.
+
+    It is Σ r·v / Σ v·v of residuals r (predicted less measured) and velocities v of the predicted
+    tracks; 0 without motion. Missing samples are ignored.
     """
     v = np.gradient(predicted_m, experiment.timestep_s, axis=0)
     residual = np.where(
@@ -428,8 +481,11 @@ def _marker_lag_s(experiment: Experiment, predicted_m: Array) -> float:
 def _with_shifted_grasps(
     experiment: Experiment, deeper: bool
 ) -> Experiment | None:
-    """Return the experiment with every grasp one layer of elements deeper or less deep;
-    None if that is impossible.
+    """Return the experiment with every grasp one layer of elements deeper or less deep; None if
+    that is impossible, or leaves a grasp fewer than three nodes or all nodes.
+
+    Deeper grasps hold all nodes of the elements that they touch; less deep ones leave out the nodes
+    of elements with a free node.
     """
     cells = experiment.body.cells
     n = len(experiment.body.nodes_m)
@@ -461,7 +517,7 @@ def _residual(experiment: Experiment, predicted_m: Array) -> Array:
 
 def _misfit(experiment: Experiment, predicted_m: Array) -> float:
     """Return the root mean square of the residuals of predicted markers (T, M, 3) [m] in standard
-    deviations; missing samples are ignored.
+    deviations; missing samples are ignored; 0 without samples.
     """
     scaled = (
         _residual(experiment, predicted_m) / experiment.markers.sigma_m[:, None]

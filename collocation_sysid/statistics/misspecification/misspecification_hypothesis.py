@@ -46,16 +46,21 @@ class Hypothesis:
 
     @property
     def cause(self) -> str:
-        """Short name of the mistake, such as "poses-inverted"."""
+        """Short name of the mistake, such as "poses-inverted": the code up to the first slash."""
         return self.code.partition("/")[0]
 
     @property
     def message(self) -> str:
-        """Message with the likely mistake and the remedy."""
+        """Message with the likely mistake and the remedy, that of `concern`."""
         return self.concern().message
 
     def concern(self, grade: Grade = "check") -> Concern:
-        """Return the hypothesis as a concern of a given grade."""
+        """Return the hypothesis as a concern of a given grade, with the code "description/" and
+        that of the hypothesis.
+
+        Its data contain the subject as "of" unless that is empty, and the strength as "nearer"
+        unless `corrected` is None.
+        """
         tried = {} if self.corrected is None else {"nearer": self.strength}
         of = {"of": self.subject} if self.subject else {}
         return Concern(
@@ -63,7 +68,9 @@ class Hypothesis:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return cause, message and strength for JSON and tables."""
+        """Return cause, message and strength under the keys "cause", "sentence" and "strength", for
+        JSON and tables.
+        """
         return {
             "cause": self.cause,
             "sentence": self.message,
@@ -98,11 +105,12 @@ class HypothesisTest:
     def accepted(
         self, hypotheses: Iterable[Hypothesis]
     ) -> Iterator[Hypothesis]:
-        """Yield those hypotheses, with their strength, whose correction decreases the misfit by the
-        required factor, or from above the noise to below it.
+        """Yield copies of those hypotheses, with their strength, whose correction decreases the
+        misfit by more than the required factor, or from above the noise to below it.
 
         The strength is the factor by which the misfit decreases, divided by the handicap. A
-        hypothesis whose misfit cannot be computed (None) is omitted.
+        hypothesis whose misfit cannot be computed (None) is omitted. The misfits are computed one
+        after the other, as the iterator advances.
         """
         for each in hypotheses:
             if (misfit := self.misfit_of(each.corrected)) is None:
@@ -128,6 +136,7 @@ def clock_hypothesis(
     subject : str
         Beginning of the message.
     lag_s : float
+        Lag [s]; its sign selects the words of the message.
     corrected : object
         Description with the mistake corrected.
     handicap : float
@@ -141,7 +150,7 @@ def clock_hypothesis(
 
 
 def rank(hypotheses: Iterable[Hypothesis]) -> tuple[Hypothesis, ...]:
-    """Return each cause once, with its strongest hypothesis, strongest first."""
+    """Return for each cause its strongest hypothesis (the first of equal ones), strongest first."""
     strongest: dict[str, Hypothesis] = {}
     for each in sorted(hypotheses, key=lambda each: -each.strength):
         strongest.setdefault(each.cause, each)

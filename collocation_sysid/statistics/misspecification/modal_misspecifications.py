@@ -74,6 +74,12 @@ def find_misspecifications_by_modes(
         Constants of the body; only ratios of stiffness within it matter.
     huber : float, optional
         Threshold of Huber's loss; None means a quadratic loss.
+
+    Notes
+    -----
+    Without markers only signs of loads are tested; in a static experiment, or where modes are of no
+    use (`ModalComparison.from_experiment`), no modes are used. That no stiffness explains the
+    tracks is only reported if no other hypothesis is, and without obstacles.
     """
     if not experiment.markers.names:
         return rank(load_sign_hypotheses(experiment))
@@ -99,8 +105,8 @@ def find_misspecifications_by_modes(
 
 
 def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield hypotheses of other axes of the tracks that bring them far nearer to the
-    undeformed body.
+    """Yield hypotheses of other axes of the tracks that bring them far nearer to the undeformed
+    body moved by its grasps; nothing without samples.
     """
     markers = experiment.markers
     body = experiment.body
@@ -110,6 +116,9 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
     size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
 
     def remaining_misfit(tracks_m: Array) -> float:
+        """Return the median distance of tracks (T, M, 3) from the rigid positions [m], with a floor
+        for deformations.
+        """
         distances_m = np.linalg.norm(tracks_m - places_m, axis=2)
         return float(np.hypot(np.nanmedian(distances_m), DEFORMED * size_m))
 
@@ -126,7 +135,7 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
 
 def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
     """Yield the tracks (T, M, 3) with their axes in every other order and of either sign, as
-    hypotheses about the experiment of a name; the tracks are their `corrected`.
+    untested hypotheses about the experiment of a name; the changed tracks are their `corrected`.
     """
     for axes, (order, signs) in OTHER_AXES.items():
         turned = np.array(signs) * tracks_m[..., list(order)]
@@ -166,8 +175,11 @@ class ModalComparison:
     ) -> ModalComparison | None:
         """Build the comparison for an experiment, see `hypotheses`.
 
-        None if the body has no modes, no single grasp carries it, there are too few tracks, or
-        tendons or pressures drive it.
+        Returns
+        -------
+        ModalComparison or None
+            None if the body has no modes, no single grasp carries it, there are fewer than three
+            samples of markers, or tendons or pressures drive it.
         """
         declared = (
             None
@@ -185,12 +197,14 @@ class ModalComparison:
         return cls(
             declared,
             markers.names,
-            response,
-            float(np.hypot(noise_m, ROUGHLY * response.size_m)),
+            response=response,
+            floor_m=float(np.hypot(noise_m, ROUGHLY * response.size_m)),
         )
 
     def misfit_m(self, declared: DeclaredMotion) -> float:
-        """Return the misfit of the best stiffness [m]."""
+        """Return the misfit of a description with the stiffness and damping that fit best [m], at
+        least `floor_m`.
+        """
         return float(
             self._misfits_m(declared, self.response.predict(declared)).min()
         )
@@ -203,7 +217,9 @@ class ModalComparison:
         return predicted[int(self._misfits_m(declared, predicted).argmin())]
 
     def hypotheses(self) -> Iterator[Hypothesis]:
-        """Iterate over the hypotheses that fit far better than the description as stated."""
+        """Yield the hypotheses that fit far better than the description as stated, with their
+        strength.
+        """
         trial = HypothesisTest(
             self.misfit_m(self.declared),
             self.misfit_m,
@@ -220,8 +236,8 @@ class ModalComparison:
         yield from self._other_axes()
 
     def unlike(self) -> Iterator[Hypothesis]:
-        """Yield the hypothesis that no stiffness explains the tracks, if they are far from
-        all predictions.
+        """Yield the hypothesis that no stiffness explains the tracks, if the misfit exceeds
+        `LARGEST_MISFIT` of the body's size.
         """
         misfit_m = self.misfit_m(self.declared)
         size_m = self.response.size_m
@@ -233,10 +249,13 @@ class ModalComparison:
             )
 
     def _other_axes(self) -> Iterator[Hypothesis]:
-        """Yield hypotheses of other axes of the tracks, tested by the modes."""
+        """Yield the hypotheses of other axes of the tracks that fit far better by the modes."""
         predicted = self.response.predict(self.declared)
 
         def remaining_misfit(tracks_m: Array) -> float:
+            """Return the misfit [m] of tracks (T, M, 3) from the prediction of the best
+            stiffness.
+            """
             turned = replace(self.declared, tracks_m=tracks_m)
             return float(self._misfits_m(turned, predicted).min())
 
@@ -249,7 +268,8 @@ class ModalComparison:
 
     def _misfits_m(self, declared: DeclaredMotion, predicted: Array) -> Array:
         """Return the misfit (S,) [m] of each prediction (S, T, M, 3): the root of the mean squared
-        distance of the nearest 90 % of the samples plus the squared floor.
+        distance of the nearest 90 % of the samples plus the squared floor; samples that are NaN
+        in either are ignored.
         """
         present = np.isfinite(declared.tracks_m[..., 0]) & np.isfinite(
             predicted[0, ..., 0]
@@ -262,8 +282,9 @@ class ModalComparison:
         return np.sqrt(squares[:, :used].mean(axis=1) + self.floor_m**2)
 
     def _frame_hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield hypotheses of a rigid motion before the poses, and of a rigid motion of the
-        tracks.
+        """Yield untested hypotheses of a rigid motion before the poses ("gripper-frame"), and of a
+        rigid motion of the tracks ("camera-frame"), each fitted; nothing if the markers' places
+        are collinear.
         """
         declared = self.declared
         places_m = self.response.places_m
@@ -301,8 +322,8 @@ class ModalComparison:
         )
 
     def _clock_hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield the hypothesis of the clock lag that fits best, unless the allowed lags are
-        none.
+        """Yield the untested hypothesis of that of the `LAGS_S` that fits best; nothing if the
+        recording is too short for all of them.
         """
         declared = self.declared
         predicted = self.response.predict(declared)
@@ -324,8 +345,9 @@ class ModalComparison:
             )
 
     def _name_hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield the hypothesis that markers have each other's names, tested on these markers; none
-        with fewer than two markers or a marker without samples.
+        """Yield the hypothesis that markers have each other's names, by the best assignment of
+        tracks to predictions, if on these markers it fits far better; nothing with fewer than
+        two markers or a marker without samples.
         """
         declared = self.declared
         squares = np.sum(
@@ -366,8 +388,8 @@ class ModalComparison:
 def _with_markers(
     declared: DeclaredMotion, tracks_m: Array, markers: Index
 ) -> DeclaredMotion:
-    """Return the description with the tracks `tracks_m` (T, M, 3) [m] of some markers (indices)
-    only; the others are missing (NaN).
+    """Return a copy of the description with the tracks `tracks_m` (T, M, 3) [m] of some markers
+    (indices) only; the others are missing (NaN).
     """
     few_m = np.full_like(tracks_m, np.nan)
     few_m[:, markers] = tracks_m[:, markers]
@@ -388,7 +410,9 @@ def _fit_rigid_motion(from_m: Array, to_m: Array) -> tuple[Array, Array]:
 
 
 def _determines_rotation(places_m: Array) -> bool:
-    """Whether places (M, 3) are not collinear, so that they determine a rotation."""
+    """Whether places (M, 3) determine a rotation: at least three, whose second principal extent is
+    above a tenth of the first, so that they are not nearly collinear.
+    """
     if len(places_m) < 3:
         return False
     extents = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
@@ -402,7 +426,10 @@ SAME_DIRECTION = 0.94
 
 
 def simple_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
-    """Iterate over the hypotheses without fitted numbers, each with the mistake corrected."""
+    """Yield the hypotheses without fitted numbers, untested, each with the description that
+    corrects it: poses (unless all are the identity), units of length and the direction of
+    gravity.
+    """
     moving = (
         np.ptp(declared.rotations, axis=0).any()
         or np.ptp(declared.translations_m, axis=0).any()
@@ -428,7 +455,9 @@ def simple_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
 
 
 def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
-    """Yield hypotheses of inverted poses, inverted rotations and other quaternion orders."""
+    """Yield untested hypotheses of inverted poses, inverted rotations and other quaternion
+    orders.
+    """
     inverse = declared.rotations.transpose(0, 2, 1)
     shift = -np.einsum("tij,tj->ti", inverse, declared.translations_m)
     inverted = replace(declared, rotations=inverse, translations_m=shift)
@@ -458,7 +487,7 @@ def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
 def _unit_hypotheses(
     declared: DeclaredMotion, what: str, who: str, section: str
 ) -> Iterator[Hypothesis]:
-    """Yield hypotheses that an attribute of the description is in another unit of length.
+    """Yield untested hypotheses that an attribute of the description is in another unit of length.
 
     Parameters
     ----------
@@ -482,7 +511,9 @@ def _unit_hypotheses(
 
 
 def gravity_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
-    """Iterate over the hypotheses of gravity along the other axes, and with the other sign."""
+    """Yield untested hypotheses of gravity along the axes, with either sign, except those within
+    some 20 degrees of the stated direction; nothing without gravity.
+    """
     size = float(np.linalg.norm(declared.gravity_m_s2))
     for axis, name in enumerate("xyz"):
         for sign, plus in ((1.0, "+"), (-1.0, "−")):

@@ -23,8 +23,8 @@ MOST_INSIDE = 0.5
 
 
 def placement_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield hypotheses about parts of a body that no grasp holds, and about obstacles that
-    contain most of it.
+    """Yield hypotheses about parts of a body that no grasp holds, and about each obstacle that
+    contains more than half of it; they need no further test.
     """
     yield from _loose_parts(experiment)
     for obstacle in experiment.obstacles:
@@ -32,8 +32,8 @@ def placement_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that the mesh has unconnected parts, some of which no grasp holds; none
-    if all are held.
+    """Yield the hypothesis that the mesh has unconnected parts, some of which no grasp holds;
+    nothing if all are held, without grasps, or with tendons.
     """
     cells = experiment.body.cells
     count = len(experiment.body.nodes_m)
@@ -67,8 +67,11 @@ def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
 def _containing(
     experiment: Experiment, obstacle: Obstacle
 ) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that an obstacle contains most of the undeformed body at the
-    first time.
+    """Yield the hypothesis that an obstacle contains more than `MOST_INSIDE` of the nodes of the
+    undeformed body at the first time.
+
+    If the obstacle is a plane with the whole body behind it, its normal is blamed
+    ("obstacle-normal"), else its place ("obstacle-place").
     """
     nodes_m = experiment.rigid_positions(experiment.t_s[:1])[
         0, : len(experiment.body.nodes.points_m)

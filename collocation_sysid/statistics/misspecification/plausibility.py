@@ -50,6 +50,11 @@ def size_and_density_hypotheses(body: Body) -> tuple[Hypothesis, ...]:
     ------
     InputError
         If a value is outside by more than a factor of a hundred.
+
+    Notes
+    -----
+    A strength of 1 or less is plausible. The density is the mass of the body over the volume of the
+    mesh.
     """
     size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
     density_kg_m3 = body.mass_kg / body.mesh.volume_m3
@@ -88,7 +93,9 @@ def size_and_density_hypotheses(body: Body) -> tuple[Hypothesis, ...]:
 
 
 def _likely_length(body: Body, *, too_large: bool) -> str:
-    """Return what to check of a body that is too large, or too small."""
+    """Return, for a message, what to check of a body that is too large, or else too small: the
+    lengths of a generated mesh, or the unit of a file.
+    """
     if body.mesh.is_generated:
         return "its lengths, which are in metres"
     unit = 'likely "mm"' if too_large else "the mesh may be in metres already"
@@ -96,8 +103,9 @@ def _likely_length(body: Body, *, too_large: bool) -> str:
 
 
 def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
-    """Return the hypothesis that no material is as dense and as soft as a body with constants θ
-    (k,); None if there may be one.
+    """Return the hypothesis "density/metal" that no material is as dense and as soft as a body with
+    constants θ (k,); None if there may be one: with a density below `METAL_KG_M3`, or a Young's
+    modulus of the stiffest part above `SOFTEST_METAL_PA`.
 
     Motion determines the stiffness over the density only, so a wrong density leaves no other trace.
     """
@@ -117,7 +125,9 @@ def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
 
 
 def _excess_factor(value: float, limits: tuple[float, float]) -> float:
-    """Return the factor by which a value is outside limits; below 1 inside."""
+    """Return the factor by which a positive value is outside limits (low, high); at most 1
+    inside.
+    """
     return max(limits[0] / value, value / limits[1])
 
 
@@ -131,10 +141,11 @@ TOUCHING = 0.05
 
 
 def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield hypotheses of a wrong sign of a wrench, where displacement and load of a static
-    experiment are anticorrelated.
+    """Yield a hypothesis of a wrong sign for each grasp and axis of a static experiment where
+    displacement and measured force are anticorrelated, below `AGAINST`.
 
-    Dynamic experiments are not tested, because of inertia.
+    Tested are axes along which a grasp is displaced by a test bench, or along which an obstacle
+    moves most. Dynamic experiments are not tested, because of inertia.
     """
     for k, grasp in enumerate(
         experiment.grasps if experiment.is_static else (), start=1
@@ -191,7 +202,10 @@ FEWEST = 8
 
 
 def step_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield hypotheses of poses that jump and of markers that slip."""
+    """Yield hypotheses of poses that jump, of all markers that jump, and of single markers that
+    slip; nothing for fewer than `FEWEST` samples. Poses are tested only if a single grasp
+    carries the body.
+    """
     if len(experiment.markers.positions_m) < FEWEST:
         return
     if (grasp := carrying_grasp(experiment)) is not None:
@@ -206,8 +220,8 @@ def step_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
 def _common_jump(
     experiment: Experiment, moved_m: Array
 ) -> Iterator[Hypothesis]:
-    """Yield the hypothesis of the largest step of all markers together that the poses do not have;
-    only samples with all markers are used.
+    """Yield the hypothesis of the largest step of all markers together that the poses do not have,
+    if it is sudden; only samples with all markers are used.
 
     Parameters
     ----------
@@ -246,6 +260,9 @@ STILL_SIGMAS = 6.0
 def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
     """Yield the hypothesis that poses are wrong, if markers move although the body starts at rest
     and neither grasps nor loads change.
+
+    Nothing is yielded without grasps, with obstacles, tendons or pressures, if a grasp begins or
+    ends within the recording, or if no marker has `FEWEST_SAMPLES` samples.
     """
     t_s = experiment.t_s
     grasps = experiment.grasps
@@ -288,13 +305,13 @@ def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _changes(values: Array) -> bool:
-    """Whether any row of values (T, …) differs from the first."""
+    """Whether values (T, …) change by more than rounding over their first axis."""
     return bool(np.ptp(values, axis=0).max(initial=0.0) > 1e-9)
 
 
 def _marker_box_m(experiment: Experiment) -> Array:
-    """Return two corners (2, 3) of the bounding box of the markers' places on the
-    undeformed body [m].
+    """Return the lowest and the highest corner (2, 3) of the bounding box of the markers' places on
+    the undeformed body [m].
     """
     places = experiment.markers.predict_positions(experiment.body.nodes_m)
     return np.vstack([places.min(axis=0), places.max(axis=0)])
@@ -313,7 +330,7 @@ def _pose_jump_hypotheses(
     experiment: Experiment, moved_m: Array
 ) -> Iterator[Hypothesis]:
     """Yield the hypothesis of the largest jump of points `moved_m` (T, m, 3) [m] carried by the
-    poses, if the markers do not follow it.
+    poses, if the markers do not follow it; nothing if no marker is measured there.
     """
     sizes = step_sizes(moved_m).max(axis=1)
     k = int(sizes.argmax())
@@ -334,7 +351,9 @@ def _pose_jump_hypotheses(
 
 
 def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield a hypothesis for each marker that steps alone and stays displaced."""
+    """Yield a hypothesis for each marker that steps alone and stays displaced against the
+    others.
+    """
     markers = experiment.markers
     sizes = step_sizes(markers.positions_m)
     for m, name in enumerate(markers.names):
@@ -366,8 +385,8 @@ def _step_hypothesis(
     usual_m: float,
     marker: str = "",
 ) -> Iterator[Hypothesis]:
-    """Yield the hypothesis of a step between samples k + 1 and k + 2, if it is far larger than
-    usual.
+    """Yield the hypothesis of a step between samples k + 1 and k + 2 (indices), if it is at least
+    `SUDDEN` times as large as usual; its strength is this ratio.
 
     Parameters
     ----------
@@ -394,7 +413,10 @@ def _step_hypothesis(
 
 def _is_lasting(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
     """Whether the distances of a marker (index) from the others in tracks (T, M, 3) remain changed
-    from the index `sample` on, by a part of the step `step_m` [m]; true if there are no others.
+    from the index `sample` on, by more than 0.3 of the step `step_m` [m].
+
+    Medians before and after are compared; one of the other markers suffices. True if there are no
+    other markers.
     """
     to_others = np.linalg.norm(tracks - tracks[:, marker : marker + 1], axis=2)
     others = np.delete(to_others, marker, axis=1)
@@ -411,7 +433,7 @@ def _is_lasting(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
 
 def _usual_change(sizes: Array) -> float:
     """Return the 90 % quantile of changes of any shape, without NaN and the largest three; 0 if
-    there are no others.
+    there are three or fewer.
     """
     rest = np.sort(sizes[np.isfinite(sizes)])[:-3]
     return float(np.quantile(rest, LIVELY)) if len(rest) else 0.0
@@ -426,7 +448,8 @@ TAMED = 0.2
 def name_exchange_hypotheses(
     experiment: Experiment, huber: float | None = None
 ) -> tuple[Hypothesis, ...]:
-    """Return hypotheses that names of markers are exchanged for a part of the recording.
+    """Return one hypothesis that names of markers are exchanged for a part of the recording, or an
+    empty tuple; the order that lasts longest is assumed right, see the module's documentation.
 
     Parameters
     ----------
@@ -470,8 +493,14 @@ def name_exchange_hypotheses(
 
 
 def _marker_identities(experiment: Experiment) -> tuple[Index, float]:
-    """Return the identity (T, M) of each marker among those of the first samples, and the factor by
-    which exchanged names fit better; 0 if no names are exchanged.
+    """Return the identity of each marker in each sample, and the factor by which exchanged names
+    fit better.
+
+    Returns
+    -------
+    ((T, M) array of int, float)
+        Element (t, m) is the index of the marker, by the names of the first samples, that has the
+        name m at sample t. The factor is 0 if no names are exchanged.
     """
     markers = experiment.markers
     grasp = carrying_grasp(experiment)

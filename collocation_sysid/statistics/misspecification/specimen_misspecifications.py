@@ -49,8 +49,11 @@ PERCENT_STRAIN = 1.0
 
 
 def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
-    """Return hypotheses of what is described wrongly of the specimens of a fit; empty where they
-    fit.
+    """Return hypotheses of what is described wrongly of the specimens of a fit; empty without
+    specimens, where they fit, or if refits fail.
+
+    The specimens with the largest misfit are tested first; a nearly certain hypothesis (`CERTAIN`)
+    ends the search.
 
     Parameters
     ----------
@@ -113,7 +116,9 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
 
 
 def _thinned(experiment: Experiment) -> Experiment:
-    """Return the experiment of a specimen with at most `REFITTED_SAMPLES` of its samples."""
+    """Return a copy of the experiment of a specimen with at most `REFITTED_SAMPLES` of its samples,
+    evenly chosen by index, without markers and without sensors that have no value there.
+    """
     count = len(experiment.t_s)
     chosen = np.unique(
         np.linspace(0, count - 1, min(count, REFITTED_SAMPLES)).astype(int)
@@ -137,8 +142,8 @@ def _thinned(experiment: Experiment) -> Experiment:
 
 
 def _initial_slope(experiment: Experiment) -> float:
-    """Return the stress of the smallest strains over these [Pa], without their sign; NaN without
-    any.
+    """Return the median of stress over strain [Pa] among the smaller half of the strains, without
+    sign; NaN without a strain.
     """
     strain, _ = specimen_strains(experiment)
     stress_pa = experiment.readings[0].measured_values[:, 0]
@@ -152,7 +157,9 @@ def _initial_slope(experiment: Experiment) -> float:
 
 
 def _misfit(parts: Sequence[ExperimentIterate]) -> float:
-    """Return the root mean square of residuals and nuisance parameters in standard deviations."""
+    """Return the root of the squares of residuals and nuisance parameters, in standard deviations,
+    per measured value; NaN residuals are ignored.
+    """
     squares = 0.0
     count = 0
     for part in parts:
@@ -172,7 +179,8 @@ def _misfit(parts: Sequence[ExperimentIterate]) -> float:
 def _hypotheses(
     experiment: Experiment, other_slopes_pa: Sequence[float]
 ) -> Iterator[Hypothesis]:
-    """Yield each common mistake with the experiment that corrects it.
+    """Yield each common mistake that is possible for a specimen, untested, with the experiment that
+    corrects it.
 
     Parameters
     ----------
@@ -230,8 +238,8 @@ def _hypotheses(
 def area_ratios(
     deformation: HomogeneousDeformation, strain: Array
 ) -> Array | None:
-    """Return the deformed over the undeformed area (T,) of an incompressible specimen; None where
-    a test does not change it.
+    """Return the deformed over the undeformed area (T,) of an incompressible specimen at strains
+    (T,), 1 / (1 + strain); None for tests other than uniaxial, equibiaxial and planar ones.
     """
     if deformation.test in ("uniaxial", "equibiaxial", "planar"):
         return 1 / (1 + strain)
@@ -239,7 +247,9 @@ def area_ratios(
 
 
 def _with_stress(experiment: Experiment, factors: Array) -> Experiment:
-    """Return the experiment with its stresses multiplied by factors (T,)."""
+    """Return a copy of the experiment with its stresses multiplied by factors (T,); sensors of
+    other quantities or with other samples are unchanged.
+    """
     readings = [
         replace(gauge, values=gauge.measured_values * factors[:, None])
         if gauge.unit == STRESS_UNIT
@@ -251,9 +261,12 @@ def _with_stress(experiment: Experiment, factors: Array) -> Experiment:
 
 
 def _strained(experiment: Experiment, factor: float) -> Experiment:
-    """Return the experiment with its strains multiplied by a factor."""
+    """Return a copy of the experiment with its prescribed strains multiplied by a factor; measured
+    values are unchanged.
+    """
 
     def scaled(grasp: Grasp) -> Grasp:
+        """Return a grasp with its positions multiplied by the factor."""
         return replace(
             grasp,
             poses=replace(
@@ -267,7 +280,9 @@ def _strained(experiment: Experiment, factor: float) -> Experiment:
 
 
 def _compressed(experiment: Experiment) -> Experiment:
-    """Return the experiment with strains and stresses of the opposite sign."""
+    """Return a copy of the experiment with strains and stresses of the opposite sign, without
+    measured lateral strains.
+    """
     reversed_stress = _with_stress(
         experiment, np.full(len(experiment.t_s), -1.0)
     )

@@ -101,7 +101,11 @@ class DescribedWrench:
 
 
 def wrench_causes(solution: Solution) -> list[Hypothesis]:
-    """Return hypotheses about wrongly described wrenches after a fit; empty if the wrenches fit."""
+    """Return hypotheses about wrongly described wrenches after a fit; empty if all wrenches fit
+    (`MISFIT`), or if no experiment has markers.
+
+    The experiments with markers are fitted again, to their markers alone.
+    """
     if not any(map(_misses, solution.parts)):
         return []
     with_markers = [
@@ -122,7 +126,7 @@ def wrench_mistakes(collocation: Collocation) -> list[Hypothesis]:
     """Return hypotheses about wrongly described wrenches before any solve.
 
     The first samples of the experiments with markers and wrenches are fitted to their markers
-    alone. Empty where that fit does not explain the markers.
+    alone. Empty where that fit does not explain the markers. The collocation is not modified.
     """
     with_both = [
         s
@@ -143,8 +147,8 @@ def wrench_mistakes(collocation: Collocation) -> list[Hypothesis]:
 
 
 def _misses(part: ExperimentIterate) -> bool:
-    """Whether the residuals of any wrench sensor of an experiment are larger than the noise by a
-    factor; false without sensors.
+    """Whether the root mean square of the residuals of any wrench sensor of an experiment exceeds
+    `MISFIT` standard deviations; false without sensors.
     """
     # They are behind the markers.
     pairs = zip(part.segment.sensors, part.observables[1:], strict=False)
@@ -156,7 +160,9 @@ def _misses(part: ExperimentIterate) -> bool:
 
 
 def _markers_misfit(part: ExperimentIterate) -> float:
-    """Return the root mean square of the markers' residuals in standard deviations."""
+    """Return the root mean square of the markers' residuals in standard deviations; 0 without
+    samples.
+    """
     residuals = part.segment.markers.residuals(part.observables[0], part.phi)
     return float(
         np.sqrt(
@@ -171,8 +177,21 @@ def _from_markers(
     transcriptions: Sequence[Transcription],
     method: ReducedSpace,
 ) -> list[ExperimentIterate]:
-    """Return experiments fitted to their markers alone by a method, with the nuisance parameters of
-    the wrenches at zero; empty if there are none or the fit fails.
+    """Return experiments fitted together to their markers alone, with the nuisance parameters of
+    the wrenches at zero.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Program of the parameters and options.
+    transcriptions : sequence of Transcription
+        Transcriptions of the experiments to be fitted.
+    method : ReducedSpace
+
+    Returns
+    -------
+    list of ExperimentIterate
+        One for each transcription, with its sensors; empty if there are none or the fit fails.
     """
     if not transcriptions:
         return []
@@ -195,7 +214,9 @@ def _from_markers(
 
 
 def _of_parts(parts: Sequence[ExperimentIterate]) -> list[Hypothesis]:
-    """Return the hypotheses for all wrench sensors of experiments fitted to their markers alone."""
+    """Return the hypotheses for all wrench sensors of experiments fitted to their markers alone,
+    those of each sensor in the order of `_OneSensor.causes`.
+    """
     hypotheses: list[Hypothesis] = []
     for part in parts:
         forced = part.motion.reactions
@@ -244,8 +265,8 @@ class _OneSensor:
         )
 
     def causes(self) -> Iterator[Hypothesis]:
-        """Yield the hypotheses whose correction improves the fit far enough; if there is none, that
-        of a large tare.
+        """Yield the hypotheses whose correction improves the fit far enough, if the misfit exceeds
+        `MISFIT`; if there are none, that of a large tare.
         """
         accepted: list[Hypothesis] = []
         misfit = self.misfit(self.declared)
@@ -257,7 +278,9 @@ class _OneSensor:
         yield from accepted or self._large_tare()
 
     def _large_tare(self) -> Iterator[Hypothesis]:
-        """Yield the hypothesis that the tare of the fit is far beyond its prior."""
+        """Yield the hypothesis that the mean difference of a component, without any tare, exceeds
+        `LARGEST_TARE` deviations of the tare's prior; nothing without a tare.
+        """
         tare = self.declared.tare
         if not tare:
             return
@@ -279,8 +302,9 @@ class _OneSensor:
             )
 
     def misfit(self, trial: DescribedWrench) -> float:
-        """Return the root mean square of the residuals of a description in standard
-        deviations; infinite without samples.
+        """Return the root mean square of the residuals of a description in standard deviations,
+        with the best tares and, if the scale is unknown, the best factor of the prediction that
+        is not negative; infinite without samples.
         """
         measured, predicted = self._scaled_by_sigma(trial)
         if not np.isfinite(measured).any():
@@ -291,8 +315,8 @@ class _OneSensor:
         return float(np.sqrt(np.nanmean((measured - factor * predicted) ** 2)))
 
     def _scaled_by_sigma(self, trial: DescribedWrench) -> tuple[Array, Array]:
-        """Return samples and prediction (S, 6) over the noise, without tares; NaN in the
-        same places.
+        """Return samples and prediction (S, 6) of a description over the standard deviations of the
+        noise, without what its tare explains; NaN in the same places.
         """
         wrench = trial.wrench
         sigmas = trial.wrench.sigmas
@@ -308,8 +332,8 @@ class _OneSensor:
         )
 
     def _predicted(self, wrench: Wrench) -> Array:
-        """Return the predicted wrench (S, 6) at the times, in the frame and about the point
-        of a wrench; cached.
+        """Return the predicted wrench (S, 6) [N, N m] at the times, in the frame and about the
+        point of a wrench, without tares and delays; cached. NaN where there is no prediction.
         """
         at = (wrench.t_s.tobytes(), wrench.frame, wrench.point_m.tobytes())
         if at not in self._known:
@@ -378,13 +402,18 @@ class _OneSensor:
         return shift_m
 
     def _mistakes(self) -> Iterator[Hypothesis]:
-        """Yield each common mistake with the description that corrects it."""
+        """Yield each common mistake, untested, with the description that corrects it: signs, frame,
+        axes, units, gains, point, clock and a free tare.
+        """
         of = f"the wrench of '{self.part.segment.experiment.name}'"
         wrench = self.declared.wrench
 
         def hypothesis(
             code: str, without: Wrench, handicap: float = 1.0, **data
         ) -> Hypothesis:
+            """Return the hypothesis of a code about the sensor with the wrench `without` in place
+            of the stated one; `data` are for the message.
+            """
             return Hypothesis(
                 code,
                 of,
@@ -413,7 +442,9 @@ class _OneSensor:
                 np.tile(signs, 2) * values[:, [*order, *(3 + k for k in order)]]
             )
             without = replace(wrench, values=turned)
-            yield hypothesis("wrench-axes", without, ONE_OF_MANY, axes=axes)
+            yield hypothesis(
+                "wrench-axes", without, handicap=ONE_OF_MANY, axes=axes
+            )
         for what, units, columns in UNITS:
             for unit, factor in (
                 units.items()
@@ -435,7 +466,7 @@ class _OneSensor:
                 yield hypothesis(
                     "wrench-gain",
                     _multiplied(wrench, columns, factor=factor),
-                    FITTED,
+                    handicap=FITTED,
                     **data,
                 )
         shift_m = self._point_shift_m()
@@ -446,7 +477,10 @@ class _OneSensor:
                 "point": str(np.round(point_m, 3).tolist()),
             }
             yield hypothesis(
-                "wrench-point", replace(wrench, point_m=point_m), FITTED, **data
+                "wrench-point",
+                replace(wrench, point_m=point_m),
+                handicap=FITTED,
+                **data,
             )
         span_s = LATEST * float(np.ptp(wrench.t_s))
         for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
@@ -467,6 +501,7 @@ class _OneSensor:
 def _without_tare(values: Array, tare: float) -> Array:
     """Return columns (S, c) in standard deviations, without the offset that a tare with a prior of
     `tare` standard deviations explains: none for 0, the mean if infinite. NaN is ignored.
+    Columns without a value stay NaN.
     """
     is_measured = np.isfinite(values)
     prior_weight = (
@@ -478,16 +513,25 @@ def _without_tare(values: Array, tare: float) -> Array:
 
 
 def _slope(measured: Array, predicted: Array) -> float:
-    """Return the factor of the prediction that fits the samples best, by least squares; NaN if the
-    prediction is zero. NaN in either is ignored.
+    """Return the factor of the prediction that fits the samples best, by least squares, of either
+    sign; NaN if the prediction is zero. NaN in either is ignored.
     """
     square = float(np.nansum(predicted**2))
     return float(np.nansum(measured * predicted)) / square if square else np.nan
 
 
 def _multiplied(wrench: Wrench, columns: slice, factor: float) -> Wrench:
-    """Return the wrench with the values of some columns (slice) multiplied by a factor; its noise
-    is increased with a large factor, but not decreased.
+    """Return a copy of the wrench with the values of some columns multiplied by a factor.
+
+    The standard deviation of forces or torques among the columns is multiplied by the absolute
+    factor if that is above 1, and not decreased.
+
+    Parameters
+    ----------
+    wrench : Wrench
+    columns : slice
+        `FORCES`, `TORQUES` or `BOTH`.
+    factor : float
     """
     values: Array = np.array(wrench.values)
     values[:, columns] *= factor

@@ -59,11 +59,12 @@ SETTLED = 0.02
 
 
 def routine_probes_with_steps(fit: SolvedFit) -> tuple[Probe, ...]:
-    """Return the probes that relax the routine assumptions by one linear step each; the most
-    significant of those that give concern is iterated.
+    """Return the probes that relax the routine assumptions by one linear step each, all with
+    `routine` set; the one of those that give concern (`is_alarming`) with the largest decrease
+    of χ² is iterated.
 
     A linear step suffices to find that an assumption is wrong, but not for estimates that change by
-    much of their value. That assumption therefore takes a few further steps, each with a
+    much of their value. That assumption therefore takes up to `STEPS` further steps, each with a
     simulation.
     """
     probes = routine_probes(fit)
@@ -79,9 +80,12 @@ def routine_probes_with_steps(fit: SolvedFit) -> tuple[Probe, ...]:
 
 
 def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
-    """Refit windows of time, recordings where there are several, and with assumptions relaxed.
+    """Return the refits of windows of time, of recordings where there are several, and with each
+    assumption relaxed, in this order.
 
-    Routine assumptions have the same prior and level of significance as in `routine_probes`.
+    The level of significance is `CHANCE` over the number of tests (Bonferroni). Routine assumptions
+    have the same prior and level of significance as in `routine_probes`. Significant assumptions
+    are iterated, with simulations.
     """
     parts = [*_window_probes(solved_fit), *_recording_probes(solved_fit)]
     relaxed = [*_relaxed_probes(solved_fit)]
@@ -100,7 +104,9 @@ def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
 
 
 def _window_probes(at: SolvedFit) -> Iterator[Probe]:
-    """Yield the refits of a third of every recording's time."""
+    """Yield the refits of a third of every recording's time, for each of the three windows with
+    enough measurements.
+    """
     for k, name in enumerate(WINDOWS):
         cuts = [_third(block, k) for block in at.fit.blocks]
         blocks = [
@@ -112,7 +118,9 @@ def _window_probes(at: SolvedFit) -> Iterator[Probe]:
 
 
 def _third(block: ResidualBlock, k: int) -> slice:
-    """Return the slice of the samples in third k (an index) of a block's samples."""
+    """Return the slice of the samples in third k (index 0, 1 or 2) of a block's samples, by their
+    number; thirds are as equal as rounding allows.
+    """
     ends = np.round(np.linspace(0, len(block.t_s), len(WINDOWS) + 1)).astype(
         int
     )
@@ -120,7 +128,7 @@ def _third(block: ResidualBlock, k: int) -> slice:
 
 
 def _restrict(block: ResidualBlock, cut: slice) -> ResidualBlock:
-    """Return the block with the samples in the slice `cut` only."""
+    """Return a copy of the block with the samples in the slice `cut` only."""
     own = ("t_s", "is_present", "residual", "jacobian", "misfit", "components")
     there = {
         name: each[cut]
@@ -134,7 +142,9 @@ def _restrict(block: ResidualBlock, cut: slice) -> ResidualBlock:
 
 
 def _recording_probes(at: SolvedFit) -> Iterator[Probe]:
-    """Yield the refits of single recordings; none if there is only one."""
+    """Yield the refits of single recordings with enough measurements; nothing if there is only one
+    recording.
+    """
     if len(blocks_by_recording(at.fit)) < 2:
         return
     for alone, step in single_fits(at.fit):
@@ -177,8 +187,8 @@ def _part_probe(
 
 
 def _with_significant_moves(probe: Probe, limit: float) -> Probe:
-    """Return the probe with the names, in `sentences`, of the estimates that differ by more than
-    `limit` of their standard errors.
+    """Return a copy of the probe with the names, in `sentences`, of the estimates that differ by
+    more than `limit` of their standard errors.
 
     A part of the data differs from all data with less than its own error bar (Hausman 1978).
     """
@@ -194,7 +204,7 @@ def _with_significant_moves(probe: Probe, limit: float) -> Probe:
 
 
 def _relaxed_probes(at: SolvedFit) -> Iterator[Probe]:
-    """Relax each assumption that changes anything, by one linear step."""
+    """Yield a probe for each assumption that changes any residual, relaxed by one linear step."""
     for name in dict.fromkeys(at.changes.names):
         wide = with_relaxed_assumption(
             at.fit, at.changes, name=name, widening=_widening(name)
@@ -207,7 +217,10 @@ def _relaxed_probes(at: SolvedFit) -> Iterator[Probe]:
 
 
 def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
-    """Iterate a significant probe by further steps, from where its first step leads.
+    """Return a significant probe after further steps, from where its first step leads.
+
+    The steps end after `STEPS`, if no shared parameter changes by more than `SETTLED`, or if a
+    simulation fails. `sentences` has the name of the assumption if it is still significant.
 
     Parameters
     ----------
@@ -258,5 +271,7 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
 
 
 def _widening(name: str) -> float:
-    """Return the deviation of an assumption's prior, in deviations of the budget."""
+    """Return the standard deviation of an assumption's prior, in deviations of the budget, for its
+    name with component: `WIDENING` for routine assumptions, else 1.
+    """
     return WIDENING if name in ROUTINE else 1.0

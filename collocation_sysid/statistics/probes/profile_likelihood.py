@@ -89,10 +89,21 @@ def compute_profile(
         Variance of the residuals in units of σ², by which the threshold grows: the reduced χ² if
         the noise is estimated, more if errors are correlated.
 
+    Returns
+    -------
+    Profile
+        An open end of the interval is None. If a lower loss than at `best` is found, the message
+        says so.
+
     Raises
     ------
     InputError
         If the best value is not within the bounds.
+
+    Notes
+    -----
+    Ends are found to `PRECISION` in the logarithm. A deviation that is not positive and finite
+    counts as 0.05. The optimum is not solved again.
     """
     value, loss = best
     if not 0 < bounds[0] <= value <= bounds[1]:
@@ -104,8 +115,9 @@ def compute_profile(
     threshold = THRESHOLD * noise_scale
 
     def rise(way: float) -> float:
-        """Return the square root of the loss's rise over the threshold, less one; nearly
-        linear in `way`, the change of the logarithm.
+        """Return √(rise of the loss over the threshold), at most √`HIGHEST`, less one; nearly
+        linear in `way`, the change of the logarithm of the parameter. Values within half of
+        `PRECISION` are zero.
         """
         trial = float(np.clip(value * np.exp(way), *bounds))
         if trial not in losses_by_value:
@@ -141,7 +153,7 @@ def compute_profile(
     )
     values = np.array(sorted(losses_by_value))
     losses = np.array([losses_by_value[at] for at in values.tolist()])
-    message = _message(parameter, (lower, upper), bounds)
+    message = _message(parameter, (lower, upper), bounds=bounds)
     if losses.min() < loss - 1e-3 * max(1.0, abs(loss)):
         better = values[int(np.argmin(losses))]
         message += (
@@ -162,16 +174,17 @@ def _find_end(
     rise: Callable[[float], float], step: float, bound: float
 ) -> float | None:
     """Return the change of the logarithm of the parameter at which the loss has risen enough, on
-    the side to which `step` points; None if it has not at the bound.
+    the side to which `step` points; None if it has not at the bound, or after `MOST_DOUBLINGS`
+    doublings of the step.
 
     Parameters
     ----------
     rise : callable
-        Function of that change; zero where the loss has risen enough, negative below.
+        Function of that change; zero where the loss has risen just enough, negative below.
     step : float
-        First change that is tried.
+        First change that is tried; negative for the lower end.
     bound : float
-        Change at which the bound is reached.
+        Change at which the bound is reached, of the same sign or zero.
     """
     inside = 0.0
     closest = min if step > 0 else max
@@ -194,7 +207,8 @@ def _message(
     interval: tuple[float | None, float | None],
     bounds: tuple[float, float],
 ) -> str:
-    """Return the message for an interval of a parameter.
+    """Return the message for an interval of a parameter: two limits, one limit, or not
+    identifiable.
 
     Parameters
     ----------
@@ -227,6 +241,17 @@ def profile_of_solution(
 ) -> Profile:
     """Compute the profile likelihood of an estimated parameter of a solution.
 
+    Parameters
+    ----------
+    solution : Solution
+        Converged solution.
+    fit : LinearisedFit
+        The fit at its answer.
+    uncertainty : Uncertainty
+        Its error bars, which determine the first step and the threshold.
+    name : str
+        Name of an estimated parameter.
+
     Raises
     ------
     InputError
@@ -245,6 +270,7 @@ def profile_of_solution(
     item = parameters.free[k]
 
     def solve_fixed(_: str, value: float) -> float:
+        """Return the loss with the parameter fixed at a value; the name is not used."""
         return _loss_with_fixed(solution, item, value=value)
 
     return compute_profile(
@@ -258,7 +284,9 @@ def profile_of_solution(
 
 
 def _loss_of(solution: Solution) -> float:
-    """Return the loss of a solution, with priors."""
+    """Return the loss of a solution, Σ ((ŷ − h(x)) / σ)² (shortened by Huber's loss), with
+    priors.
+    """
     return (
         solution.collocation.objective(solution.z)
         / solution.collocation.loss_scale
@@ -268,8 +296,13 @@ def _loss_of(solution: Solution) -> float:
 def _loss_with_fixed(
     solution: Solution, item: Parameter, value: float
 ) -> float:
-    """Return the smallest loss, with priors, with one parameter fixed at a value, searched from the
-    answer; infinite if the solve does not converge.
+    """Return the smallest loss, with all priors, with one parameter fixed at a value, searched from
+    the answer by reduced space; infinite if the solve does not converge.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If the solve is interrupted.
     """
     before = solution.collocation
     started = before.parameters.with_guess(solution.parameters)
@@ -292,8 +325,8 @@ def _loss_with_fixed(
 def _noise_scale(
     solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int
 ) -> float:
-    """Return the variance of the parameter with index k over its variance for independent errors of
-    the stated σ; 1 if that ratio is not finite.
+    """Return the variance of the parameter with index k (from 0) over its variance for independent
+    errors of the stated σ; 1 if that ratio is not finite.
     """
     size = relative_derivatives(solution.collocation.parameters, solution.q)[k]
     standard_error = size * least_squares_of_fit(fit).standard_errors[k]

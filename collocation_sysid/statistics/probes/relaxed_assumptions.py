@@ -71,9 +71,10 @@ class Probe:
     kind : {"window", "recording", "assumption"}
         What was refitted.
     name : str
-        Name of the window, of the recording, or of the assumption with its component.
+        Name of the window, of the recording, or of the assumption with its component after a space.
     chi_squared : float
-        Decrease of χ², with the stated σ and with priors.
+        Decrease of χ² of the refitted data, with the stated σ and with priors, from the parameters
+        of the fit of all data to those of the refit.
     moves : mapping of str to EstimateChange
         Changes of the estimates that the refit determines.
     size, size_error : float or None
@@ -100,8 +101,8 @@ class Probe:
     relevance: float | None = None
 
     def is_beyond(self, limit: float) -> bool:
-        """Whether the size of a relaxed assumption exceeds `limit` of its standard errors;
-        false if there is no size.
+        """Whether the absolute size of a relaxed assumption exceeds `limit` of its standard errors;
+        false if there is no size, or if its error is None or zero.
         """
         if self.size is None or not self.size_error:
             return False
@@ -143,7 +144,7 @@ class SolvedFit:
 
     def uncertainty_of_refit(self, fit: LinearisedFit, p: Array) -> Uncertainty:
         """Return estimates and error bars of another fit at its parameters p (p,), with the error
-        model of this one.
+        model of this one. Derived moduli are those at p.
         """
         q = p[: fit.shared_count]
         constants = (
@@ -157,8 +158,11 @@ class SolvedFit:
     def changes_of_estimates(
         self, uncertainty: Uncertainty
     ) -> dict[str, EstimateChange]:
-        """Return the changes of the estimates that a refit determines precisely, from those of the
-        joint fit, by name.
+        """Return the changes of the estimates that a refit determines, from those of the joint fit,
+        by name; parameters and derived moduli.
+
+        Left out are estimates whose relative standard error in the refit is missing or at least
+        `TELLING`.
         """
         changes = {}
         for name, each in {
@@ -194,8 +198,8 @@ class SolvedFit:
 def _share_of_interval(
     change: float, interval: tuple[float, float] | None
 ) -> float | None:
-    """Return a change over the half width of an interval, with its sign; None without an
-    interval.
+    """Return a change over the half width of an interval (lower, upper), with the sign of the
+    change; None without an interval.
     """
     return (
         None
@@ -229,6 +233,11 @@ def probed_changes(
         Standard deviation of each assumption or nuisance parameter; None if exact.
     changes : ResidualChanges, optional
         Result of `changes_of_assumptions` for these deviations, if it is known.
+
+    Returns
+    -------
+    ResidualChanges
+        The arrays of `changes` are not modified.
     """
     known = (
         changes_of_assumptions(collocation, z, deviations=deviations)
@@ -256,8 +265,8 @@ def probed_changes(
 def has_monotonic_load(
     iterate: ExperimentIterate, collocation: Collocation
 ) -> bool:
-    """Whether the internal forces of a static recording only grow, or only shrink, in time;
-    true for very few samples.
+    """Whether the norm of the internal forces of a static recording only grows, or only shrinks, in
+    time, but for `RETURN` of its range; true for fewer than `FEWEST_SAMPLES` samples.
     """
     load_n = np.linalg.norm(
         ExperimentAtAnswer(iterate, collocation.parameters).internal_n(), axis=1
@@ -286,7 +295,8 @@ def with_relaxed_assumption(
         the unit of the new parameters.
     name : str
         Name of the assumption with its component. If `changes` does not contain it, no parameter is
-        added.
+        added; if it does several times (once for each recording), as many are added at the end,
+        named by it and a number from 0.
     widening : float
         Standard deviation of the prior of the new parameters, in these deviations.
     """
@@ -334,8 +344,8 @@ def relaxed_probe(
     Returns
     -------
     Probe
-        Its size is that of the most significant amplitude, if there are several; its `sentences`
-        are empty.
+        Its size, in the unit of the assumption, is that of the most significant amplitude if there
+        are several; its `sentences` are empty.
     """
     first = len(fit.fit.names)
     step = gauss_newton_step(wide)
@@ -367,8 +377,8 @@ def relaxed_probe(
 
 
 def relevance(fit: SolvedFit, probe: Probe) -> float:
-    """Return the largest change of an estimate by a probe, in half widths of its statistical
-    interval.
+    """Return the largest absolute change of an estimate by a probe, in half widths of its
+    statistical interval; 0 if there are no such changes.
 
     For a drift, half of it counts as a change of the moduli too: by so much the stiffness at either
     end of a recording differs from the one that is reported.
@@ -388,5 +398,5 @@ def relevance(fit: SolvedFit, probe: Probe) -> float:
 
 
 def assumption_name(name: str) -> str:
-    """Return the name of an assumption without its component."""
+    """Return the name of an assumption without its component: the part before the first space."""
     return name.partition(" ")[0]

@@ -8,8 +8,8 @@ step.
 
 A probe is *significant* if its amplitude is farther from zero than noise explains, and *relevant*
 if relaxing the assumption changes what is reported. Only what is both gives concern, see
-`trust.probe_concerns`: with much data any imperfection is significant, and with little data any
-change is large.
+`assessment.probe_concerns`: with much data any imperfection is significant, and with little data
+any change is large.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ RELEVANT = 0.25
 def probed_deviations(
     deviations: Mapping[str, float | None],
 ) -> dict[str, float | None]:
-    """Return deviations in which none of the routine probes is None.
+    """Return a copy of deviations in which none of the routine probes is None.
 
-    A quantity stated as exact is left out of the budget but still tested, with the default
-    deviation of the table.
+    A quantity stated as exact (None), or without an entry, is left out of the budget but still
+    tested, with the default deviation of the table.
 
     Parameters
     ----------
@@ -64,7 +64,8 @@ def probed_deviations(
 
 
 def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
-    """Relax each routine assumption by one linear step from the answer.
+    """Return the probes that relax each routine assumption by one linear step from the answer, in
+    the order of `ROUTINE`; none is left out because it is not significant.
 
     Parameters
     ----------
@@ -99,14 +100,19 @@ def significance_limit(changes: ResidualChanges) -> float:
     """Return the least significant amplitude of a routine probe, in its standard errors.
 
     Bonferroni's bound over all amplitudes: a drift has one, the clock rate one for each recording.
+
+    Parameters
+    ----------
+    changes : ResidualChanges
+        Changes whose `names` are counted; without a routine assumption, one amplitude is assumed.
     """
     amplitudes = sum(name in ROUTINE for name in changes.names)
     return float(normal_isf(FALSE_ALARMS / 2 / max(1, amplitudes)))
 
 
 def is_alarming(probe: Probe) -> bool:
-    """Whether a relaxed assumption is significant, and relevant to the estimates that are
-    reported.
+    """Whether a probe relaxes an assumption that is significant (it has `sentences`), and relevant
+    to the estimates (`relevance` at least `RELEVANT`); false for parts of the data.
     """
     return (
         bool(probe.sentences)

@@ -67,7 +67,7 @@ class LaggedProducts:
     shifted: Array
 
     def split(self, values: Array) -> list[Array]:
-        """Split values (K,) by experiment."""
+        """Split values (K,) by experiment, into arrays (lag + 1,)."""
         ends = np.cumsum([last + 1 for last in self.lags])
         return np.split(values, ends[:-1])
 
@@ -78,6 +78,11 @@ class LaggedProducts:
         ----------
         beyond : (K,) array or 0
             Contribution of longer lags to the products, which is subtracted.
+
+        Notes
+        -----
+        γ are the least-squares solution of expected γ = products − beyond, for all experiments
+        together.
         """
         solution = np.linalg.lstsq(self.expected, self.products - beyond)[0]
         return self.split(solution.astype(np.float64))
@@ -88,7 +93,8 @@ class LaggedProducts:
         information: Information,
         tails: Sequence[Array],
     ) -> Array:
-        """Return the contribution (K,) of autocovariances at longer lags to the products.
+        """Return the contribution (K,) of autocovariances at longer lags to the products; zero if
+        all are zero.
 
         It is tr(D_k M C M) with their Toeplitz matrix C, whose k-th diagonals are zero.
 
@@ -99,7 +105,7 @@ class LaggedProducts:
         information : Information
             Its information.
         tails : sequence of (T,) arrays
-            Autocovariances of each experiment, zero at the lags in `lags`.
+            Autocovariances of each experiment by lag, zero at the lags in `lags`.
         """
         if not any(tail.any() for tail in tails):
             return np.zeros_like(self.products)
@@ -113,7 +119,8 @@ class LaggedProducts:
             strict=True,
         ):
             smoothed = (
-                toeplitz_product(tail, slope) * block.channels[2][:, :, None]
+                toeplitz_product(tail, slope)
+                * block.channels.is_measured[:, :, None]
             )
             total += np.einsum("tcr,tcs->rs", slope, smoothed, optimize=True)
             overlap += [
@@ -148,7 +155,8 @@ def lagged_products(
     for block, slope, last in zip(
         fit.blocks, information.scaled_jacobians, lags, strict=True
     ):
-        residual, _, present = block.channels
+        residual = block.channels.residual
+        present = block.channels.is_measured
         width = slope.shape[2]
         within = np.zeros((last + 1, width, width))
         overlap = np.zeros((last + 1, last + 1))
@@ -189,7 +197,9 @@ def lagged_products(
 
 
 def toeplitz_product(autocorrelation: Array, values: Array) -> Array:
-    """Return the product of the Toeplitz matrix of an autocorrelation (T,) with values (T, …)."""
+    """Return the product of the symmetric Toeplitz matrix of an autocorrelation by lag (T,) with
+    values (T, …), along their first axis.
+    """
     columns = values.reshape(len(values), -1)
     product = np.asarray(
         matmul_toeplitz(autocorrelation, columns), dtype=np.float64
@@ -199,7 +209,8 @@ def toeplitz_product(autocorrelation: Array, values: Array) -> Array:
 
 def _lagged(columns: Array, is_present: Mask, lag: int) -> Array:
     """Return D_k times the columns (T, r) of one channel, with D_k the symmetric matrix of ones at
-    the lag k (the identity for k = 0), at its present samples (T,).
+    the lag k, zero at samples that are not present (T,); for k = 0 the columns themselves, as
+    they are.
     """
     if lag == 0:
         return columns
@@ -222,6 +233,13 @@ def fit_autoregression(autocovariance: Array, samples: float) -> Array:
         Autocovariances; the largest order is `lags`.
     samples : float
         Number of independent samples.
+
+    Returns
+    -------
+    (order,) array
+        Coefficients of x_t = Σ c_k x_{t−k} + noise, k from 1; empty for white noise, and if the
+        variance is not positive. Partial autocorrelations are limited to ±`LARGEST_PARTIAL`, so
+        that the process is stationary.
     """
     coefficients = np.zeros(0)
     innovation = autocovariance[0]
@@ -250,8 +268,8 @@ def fit_autoregression(autocovariance: Array, samples: float) -> Array:
 
 
 def process_autocorrelation(coefficients: Array, samples: int) -> Array:
-    """Return the autocorrelation (samples,) of an autoregressive process with coefficients
-    (order,), from its Yule–Walker equations; white noise for order 0.
+    """Return the autocorrelation by lag (samples,), beginning with 1, of an autoregressive process
+    with coefficients (order,), from its Yule–Walker equations; white noise for order 0.
     """
     order = len(coefficients)
     correlation = np.zeros(samples + order)
@@ -296,7 +314,8 @@ class Dependence:
     shared_p : float
         p-value of the correlations among channels, for independent errors.
     space_p : float
-        p-value of the correlations of neighbours on the surface.
+        p-value of the correlations of neighbours on the surface, after Bonferroni, so that it may
+        exceed 1; 1 if nothing is tested.
     """
 
     lag1: float
@@ -306,18 +325,22 @@ class Dependence:
 
     @property
     def is_correlated_in_time(self) -> bool:
-        """Whether the errors persist, significantly and noticeably."""
+        """Whether the absolute `lag1` is significant at the level `SIGNIFICANCE` and above
+        `NOTICEABLE`; false if its deviation is infinite.
+        """
         limit = float(normal_isf(SIGNIFICANCE / 2)) * self.lag1_deviation
         return abs(self.lag1) > max(limit, NOTICEABLE)
 
     @property
     def is_correlated_among_channels(self) -> bool:
-        """Whether markers or axes have errors in common, significantly."""
+        """Whether markers or axes have errors in common: `shared_p` below `SIGNIFICANCE`."""
         return self.shared_p < SIGNIFICANCE
 
     @property
     def is_correlated_in_space(self) -> bool:
-        """Whether errors of neighbours on the surface are correlated, significantly."""
+        """Whether errors of neighbours on the surface are correlated: `space_p` below
+        `SIGNIFICANCE`.
+        """
         return self.space_p < SIGNIFICANCE
 
     @property
@@ -362,6 +385,11 @@ def analyse_dependence(
 
     Residuals at the level of rounding count as uncorrelated. Blocks with a floor of noise are not
     tested in space.
+
+    Notes
+    -----
+    Without consecutive samples `lag1` is 0 with an infinite deviation. Huber's weights are those of
+    the residuals of the fit.
     """
     if fit.chi_squared <= ROUNDING**2 * fit.measurement_count:
         return Dependence(0.0, np.inf, shared_p=1.0)
@@ -399,12 +427,13 @@ def analyse_dependence(
 
 def _channel_correlation_p(fit: LinearisedFit) -> float:
     """Return the p-value of the Lagrange-multiplier test of Breusch and Pagan (1980) on all pairs
-    of channels within each block; 1 without pairs.
+    of channels within each block that have more than two common samples; 1 without pairs.
     """
     statistic = 0.0
     pairs = 0
     for block in fit.blocks:
-        residual, _, present = block.channels
+        residual = block.channels.residual
+        present = block.channels.is_measured
         counts = present.T.astype(float) @ present
         of_channel = np.sqrt(
             np.sum(residual**2, axis=0) / np.maximum(np.diag(counts), 1)
@@ -420,7 +449,18 @@ def _channel_correlation_p(fit: LinearisedFit) -> float:
 def error_processes(
     fit: LinearisedFit, information: Information
 ) -> tuple[ErrorProcess, ...]:
-    """Estimate the error process of each experiment."""
+    """Estimate the error process of each block of a fit, in their order.
+
+    The order of the autoregression is at most `MAX_ORDER`, and one per `SAMPLES_PER_ORDER` samples.
+    Autocovariances at few and at longer lags are computed in turn, `ROUNDS` times or until they
+    change by less than `SETTLED`.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+    information : Information
+        Information of the fit.
+    """
     orders = [
         min(MAX_ORDER, len(block.t_s) // SAMPLES_PER_ORDER)
         for block in fit.blocks
@@ -439,7 +479,7 @@ def error_processes(
         before, autocovariances = (
             autocovariances,
             moments.autocovariances(
-                moments.long_lag_products(fit, information, tails)
+                moments.long_lag_products(fit, information, tails=tails)
             ),
         )
         if np.allclose(
@@ -464,8 +504,16 @@ def error_processes(
 def _long_lag_autocovariances(
     block: ResidualBlock, autocovariance: Array, order: int
 ) -> Array:
-    """Return the autocovariances (T,) of a block's errors by an autoregression of an order, at lags
-    beyond those given (K,); zero at the given ones.
+    """Return the autocovariances (T,) of a block's errors by lag, by an autoregression, at lags
+    beyond given ones; zero at the given ones.
+
+    Parameters
+    ----------
+    block : ResidualBlock
+    autocovariance : (K,) array
+        Autocovariances at the first lags, K > order; a negative variance counts as zero.
+    order : int
+        Largest order of the autoregression, which is fitted to the first order + 1 of them.
     """
     coefficients = _autoregression_of(block, autocovariance[: order + 1])
     tail = max(0.0, autocovariance[0]) * process_autocorrelation(
@@ -476,10 +524,11 @@ def _long_lag_autocovariances(
 
 
 def _autoregression_of(block: ResidualBlock, autocovariance: Array) -> Array:
-    """Return the coefficients (order,) of the autoregression of a block's errors, from
-    autocovariances (order + 1,).
+    """Return the coefficients of the autoregression of a block's errors, at most `order`, from
+    autocovariances (order + 1,), see `fit_autoregression`.
     """
-    residual, _, present = block.channels
+    residual = block.channels.residual
+    present = block.channels.is_measured
     channels = _effective_channels(_channel_covariance(residual, present))
     return fit_autoregression(
         autocovariance, _mean_sample_count(present) * channels
@@ -497,10 +546,23 @@ def _mean_sample_count(present: NDArray[np.bool_]) -> float:
 def _error_process(
     block: ResidualBlock, slope: Array, autocovariance: Array
 ) -> ErrorProcess:
-    """Return the error process of one block, from autocovariances (K,) of its errors and
-    derivatives `slope` (T, 3M, r) of its residuals.
+    """Return the error process of one block.
+
+    If samples are not more than channels, the covariance among channels is that of
+    `estimate_spatial_correlation` if there is one; with a floor of noise it is at least that of
+    independent errors of the stated σ.
+
+    Parameters
+    ----------
+    block : ResidualBlock
+    slope : (T, 3M, r) array
+        D = S L of the block.
+    autocovariance : (K,) array
+        Autocovariances of its errors at lags 0 … K − 1. If the variance is not positive, the errors
+        count as white, with the mean square of the residuals.
     """
-    residual, _, present = block.channels
+    residual = block.channels.residual
+    present = block.channels.is_measured
     over_space = estimate_spatial_correlation(block, slope)
     measured = present.any(axis=0)
     raw_variance = float(np.sum(residual**2)) / max(1, present.sum())
@@ -546,7 +608,7 @@ def _error_process(
 
 def _effective_channels(covariance: Array) -> float:
     """Return the number of equal independent channels whose mean variance would be known as
-    precisely.
+    precisely, (tr Σ)² / tr Σ², for a covariance Σ (c, c); 1 if it is zero.
     """
     squares = float(np.sum(covariance**2))
     return float(np.trace(covariance)) ** 2 / squares if squares > 0 else 1.0
@@ -608,8 +670,22 @@ def score_covariance(
 def _innovations(
     residual: Array, present: NDArray[np.bool_], coefficients: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the part of the residuals (T, 3M) that earlier samples do not predict, (T − order,
-    3M), and a mask of where it is known: where all these samples are present.
+    """Return the part of the residuals that earlier samples do not predict, and where it is known.
+
+    Parameters
+    ----------
+    residual : (T, 3M) array
+        Residuals, zero where missing.
+    present : (T, 3M) array of bool
+        Whether each is measured.
+    coefficients : (order,) array
+        Coefficients of the autoregression.
+
+    Returns
+    -------
+    ((T − order, 3M) array, (T − order, 3M) array of bool)
+        Innovations, zero where unknown, and the mask: known where the sample and all those that
+        predict it are present.
     """
     order = len(coefficients)
     innovation = residual[order:].copy()
@@ -622,7 +698,7 @@ def _innovations(
 
 
 def _channel_covariance(residual: Array, present: NDArray[np.bool_]) -> Array:
-    """Return the covariance (3M, 3M) of channels about zero over samples that both have.
+    """Return the covariance (3M, 3M) of channels about zero, over samples that both channels have.
 
     It is made positive semidefinite if samples are missing, and zero for a pair without a common
     sample before that.

@@ -80,17 +80,20 @@ class NoiseLevel:
 
     @property
     def is_smaller(self) -> bool:
-        """Whether the residuals are significantly smaller than σ."""
+        """Whether the residuals are significantly smaller than σ: `smaller_p` below `SMALLER`."""
         return self.smaller_p < SMALLER
 
     @property
     def is_unequal(self) -> bool:
-        """Whether markers differ more than by chance."""
+        """Whether markers differ more than by chance: `unequal_p` below `UNEQUAL`."""
         return self.unequal_p < UNEQUAL
 
     @property
     def suggested_noise(self) -> Noise:
-        """Source of the variance that the residuals suggest."""
+        """Source of the variance that the residuals suggest: "by-marker" if markers are unequal,
+        else "estimated" if the residuals are significantly larger (`LARGER`) or smaller than σ,
+        else "given".
+        """
         if self.is_unequal:
             return "by-marker"
         return (
@@ -120,12 +123,13 @@ class NoiseLevel:
     def score_covariance(
         self, kind: Noise, information: Information, shared: int
     ) -> tuple[Array, Array]:
-        """Return the covariance of the score.
+        """Return the covariance of the score Sᵀe for independent errors, with that of priors and of
+        other known errors.
 
         Parameters
         ----------
         kind : {"given", "estimated", "by-marker"}
-            Source of the variance.
+            Source of the variance: stated σ, `pooled` or `variances`.
         information : Information
             Information of the fit.
         shared : int
@@ -176,6 +180,11 @@ def estimate_noise_level(
         The fit.
     information : Information
         Its information.
+
+    Notes
+    -----
+    Sums of squares that Huber's loss has shortened are corrected by `shortened_power`. If residuals
+    are rounding, or the measurements are not more than the parameters, p-values are 1.
     """
     names = []
     squares = []
@@ -223,7 +232,7 @@ def estimate_noise_level(
 def _prior_score_covariance(block: ResidualBlock, slope: Array) -> Array:
     """Return the covariance (r, r) of the score due to a block whose noise is at least as stated.
 
-    Residuals larger than stated increase it.
+    It is DᵀD times the mean square of the residuals per degree of freedom, but at least once.
 
     Parameters
     ----------
@@ -247,8 +256,9 @@ def _prior_score_covariance(block: ResidualBlock, slope: Array) -> Array:
 
 
 def disturbance_samples(fit: LinearisedFit) -> list[Array]:
-    """Return samples (K, T, M, 3) of known errors for every block; zero where there are
-    none and where measurements are missing.
+    """Return samples (K, T, M, 3) of known errors for every block, zero where measurements are
+    missing and in blocks without known errors; K is that of the first block with known errors, 0
+    if there is none.
     """
     of_blocks = [block.disturbances for block in fit.blocks]
     count = next((len(each) for each in of_blocks if each is not None), 0)
@@ -271,12 +281,12 @@ def project_errors(
     information : Information
         Information of the fit.
     errors : sequence of (K, T, M, 3) arrays
-        Samples for each block.
+        Samples for each block, zero where nothing is measured.
 
     Returns
     -------
     ((K, r) array, list of (K, T, M, 3) arrays)
-        Scores, and the residuals that remain after the fit.
+        Scores DᵀE of all blocks together, and the residuals M e that remain after the fit.
     """
     error_rows = [each.reshape(len(each), each.shape[1], -1) for each in errors]
     pairs = [*zip(error_rows, information.scaled_jacobians, strict=True)]
@@ -408,10 +418,10 @@ def _bartlett(squares: Array, freedoms: Array) -> float:
 
 
 def shortened_power(block: ResidualBlock) -> float:
-    """Return the share of white noise's power that remains in residuals shortened by Huber's loss;
-    1 without outliers.
+    """Return the share of white noise's power that remains in residuals of a block shortened by
+    Huber's loss; 1 without outliers.
 
-    It is E min(χ², k²) / E χ² for three axes and the threshold k.
+    It is E min(χ², k²) / E χ² for three axes and the largest shortened residual k.
     """
     if not block.is_outlier.any():
         return 1.0

@@ -66,7 +66,7 @@ class RecordingComparison:
         Their standard deviations; NaN likewise.
     sensitivities : (p, nq n) array
         Changes of the joint estimates if a parameter differs in one recording by its standard
-        deviation between recordings.
+        deviation between recordings; column n k + e for parameter k and recording e, from 0.
     """
 
     recordings: tuple[str, ...]
@@ -90,19 +90,24 @@ class RecordingComparison:
 
     @property
     def degrees_of_freedom(self) -> NDArray[np.int64]:
-        """Degrees of freedom (nq,) of χ²."""
+        """Degrees of freedom (nq,) of χ²: the number of recordings that determine the parameter,
+        less one, at least 0.
+        """
         return np.maximum(np.isfinite(self.deviations).sum(axis=0) - 1, 0)
 
     @property
     def is_disagreeing(self) -> NDArray[np.bool_]:
-        """Mask (nq,) of the parameters on which the recordings disagree more than by chance."""
+        """Mask (nq,) of the parameters on which the recordings disagree more than by chance:
+        p-value of χ² below `SIGNIFICANT` over the number of parameters.
+        """
         freedom = self.degrees_of_freedom
         p = chi2_sf(self.chi_squared, np.maximum(freedom, 1))
         return np.asarray((freedom > 0) & (p < SIGNIFICANT / len(freedom)))
 
     def widen(self, variances: Array) -> Array:
         """Return the variances (nq,) of q of the joint fit, increased for parameters on which the
-        recordings disagree.
+        recordings disagree: to χ²/f times the lesser of the variance and that of the mean of the
+        recordings, if that is more. The argument is not modified.
         """
         ratio = self.chi_squared / np.maximum(self.degrees_of_freedom, 1)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -114,7 +119,9 @@ class RecordingComparison:
 
 
 def blocks_by_recording(fit: LinearisedFit) -> dict[str, list[int]]:
-    """Return the indices of the blocks of each recording, by its name."""
+    """Return the indices of the blocks of each recording, by its name, in the order of the
+    blocks.
+    """
     blocks: dict[str, list[int]] = {}
     for k, block in enumerate(fit.blocks):
         blocks.setdefault(block.name, []).append(k)
@@ -122,8 +129,11 @@ def blocks_by_recording(fit: LinearisedFit) -> dict[str, list[int]]:
 
 
 def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
-    """Yield for each recording the fit to it alone, and the step from the joint parameters to its
-    own, in the order of its names.
+    """Yield for each recording the fit to it alone, after a Gauss–Newton step, and this step (m,)
+    from the joint parameters, in the order of `blocks_by_recording`.
+
+    Its m parameters are the shared ones, then the nuisance parameters of the recording and those
+    shared between recordings.
     """
     for name, block_numbers in blocks_by_recording(fit).items():
         # What recordings share they have to find alone, too.
@@ -142,19 +152,20 @@ def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
 def fit_part(
     fit: LinearisedFit, blocks: Sequence[ResidualBlock], columns: Index
 ) -> tuple[LinearisedFit, Array]:
-    """Return the fit of some parameters to some data alone, and these parameters less the joint
-    ones.
+    """Return the fit of some parameters to some data alone, after a Gauss–Newton step, and this
+    step (m,): these parameters less the joint ones.
 
-    Priors of shared parameters belong to all the data and are left out.
+    Priors of shared parameters belong to all the data and are left out; no parameter counts as at a
+    bound.
 
     Parameters
     ----------
     fit : LinearisedFit
-        The joint fit.
+        The joint fit; not modified.
     blocks : sequence of ResidualBlock
         Data of the part.
-    columns : array
-        Indices of the parameters that are fitted.
+    columns : (m,) array
+        Indices of the parameters that are fitted; shared ones are those below `fit.shared_count`.
     """
     prior_residual, prior_slope = (
         np.where(columns < fit.shared_count, 0.0, prior[columns])
@@ -175,22 +186,42 @@ def fit_part(
     return alone.after_step(step), step
 
 
+@dataclass(frozen=True, eq=False)
+class RecordingEstimate:
+    """Shared parameters by one recording alone, in the solver's coordinates.
+
+    Attributes
+    ----------
+    step : (nq,) array
+        Estimates less those of the joint fit.
+    variances : (nq,) array
+        Their variances; NaN or infinite where the recording does not determine them.
+    independent_variances : (nq,) array
+        Variances for independent errors of the stated σ.
+    """
+
+    step: Array
+    variances: Array
+    independent_variances: Array
+
+
 def compare_recordings(
-    fit: LinearisedFit, alone: Mapping[str, tuple[Array, Array, Array]]
+    fit: LinearisedFit, alone: Mapping[str, RecordingEstimate]
 ) -> RecordingComparison:
     """Compare recordings by the result of each alone; a parameter that a recording hardly
-    determines has NaN there.
+    determines, with a standard deviation of q of at least `TELLING`, has NaN there.
 
     Parameters
     ----------
     fit : LinearisedFit
         The joint fit.
-    alone : mapping of str to three arrays, each (nq,)
-        For each recording: step from the joint answer, variances of q, and variances of q for
-        independent errors of the stated σ.
+    alone : mapping of str to RecordingEstimate
+        Estimates by recording, at least one.
     """
-    steps, variances, independent = (
-        np.array(each) for each in zip(*alone.values(), strict=True)
+    steps = np.array([each.step for each in alone.values()])
+    variances = np.array([each.variances for each in alone.values()])
+    independent = np.array(
+        [each.independent_variances for each in alone.values()]
     )
     deviations = np.sqrt(variances)
     is_determined = deviations < TELLING
@@ -209,8 +240,17 @@ def compare_recordings(
 def _sensitivities_to_differences(
     fit: LinearisedFit, names: Sequence[str], excess: Array
 ) -> Array:
-    """Return `RecordingComparison.sensitivities` (p, nq n) for n recordings, by name; zero for
-    parameters at a bound.
+    """Return `RecordingComparison.sensitivities` (p, nq n) for n recordings; zero for parameters at
+    a bound, and for those without variance between recordings.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+        The joint fit.
+    names : (n,) sequence of str
+        Names of recordings, those of blocks of the fit.
+    excess : (n, nq) array
+        Variances of q by each recording alone over those for independent errors of the stated σ.
     """
     own = [
         least_squares_of_blocks(fit, blocks_by_recording(fit)[name])

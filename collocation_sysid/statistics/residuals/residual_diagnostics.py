@@ -99,7 +99,9 @@ class MarkerDiagnosis:
 
 
 def diagnose_markers(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
-    """Diagnose every marker that was measured, experiment by experiment."""
+    """Diagnose every marker that has a sample, experiment by experiment; sensors other than markers
+    are left out.
+    """
     level = estimate_noise_level(fit, factorise_information(fit))
     alone = {
         outlier.series: outlier for outlier in reversed(remove_outliers(fit)[1])
@@ -208,8 +210,8 @@ def _diagnose_marker(
 
 
 def _rms_m(block: ResidualBlock, marker: int) -> float:
-    """Return the root mean square distance of a marker from its measurements [m], including
-    outliers.
+    """Return the root mean square distance of a marker (index) with a sample from its measurements
+    [m], including outliers at their full distance.
     """
     misfit = block.residual if block.misfit is None else block.misfit
     squares = np.sum(misfit[:, marker] ** 2) / block.is_present[:, marker].sum()
@@ -217,8 +219,11 @@ def _rms_m(block: ResidualBlock, marker: int) -> float:
 
 
 def _lag1(varying: Array, present: NDArray[np.bool_]) -> float:
-    """Return the autocorrelation of consecutive present samples of residuals (T, 3) about
-    their mean; 0 without pairs.
+    """Return the autocorrelation of consecutive present samples of residuals (T, 3) about their
+    mean, pooled over the axes; 0 without pairs or power.
+
+    `varying` (T, 3) are the residuals less their mean, zero where missing; `present` (T,) is
+    whether there is a sample.
     """
     pairs = np.sum(present[1:] & present[:-1])
     samples = present.sum()
@@ -230,7 +235,11 @@ def _lag1(varying: Array, present: NDArray[np.bool_]) -> float:
 
 def _largest_peak(varying: Array, t_s: Array) -> tuple[float, float]:
     """Return the frequency [Hz] of the largest peak in the periodogram of evenly sampled values (T,
-    3), and its share of the power; zeros if there is none.
+    k), and the share of the power in it and `PEAK_BINS` bins on both sides; zeros for fewer than
+    four samples or without power.
+
+    The frequency is the mean of these bins, weighted by their power. The mean of the values must be
+    zero.
     """
     if len(t_s) < 4:
         return 0.0, 0.0
@@ -313,8 +322,8 @@ def _message(
 
 
 def _white_noise_message(diagnosis: MarkerDiagnosis) -> str:
-    """Return the description of white residuals by their size; a few samples may differ
-    from σ by chance.
+    """Return the description of uncorrelated residuals by their size compared with σ; a few samples
+    may differ by chance.
     """
     factor = diagnosis.noise_factor
     chance = normal_isf(SIGNIFICANCE / 2) / np.sqrt(6 * diagnosis.samples)
@@ -328,8 +337,16 @@ def _white_noise_message(diagnosis: MarkerDiagnosis) -> str:
 def _oscillation_message(
     diagnosis: MarkerDiagnosis, t_s: Array, motion: Array
 ) -> str:
-    """Return the description of oscillating residuals at times (T,) [s], compared with the
-    frequency of the motion, which derivatives `motion` (T, k) of the residuals show.
+    """Return the description of oscillating residuals: a slow drift for fewer than `FEWEST_PERIODS`
+    periods, else the frequency, compared with that of the motion.
+
+    Parameters
+    ----------
+    diagnosis : MarkerDiagnosis
+    t_s : (T,) array
+        Times [s].
+    motion : (T, k) array
+        Derivatives of the residuals, which have the frequency of the motion.
     """
     share = (
         f"{100 * diagnosis.oscillating_share:.0f} % of the squared residuals"
@@ -386,7 +403,9 @@ class Outlier:
 
     @property
     def concern(self) -> Concern:
-        """Concern about this sample, with the remedy."""
+        """Concern about this sample, of grade "check": "residuals/first" for a relaxed start, else
+        "residuals/outlier".
+        """
         code = (
             "residuals/first" if self.is_relaxed_start else "residuals/outlier"
         )
@@ -403,6 +422,9 @@ def remove_outliers(
 ) -> tuple[LinearisedFit, tuple[Outlier, ...]]:
     """Return the fit without its outliers, which count as missing, and the outliers; the same fit
     and an empty tuple if there are none.
+
+    Outliers of each marker are removed one after the other, at most a share `EXCEPTIONS` of its
+    samples, but at least one is allowed. The parameters are not fitted again.
     """
     blocks = []
     outliers = []
@@ -432,7 +454,9 @@ def _find_outlier(
 ) -> Outlier | None:
     """Return the sample that dominates the residuals of a marker (index); None if none does.
 
-    It would occur by chance with a probability below `significance`.
+    It has at least the share `MOST` of the marker's power, which by chance would occur with a
+    probability of at most `significance` for any marker of the block; a marker with fewer than
+    `FEWEST_SAMPLES` samples has none.
     """
     power = np.sum(block.residual[:, marker] ** 2, axis=1)
     count = int(block.is_present[:, marker].sum())
@@ -461,7 +485,7 @@ def _find_outlier(
 def _without_sample(
     block: ResidualBlock, marker: int, sample: int
 ) -> ResidualBlock:
-    """Return the block without one sample of a marker, both given by index: it counts as
+    """Return a copy of the block without one sample of a marker, both given by index: it counts as
     missing.
     """
     is_included: Mask = np.ones(block.is_present.shape, dtype=bool)

@@ -13,6 +13,7 @@ directions that the parameters do not affect (restricted maximum likelihood; Pat
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -70,8 +71,15 @@ def estimate_spatial_correlation(
     -------
     SpatialCorrelation or None
         None if the block has no places, no samples, or too few points in each.
+
+    Notes
+    -----
+    At most `MOST_SAMPLES` samples are used. The result is the best of `SHARES` and `LENGTHS`
+    lengths, also where independent errors would be as likely; then the p-value is 1. The covariance
+    is that of all n channels.
     """
-    residual, _, present = block.channels
+    residual = block.channels.residual
+    present = block.channels.is_measured
     if block.places_m is None or not present.any():
         return None
     distances_m = np.linalg.norm(
@@ -98,15 +106,17 @@ def estimate_spatial_correlation(
         ]
         if free.shape[1] > 2:
             contrasts.append(
-                (
+                _Contrasts(
                     free.T @ residual[t, present_channels],
                     free,
-                    distances_m[np.ix_(present_channels, present_channels)],
+                    distances_m=distances_m[
+                        np.ix_(present_channels, present_channels)
+                    ],
                 )
             )
     if not contrasts:
         return None
-    count = sum(len(z) for z, _, _ in contrasts)
+    count = sum(len(each.values) for each in contrasts)
     nearest = float(
         np.median(np.where(distances_m > 0, distances_m, np.inf).min(axis=1))
     )
@@ -124,7 +134,7 @@ def estimate_spatial_correlation(
     least, level, share, length = min(candidates)
     p = float(chi2_sf(max(0.0, white - least), 2))
     shape = _correlation_matrix(distances_m, share, length_m=float(length))
-    share_known = count / max(1, sum(len(f) for _, f, _ in contrasts))
+    share_known = count / max(1, sum(len(each.matrix) for each in contrasts))
     freedom = max(
         1.0,
         len(contrasts)
@@ -148,16 +158,33 @@ def _correlation_matrix(
     )
 
 
+class _Contrasts(NamedTuple):
+    """Combinations of the residuals of one sample that the parameters do not affect.
+
+    Attributes
+    ----------
+    values : (k,) array
+        Contrasts z, in units of σ.
+    matrix : (n, k) array
+        Orthonormal columns that form them from the n channels of the sample.
+    distances_m : (n, n) array
+        Distances of the channels' points on the undeformed body [m].
+    """
+
+    values: Array
+    matrix: Array
+    distances_m: Array
+
+
 def _restricted_likelihood(
-    contrasts: list[tuple[Array, Array, Array]], share: float, length_m: float
+    contrasts: list[_Contrasts], share: float, length_m: float
 ) -> tuple[float, float]:
     """Return −2 log-likelihood up to a constant, and the variance s² that maximises the likelihood.
 
     Parameters
     ----------
-    contrasts : list of (array, array, array)
-        For each sample, contrasts z (k,), the matrix (n, k) that forms them from n points, and the
-        distances (n, n) of the points [m].
+    contrasts : list of _Contrasts
+        Contrasts of each sample, at least one.
     share : float
         Share a of the variance that is correlated.
     length_m : float
@@ -166,14 +193,13 @@ def _restricted_likelihood(
     squares = 0.0
     logarithms = 0.0
     count = 0
-    for z, free, distances_m in contrasts:
-        root = np.linalg.cholesky(
-            free.T
-            @ _correlation_matrix(distances_m, share, length_m=length_m)
-            @ free
+    for each in contrasts:
+        correlation = _correlation_matrix(
+            each.distances_m, share, length_m=length_m
         )
-        squares += float(np.sum(np.linalg.solve(root, z) ** 2))
+        root = np.linalg.cholesky(each.matrix.T @ correlation @ each.matrix)
+        squares += float(np.sum(np.linalg.solve(root, each.values) ** 2))
         logarithms += 2 * float(np.log(np.diag(root)).sum())
-        count += len(z)
+        count += len(each.values)
     variance = max(squares / count, 1e-300)
     return count * float(np.log(variance)) + logarithms, variance
