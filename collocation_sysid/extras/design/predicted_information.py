@@ -633,8 +633,12 @@ class LinearRecording:
         return cls(recording, still, np.array(answers), length)
 
     def information(self, motion: HandMotion) -> Array:
-        """Return the information (nq, nq) of a motion about the shared parameters, see
-        `shared_information`.
+        """Return the information (nq, nq) of a motion about the shared parameters, to first order
+        in the motion, see `shared_information`. s         course =
+        motion.derivatives(recording.since_start_s)[0] ==>         course =
+        motion.derivatives(recording.since_start_s).value s         # What was simulated is highest
+        at a sample before which a motion from rest is nothing yet. ==>         # The pulses are
+        highest at sample CENTRE; before it a motion from rest is negligible.
         """
         recording = self.recording
         course = motion.derivatives(recording.since_start_s)[0]

@@ -73,7 +73,7 @@ LIKELY = 1.0
 def model_rows(
     planned: Sequence[PlannedRun], records: Mapping[str, Record]
 ) -> list[Row]:
-    """Return one row for each model, in their order.
+    """Return one row for each model, in the order of the first run of each.
 
     Parameters
     ----------
@@ -85,7 +85,12 @@ def model_rows(
     Returns
     -------
     list of Row
-        Values are None if they are not known.
+        By key: "model", "status" ("missing" if the fit to all recordings is not done), "converged",
+        "free" (number of parameters), "unit" of the errors, "rms" of the fit to all, "held_out_rms"
+        over all predictions, "predictions" and "blocks" by recording, "failures" (messages by
+        recording), "evidence", "parameters", "budget", "total_s", "independent", "delta_aic" (AIC
+        less the smallest), "log_ratio" and "log_ratio_error" (prediction error relative to the
+        best), "chosen". Values are None if they are not known.
     """
     of_model: dict[str, dict[str, Any]] = {}
     for run in planned:
@@ -138,7 +143,9 @@ def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
 
 
 def _pooled_rms(predictions: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the RMS over all predictions; None if one is missing or their units differ."""
+    """Return the RMS over the samples of all predictions; None if there is none, one is missing, or
+    their units differ.
+    """
     if not predictions or any(each.get("rms") is None for each in predictions):
         return None
     if len({each["unit"] for each in predictions}) > 1:
@@ -208,18 +215,19 @@ def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
 
 
 def _best_prediction(rows: Sequence[Row]) -> Row | None:
-    """Return the converged model with the smallest prediction error for held-out data; None if
-    nothing was predicted.
+    """Return the converged model with the smallest prediction error for held-out data; None if no
+    converged model has predicted all recordings.
     """
     predicted = [r for r in rows if r["converged"] and r["held_out_rms"]]
     return min(predicted, key=lambda r: r["held_out_rms"], default=None)
 
 
 def chosen_row(rows: Sequence[Row]) -> Row | None:
-    """Return the model to use: the one with fewest parameters among those that predict equally
-    well; None if none could be fitted.
+    """Return the model to use: the one with fewest parameters among those that predict as well as
+    the best within `LIKELY` standard errors, of several the one with the smallest error.
 
-    Without predictions it is the one with the least AIC.
+    If nothing was predicted it is the one with the least AIC; None if none has an AIC either. The
+    rows must have "delta_aic" and "log_ratio".
     """
     best = _best_prediction(rows)
     if best is None:
@@ -244,7 +252,8 @@ def _equally_good(rows: Sequence[Row], errors: float) -> list[Row]:
 
 
 def advice(rows: Sequence[Row]) -> str:
-    """Return in words which model to use, why, and how certain that is.
+    """Return in words which model to use, why, and how certain that is, and in which estimates
+    equally good laws disagree.
 
     Parameters
     ----------
@@ -343,8 +352,8 @@ def display_unit(unit: str) -> tuple[float, str]:
 
 
 def _log_ratio_between(chosen: Row, rival: Row) -> tuple[float, float]:
-    """Return the logarithmic ratio of the rival's error to the chosen model's, and its
-    standard error.
+    """Return the logarithm of the ratio of the rival's prediction error to the chosen model's, and
+    its standard error: the larger of those of both relative to the best.
     """
     ratio = rival["log_ratio"] - chosen["log_ratio"]
     return ratio, max(rival["log_ratio_error"], chosen["log_ratio_error"])
@@ -372,7 +381,10 @@ def _certainty(chosen: Row, rival: Row) -> str:
 
 
 def model_notes(rows: Sequence[Row]) -> list[str]:
-    """Return notes that explain the table and list failures."""
+    """Return notes that explain the table and list failures: what is held out, the equivalent
+    number of independent measurements if known, models that did not converge, and failed
+    predictions. There must be at least one row.
+    """
     names = rows[0]["predictions"]
     test_data = (
         "each recording in turn"
@@ -490,12 +502,13 @@ def _independent_measurements(
 
 # Share of a single recording that is fitted.
 FITTED = 2 / 3
-# Parts in time of what is held out: longer than most errors persist, and enough to see a scatter.
+# Number of blocks in time of held-out data: each longer than most errors persist, and enough of
+# them for a standard deviation.
 BLOCKS = 8
 
 
 def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
-    """Fit a model to all recordings, or to all but the held-out one, and return its fit and
+    """Fit a model to all recordings, or to all but the held-out data, and return its fit and
     prediction.
 
     Parameters
@@ -505,13 +518,20 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     method : str
         Name of the method.
     test_name : str
-        Recording that is predicted; "" to fit all.
+        Fitted recording that is predicted, see `reserve_test_data`; "" to fit all.
 
     Returns
     -------
     dict
-        Status, parameters and RMS; with converged fits also "evidence" and "budget" if all are
-        fitted, else "prediction", which is None with a "failure" if the simulation failed.
+        "status", "converged", "rms" by unit (None where nothing is measured), "parameters", "free"
+        (names) and "time_s". If the fit converged also "evidence" and "budget" if all are fitted,
+        else "prediction", which is None with a "failure" if the simulation failed. A fit that
+        cannot be linearised counts as not converged.
+
+    Raises
+    ------
+    InputError
+        If the problem cannot be solved with the method.
     """
     known, start_s = (
         reserve_test_data(problem, test_name)
@@ -598,7 +618,15 @@ def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
     """Return the problem without a recording, or without its end, and the time of the first
     held-out sample [s].
 
-    The end of a single recording is held out. The time is −∞ if the complete recording is held out.
+    If it is the only fitted recording, the measurements after two thirds of its duration are
+    removed: markers and wrenches become NaN, depth images are left out, and custom sensors become
+    NaN unless nothing would remain. Otherwise the recording becomes one for validation, and the
+    time is −∞. `problem` is not modified.
+
+    Raises
+    ------
+    StopIteration
+        If the problem has no recording with this name.
     """
     chosen = next(e for e in problem.experiments if e.name == name)
     if len(fitted_recordings(problem)) > 1:
