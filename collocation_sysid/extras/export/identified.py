@@ -39,7 +39,17 @@ class IdentifiedBranch:
 
 @dataclass(frozen=True)
 class PowerTerm:
-    """Term of Ogden's law or of a compressible foam: μ_p [Pa], α_p, and β_p of a foam."""
+    """Term p of Ogden's law or of a compressible foam.
+
+    Attributes
+    ----------
+    mu_pa : float
+        Constant μ_p.
+    alpha : float
+        Exponent α_p.
+    beta : float
+        Constant β_p of a foam; 0 for Ogden's law.
+    """
 
     mu_pa: float
     alpha: float
@@ -67,7 +77,8 @@ class IdentifiedRegion:
         Name of the damping law.
     gamma_r_s, gamma_m_1_s : float
         Stiffness-proportional and mass-proportional damping, see the glossary.
-    branches : tuple of BranchIndices
+    branches : tuple of IdentifiedBranch
+        Viscoelastic branches; empty without memory.
     """
 
     name: str
@@ -86,7 +97,7 @@ class IdentifiedRegion:
 
     @property
     def kappa_pa(self) -> float:
-        """Bulk modulus κ = λ + ⅔ μ."""
+        """Bulk modulus κ = λ + ⅔ μ [Pa]."""
         return self.lambda_pa + 2 / 3 * self.mu_pa
 
     @property
@@ -104,9 +115,12 @@ class IdentifiedRegion:
 
 
 def without_obstacles(experiment: Experiment) -> Experiment:
-    """Return an experiment without its obstacles, which simulators have as separate objects.
+    """Return a copy of an experiment without its obstacles, which simulators have as separate
+    objects.
 
-    Measurements are replaced by one placeholder marker, because there may be none on the body.
+    Measurements are replaced by one marker at the first node with zeros as positions, because an
+    experiment must have some and all of them may be of the obstacles. Initial positions and
+    velocities are those of the body's nodes alone.
 
     Raises
     ------
@@ -122,7 +136,7 @@ def without_obstacles(experiment: Experiment) -> Experiment:
         else positions_m[:own]
         for name in ("start_positions_m", "start_velocities_m_s")
     }
-    # Exports need no measurements, and all of them may be of the obstacles.
+    # Placeholder: see the docstring.
     some = Markers(
         t_s,
         np.zeros((len(t_s), 1, 3)),
@@ -155,13 +169,14 @@ class IdentifiedBody:
     warnings : tuple of str
         Reasons not to use the numbers without care.
     parameters : mapping of name to ReportedEstimate
+        Estimates of the run.
     body : Body
     theta : (k,)
-        Constants of the body.
+        Constants of the body at the estimates.
     experiment : Experiment
         The recording with corrected gravity and grasps, and without obstacles.
     simulated_m : (T, n, 3) or None
-        Forward simulation of this package at the samples.
+        Forward simulation of this package at the samples; None if the run has none.
     experiment_with_obstacles : Experiment or None
         The recording with its obstacles, whose friction coefficients are numbers; None without
         obstacles.
@@ -287,7 +302,7 @@ class IdentifiedBody:
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """Obstacles with which the body may come into contact."""
+        """Obstacles with which the body may come into contact; empty without any."""
         return (
             ()
             if self.experiment_with_obstacles is None
@@ -301,7 +316,9 @@ class IdentifiedBody:
 
     @cached_property
     def nodes_m(self) -> Array:
-        """Undeformed nodes (n, 3), placed as the grasp holds the body at the first sample."""
+        """Undeformed nodes (n, 3) [m] in the world, placed rigidly as the grasp holds the body at
+        the first sample.
+        """
         return self.experiment.rigid_positions([self.start_s])[0]
 
     @cached_property
@@ -321,7 +338,7 @@ class IdentifiedBody:
 
     @cached_property
     def prescribed_displacements_m(self) -> Array:
-        """Prescribed coordinates minus `nodes_m` (n, 3), and 0 where a coordinate is free.
+        """Prescribed coordinates minus `nodes_m` (n, 3) [m], and 0 where a coordinate is free.
 
         It is not zero where a second grasp holds nodes elsewhere than the rigidly placed body has
         them.
@@ -360,7 +377,7 @@ class IdentifiedBody:
 
     @cached_property
     def regions(self) -> tuple[IdentifiedRegion, ...]:
-        """Parts of the body with their constants."""
+        """Parts of the body with their constants at the estimates, in the order of `Body.parts`."""
         body = self.body
         regions = []
         lame = body.lame(self.theta)
@@ -400,7 +417,12 @@ class IdentifiedBody:
         return tuple(regions)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return everything as a dictionary for a JSON file."""
+        """Return the content of identified.json as a dictionary, with arrays and dataclasses that
+        `as_json` converts: estimates, mesh, masses, regions, loads, grasps and obstacles of the
+        recording.
+
+        Positions are those at the first sample; element and node indices count from 0.
+        """
         e = self.experiment
         body = self.body
         names = (

@@ -97,7 +97,9 @@ def write_rerun(
 
 
 def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
-    """Return the von Mises stress (T, F) on the surface; None if the run has no frames of it."""
+    """Return the von Mises stress (T, F) on the surface [Pa]; None if the run has no frames of it,
+    or the experiment was not fitted.
+    """
     if replay.positions_m is None:  # only fitted experiments have frames
         return None
     try:
@@ -107,7 +109,9 @@ def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
 
 
 def _limits(stresses: Sequence[Array | None]) -> tuple[float, float]:
-    """Return the ends of the colour scale, the same for all experiments."""
+    """Return the smallest and largest value as ends of the colour scale, the same for all
+    experiments; 0 and 1 if nothing is known.
+    """
     known = [
         each
         for each in stresses
@@ -127,6 +131,9 @@ def vertex_colours(
     count: int,
 ) -> NDArray[np.uint8]:
     """Return the colours of vertices from values on the triangles around them.
+
+    The value of a vertex is the mean over the triangles around it; values beyond the limits have
+    the colour of the nearest limit, and so have vertices without a triangle at the value 0.
 
     Parameters
     ----------
@@ -298,7 +305,9 @@ class _Recording:
         self._write_wrenches(replay)
 
     def _up_axis(self, up: Array) -> Any:
-        """Return the viewer's axis that is nearest to a direction (3,)."""
+        """Return the viewer's coordinate system whose axis is nearest to a direction (3,), upwards
+        or downwards.
+        """
         axis = int(np.abs(up).argmax())
         end = "UP" if up[axis] > 0 else "DOWN"
         return getattr(
@@ -353,7 +362,9 @@ class _Recording:
         colour: tuple[int, int, int],
         radius_m: float,
     ) -> None:
-        """Write points (k, 3) at each time; points that are not finite are left out."""
+        """Write points (k, 3) [m] at each time; points that are not finite are left out. Nothing is
+        written if none remains.
+        """
         rr = self.rr
         there = [each[np.isfinite(each).all(axis=1)] for each in points_m]
         if not any(map(len, there)):
@@ -366,7 +377,7 @@ class _Recording:
         )
 
     def _write_obstacles(self, replay: MotionRecord) -> None:
-        """Write the outlines of obstacles."""
+        """Write the outlines of obstacles at each sample; without obstacles nothing."""
         if replay.obstacles_m is None:
             return
         path = self._path(replay.name, "obstacles")
@@ -379,7 +390,9 @@ class _Recording:
         self.stream.reset_time()
 
     def _write_residuals(self, replay: MotionRecord) -> None:
-        """Write the distances of the fitted (or else simulated) markers from the measured ones."""
+        """Write the distances [mm] of the fitted (or else simulated) markers from the measured
+        ones; without either nothing.
+        """
         model_m = (
             replay.rolled_out_m
             if replay.markers_m is None
@@ -395,7 +408,9 @@ class _Recording:
             self._write_curve(path, replay.t_s, values=values)
 
     def _write_wrenches(self, replay: MotionRecord) -> None:
-        """Write forces and torques as measured, fitted and simulated."""
+        """Write each component of forces and torques as measured, fitted and simulated; grasps with
+        a sensor are numbered from 1.
+        """
         for k, columns in enumerate(replay.wrenches, start=1):
             t_s = columns[:, 0]
             values = columns[:, 1:].reshape(len(t_s), 3, len(COMPONENTS))
@@ -431,7 +446,9 @@ class _Recording:
 
 
 def _polylines(points_m: Array) -> Iterator[Array]:
-    """Yield the lines of points (o, 3) that are separated by rows of NaN."""
+    """Yield the lines of points (o, 3) that are separated by rows with a value that is not finite;
+    lines of one point are left out.
+    """
     ends = np.flatnonzero(~np.isfinite(points_m).all(axis=1))
     start = 0
     for end in (*ends, len(points_m)):
