@@ -33,7 +33,8 @@ from .prediction import CopyError, PredictionErrors
 class ReportedEstimate(Estimate):
     """A parameter or derived modulus as it is reported; derived moduli have no `guess`.
 
-    `value` is corrected for the known discretisation error, and `statistical95` is centred on it.
+    `value` is corrected for the known discretisation error and for known effects, and
+    `statistical95` is centred on it.
 
     Attributes
     ----------
@@ -72,11 +73,13 @@ class ReportedEstimate(Estimate):
     tied: bool | None = optional()
 
     def at_optimum(self, name: str, *, linear: bool) -> Estimate:
-        """Return the estimate before the correction of the discretisation error.
+        """Return the estimate before the correction of the discretisation error: with the value
+        `optimum`, and the statistical interval and standard error moved with it.
 
         Parameters
         ----------
         name : str
+            Name of the estimate, which decides its coordinate.
         linear : bool
             Whether the parameter is its own coordinate, see `IntervalCoordinate`.
         """
@@ -127,7 +130,9 @@ class ReportedEstimate(Estimate):
 
     @property
     def systematic_std_error(self) -> float | None:
-        """Part of the combined standard uncertainty that is not statistical; None if unknown."""
+        """Part of the combined standard uncertainty that is not statistical, √(combined² −
+        statistical²), at least 0; None if one of the two is unknown.
+        """
         if (
             self.combined_std_error is None
             or self.statistical_std_error is None
@@ -144,9 +149,9 @@ class NuisanceResult:
     Attributes
     ----------
     value : float
-        In its unit.
+        Estimate, in the unit that its label states.
     prior : float
-        Standard deviation of its prior.
+        Standard deviation of its prior, in the same unit.
     std_error : float or None
         Statistical standard error; None without error bars.
     """
@@ -269,7 +274,33 @@ class ProfileResult:
 class UncertaintyResult:
     """Statistics behind the error bars.
 
-    Matrices refer to the logarithms (or other coordinates) of the parameters in `names`.
+    Matrices refer to the logarithms (or other coordinates) of the k parameters in `names`;
+    coefficients of fields are left out.
+
+    Attributes
+    ----------
+    noise : str
+        Whether the noise level was stated or estimated from the residuals, see `Uncertainty`.
+    errors : str
+        Kind of error model, see `Uncertainty`.
+    reduced_chi_squared : float
+        χ² over the degrees of freedom.
+    noise_factors : mapping of str to float
+        Factor on the stated σ, by kind of measurement.
+    autocorrelation : float
+        Autocorrelation of the residuals between consecutive samples.
+    names : tuple of str
+        Estimated parameters.
+    correlation, covariance : (k, k) arrays
+        Statistical correlation and covariance.
+    quantiles : (k,) array
+        Half width of a 95 % interval over the standard error.
+    verdicts : tuple of str
+        Sentences on what the data determine.
+    recordings : mapping of str to RecordingsAgreement, or None
+        Agreement of the recordings, by parameter; None if it was not evaluated.
+    profiles : mapping of str to ProfileResult
+        Requested profile likelihoods, by parameter.
     """
 
     noise: str
@@ -429,8 +460,14 @@ class SimulatedExperiment:
 
 @dataclass(frozen=True)
 class ForwardResult:
-    """Forward simulations with the estimates; RMS and largest distance of the fitted experiments'
-    markers.
+    """Forward simulations with the estimates.
+
+    Attributes
+    ----------
+    rms_m, max_m : float or None
+        RMS and largest distance of the markers of all fitted experiments; None without any.
+    experiments : mapping of name to SimulatedExperiment
+        Results of each experiment, also of those for validation.
     """
 
     rms_m: float | None
@@ -440,8 +477,16 @@ class ForwardResult:
 
 @dataclass(frozen=True)
 class DynamicsResult:
-    """Residuals of the equations of motion: largest force [N], relative to other forces, and
-    where.
+    """Residuals of the equations of motion.
+
+    Attributes
+    ----------
+    max_violation_n : float
+        Largest residual [N].
+    max_violation_relative : float
+        Largest residual relative to the largest other force.
+    largest : tuple of str
+        Sentences on where the residual is largest.
     """
 
     max_violation_n: float
@@ -451,7 +496,21 @@ class DynamicsResult:
 
 @dataclass(frozen=True)
 class ProgramSize:
-    """Size of the discretised problem and its scheme."""
+    """Size of the discretised problem and its scheme.
+
+    Attributes
+    ----------
+    nodes, elements : int
+        Numbers of nodes and elements of all bodies.
+    substeps : int
+        Time steps per sample.
+    timesteps : int
+        Time steps of all fitted experiments.
+    variables, constraints : int
+        Size of the nonlinear program.
+    scheme : str
+        Name of the time scheme.
+    """
 
     nodes: int
     elements: int
@@ -500,10 +559,12 @@ class Elapsed:
 class Result:
     """The content of ``result.json``; the attributes are its keys.
 
-    `timing_s` is about the iterations of the method alone, `elapsed_s` about the whole run. `basis`
+    `timing_s` is the time of the method's iterations alone, `elapsed_s` that of the complete run.
+    `missing` names checks that were left out after Ctrl-C, and is empty if all were done. `basis`
     names what the values refer to: the damping law, and what sets the scale; `budget` has each
-    source's share of an estimate's variance; `deep_probes` are refits with an assumption relaxed
-    and, where requested, of parts of the data.
+    source's share of an estimate's variance; `probes` are refits with an assumption relaxed and,
+    where requested, of parts of the data. `uncertainty` is None without error bars, `scan` None
+    without a scan.
     """
 
     schema: int
@@ -583,7 +644,8 @@ class Result:
         return {name: error for name, error in errors if error is not None}
 
     def problem_folder(self, run: str | Path, purpose: str) -> Path:
-        """Return the folder of the problem file.
+        """Return the folder of the problem file that the run was made from; whether it still exists
+        is not checked.
 
         Parameters
         ----------

@@ -46,7 +46,9 @@ class CompletedStart:
 
 
 def has_local_minima(collocation: Collocation) -> bool:
-    """Return whether correspondences of measurements change during the search."""
+    """Return whether a fitted experiment has a depth camera, whose correspondences change during
+    the search and can make local minima.
+    """
     return any(segment.depths for segment in collocation.transcriptions)
 
 
@@ -78,7 +80,7 @@ def follow_starts(
     watch: Watch | None,
     solve: Solve,
 ) -> CompletedStart:
-    """Follow the starts of a scan to convergence and return the one with the lowest loss.
+    """Follow the starts of a scan to convergence and return the one with the lowest `robust_loss`.
 
     The best start of the scan is returned without a solution if the scan found only one start, if
     the problem has no local minima, if no start converges, or after an interrupt; an interrupted
@@ -92,8 +94,9 @@ def follow_starts(
     collocation : Collocation
         With the guesses of the scan's best stiffness.
     scan : Scan
+        Scan with its starts; not modified.
     watch : callable, optional
-        Called with every iteration.
+        Not used: `solve` reports the iterations.
     solve : callable
         ``solve(method, collocation)``, with renewed correspondences.
     """

@@ -155,8 +155,29 @@ def _solve_once(
     watch: Watch | None,
     workers: ExperimentExecutor | None,
 ) -> Solution:
-    """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier
-    solution.
+    """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier solution.
+
+    If the search from guesses fails, a scan follows; if it converges near ν = ½ in reduced space
+    and without an earlier solution, a second start is tried.
+
+    Parameters
+    ----------
+    problem : Problem
+    start : str, Path, WarmStart or None
+        Earlier solution or its run folder; None for the guesses of the problem, or a scan if it
+        lacks some.
+    solver : Method
+        Method to use.
+    watch : callable or None
+        Called with every iteration.
+    workers : ExperimentExecutor or None
+        Workers for reduced space; None for this process.
+
+    Raises
+    ------
+    InputError
+        If the start is unsuitable or none is found, if the machine lacks memory, or if the method
+        refuses the problem.
     """
     warm_start = (
         WarmStart.read(start) if isinstance(start, (str, Path)) else start
@@ -378,10 +399,12 @@ LAME = ("young_pa", "poisson", "lambda_pa", "mu_pa")
 
 
 def second_start_parameters(solution: Solution) -> Parameters | None:
-    """Return the parameters at a solution with high Poisson's ratios replaced by the usual one.
+    """Return the parameters at a solution, as guesses, with high Poisson's ratios replaced by the
+    usual one at the same Young's modulus.
 
-    Only estimated ratios count, of regions in which both moduli are estimated. None if no ratio is
-    high or a parameter with one is at a bound.
+    A ratio is high above `NEARLY_INCOMPRESSIBLE`. Only ratios of regions count in which both
+    moduli, or the ratio alone, are estimated. None if no ratio is high, or if a replaced value is
+    not within its bounds.
     """
     collocation = solution.collocation
     values = parameter_values(solution.collocation, solution.q)

@@ -62,7 +62,7 @@ FEWEST_ELEMENTS = 2
 
 @dataclass(frozen=True, eq=False)
 class _PhaseSearch:
-    """The two-phase field of a problem, and the names of its parameters.
+    """Two-phase field of a problem, and the names of its parameters.
 
     Attributes
     ----------
@@ -71,6 +71,7 @@ class _PhaseSearch:
     contrast : str
         Name of the contrast.
     modes : TwoPhaseModes
+        Shapes of the field.
     number : int
         Index of the part in the body.
     elements : tuple of str
@@ -128,6 +129,10 @@ def solve_two_phases(
     """Solve a problem with a two-phase field; the body of the solution has the phases and their
     samples.
 
+    If the smooth field or the first solve with phases does not converge, that solution is returned,
+    without samples. A later round that does not converge or does not decrease χ² ends the rounds,
+    and the best solution counts.
+
     Parameters
     ----------
     problem : Problem
@@ -135,7 +140,8 @@ def solve_two_phases(
     start : str, Path or WarmStart, optional
         Start of the solve with the smooth field.
     solve_once : callable
-        ``solved(problem, start)``, the solution of a problem with given phases or a smooth field.
+        ``solve_once(problem, start)``, the solution of a problem with given phases or a smooth
+        field.
 
     Raises
     ------
@@ -280,8 +286,11 @@ def _two_phase_search(problem: Problem) -> _PhaseSearch:
 
 
 def _likelier_phases(probability: Array) -> Array:
-    """Return the likelier phase (E,) of every element, from the probability (E,) of an inclusion;
-    each phase has at least `FEWEST_ELEMENTS` elements.
+    """Return the likelier phase (E,) of every element, 1 for an inclusion and 0 otherwise, from the
+    probability (E,) of an inclusion.
+
+    Each phase has at least `FEWEST_ELEMENTS` elements: if necessary, those that are nearest to it
+    in probability are added.
     """
     phase = is_inclusion(probability).astype(float)
     order = np.argsort(probability)

@@ -90,7 +90,7 @@ def solution_concerns(
     for part in solution.parts:
         nuisance = part.segment.nuisance
         low, high = nuisance.bounds(part.segment.association.clock_samples)
-        # A lag and a tool may well be none.
+        # Zero is a plausible value of a lag or a tool's mass, although it is a bound.
         low = np.where(low == 0, -np.inf, low)
         yield from nuisance_concerns(
             nuisance.names, part.phi, low=low, high=high
@@ -152,17 +152,20 @@ def combined_concerns(
     estimates: Mapping[str, ReportedEstimate],
     shares: Mapping[str, Mapping[str, float]],
 ) -> list[Concern]:
-    """Return a concern for each estimated parameter whose combined interval is wider than its
-    value, or that has a budget but no interval.
+    """Return a concern for each estimated parameter that has a budget and whose combined interval
+    is wider than its value or missing.
 
     Derived moduli give none: λ of a nearly incompressible material is rarely determined.
 
     Parameters
     ----------
     parameters : Parameters
+        Parameters, of which the estimated ones count.
     estimates : mapping of name to ReportedEstimate
+        Estimates of all of them.
     shares : mapping of name to mapping of source to float
-        Shares of the variance in the budget, largest first.
+        Shares of the variance in the budget, largest first; parameters without an entry are left
+        out.
     """
     return [
         _undetermined_concern(
@@ -194,8 +197,8 @@ def _undetermined_concern(
 
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:
-    """Yield concerns about implausible sizes and densities, implausible stiffness, and unknown
-    scale.
+    """Yield concerns about implausible sizes and densities, or else about an implausible stiffness
+    at the estimates, of each fitted body, and about an unknown scale of the moduli.
     """
     for body in dict.fromkeys(
         segment.body for segment in solution.collocation.transcriptions
@@ -276,14 +279,19 @@ def _forward_concerns(
     """Return concerns about the forward simulation of an experiment: that it failed, or that its
     errors are larger than the noise and the residuals of the fit.
 
+    Forces and depth are compared only for experiments that were not fitted, and only if their
+    markers give no concern.
+
     Parameters
     ----------
     name : str
         Name of the experiment.
     rollout : ForwardSimulation or str
+        Forward simulation, or why there is none.
     solution : Solution
+        Solution with the residuals of the fit.
     noise_m : float
-        Expected RMS distance of the markers by their noise.
+        Expected RMS distance of the markers by their noise [m].
     """
     fit_rms_m = solution.rms_by_experiment_m
     if not isinstance(rollout, ForwardSimulation):
@@ -337,8 +345,8 @@ def _depth_concerns(
 
 
 def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
-    """Return the distances of depth cameras' points from the fitted surface, by (experiment,
-    camera).
+    """Return the distances of depth cameras' points from the fitted surface, by names of experiment
+    and camera; empty without depth cameras.
     """
     return {
         (
@@ -358,7 +366,13 @@ def expected_rms_m(
     solution: Solution, uncertainty: Uncertainty | None
 ) -> float:
     """Return the RMS distance [m] of the fitted markers that is expected from noise with the stated
-    σ, less what the fitted parameters absorb; without `uncertainty` they absorb nothing.
+    σ, less what the fitted parameters absorb.
+
+    Parameters
+    ----------
+    solution : Solution
+    uncertainty : Uncertainty or None
+        Its degrees of freedom say how much the parameters absorb; for None they absorb nothing.
     """
     markers = [
         segment.experiment.markers

@@ -102,7 +102,9 @@ class WarmStart:
 
     @classmethod
     def of(cls, solution: Solution) -> WarmStart:
-        """Return the estimates of a solution."""
+        """Return the estimates of a solution in memory, without the correction for discretisation
+        errors, also of one that has not converged.
+        """
         collocation = solution.collocation
         nuisance = {}
         places_m = {}
@@ -146,7 +148,9 @@ class WarmStart:
         )
 
     def apply_to_places(self, collocation: Collocation) -> Collocation:
-        """Return the discretised problem with estimated markers starting at the earlier places."""
+        """Return the discretised problem in which markers whose place is estimated start at the
+        earlier places; markers without an earlier place keep theirs.
+        """
         places_m = []
         for segment in collocation.transcriptions:
             here = segment.marker_places_m(segment.guess_phi)
@@ -167,9 +171,11 @@ class WarmStart:
         }
 
     def apply_to_nuisance(self, collocation: Collocation) -> tuple[Array, int]:
-        """Return p at the guess with the earlier nuisance parameters, and the number of these.
+        """Return p, the guesses of parameters and nuisance parameters in the solver's coordinates,
+        with the earlier nuisance parameters, and the number of these.
 
-        Places of markers are those of the discretised problem.
+        Only nuisance parameters with the same experiment and label are replaced, and not limited to
+        their bounds. Places of markers are those of the discretised problem.
         """
         p = collocation.guess_p
         matches = 0

@@ -149,7 +149,7 @@ class CheckResult(QuickCheck):
     method : str
         The chosen method.
     memory_mb : float or None
-        Its memory; None if it is not among the `method_costs`.
+        Estimated memory of the chosen method; None if it is not among the `costs`.
     costs : tuple of MethodCost, one for each method with a known cost
     jacobian_error, hessian_error : float
         Largest relative deviation from central differences along random directions.
@@ -193,7 +193,7 @@ class CheckResult(QuickCheck):
 
     @property
     def derivatives_agree(self) -> bool:
-        """Whether both derivative checks pass."""
+        """Whether the errors of both derivative checks are below `DERIVATIVE_TOLERANCE`."""
         return (
             max(self.jacobian_error, self.hessian_error) < DERIVATIVE_TOLERANCE
         )
@@ -213,7 +213,7 @@ class CheckResult(QuickCheck):
 def quick_check(problem: Problem) -> QuickCheck:
     """Return a check of bodies, recordings and grasps without a simulation.
 
-    Parameters without a guess get usual values.
+    Parameters without a guess get usual values of a soft body; the problem is not modified.
     """
     usual = typical_parameters(problem.parameters, SOFT_PA)
     return QuickCheck(**_quick_fields(replace(problem, parameters=usual), {}))
@@ -558,8 +558,8 @@ def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
 
 
 def _body_concerns(body: BodyCheck, alone: bool) -> tuple[Concern, ...]:
-    """Return the concerns of a body; unless it is the only body (`alone`), with the names of its
-    experiments.
+    """Return the concerns of a body; unless it is the only body (`alone`), their data name its
+    experiments under "of".
     """
     of = f"in the body of {', '.join(map(repr, body.experiments))}"
     named = (
@@ -572,6 +572,7 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
     """Return likely errors in the description of a problem; mostly none.
 
     Odd sizes and densities come first, as others may follow from them; then the likeliest.
+    Parameters without a guess get usual values.
 
     Raises
     ------

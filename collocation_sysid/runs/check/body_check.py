@@ -80,7 +80,7 @@ class Slenderness:
 
 
 def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
-    """Return the `count` elements of lowest quality, worst first."""
+    """Return the `count` elements of lowest quality, worst first; all of them if there are fewer."""
     corners = mesh.points_m[mesh.tetrahedra]
     areas = [_areas(corners[:, face]) for face in _FACES]
     heights = 3 * mesh.volumes_m3 / np.max(areas, axis=0)
@@ -198,8 +198,14 @@ class BodyCheck:
     experiments : tuple of str
         Names of its experiments.
     element : str
-    size_m : (x, y, z) extents along the axes
-    edges_m : shortest, mean and longest edge
+    nodes, elements : int
+        Numbers of nodes and elements.
+    volume_m3, mass_kg : float
+        Volume of the mesh, and mass at the guess, without point masses.
+    size_m : (x, y, z) extents of the mesh along the axes
+    smallest_element_quality, median_element_quality : float
+        Mean ratio, see `ElementShape`.
+    edges_m : shortest, mean and longest edge of the mesh
     worst_elements : tuple of ElementShape, worst first
     cells_across : float
         Number of elements across the body's thickness.
@@ -317,7 +323,9 @@ def _rest_shape(body: Body) -> str | None:
 
 
 def _rest_shape_change_m(body: Body, theta: Array) -> float:
-    """Return the largest distance of the mesh from the stress-free shape [m], NaN without one."""
+    """Return the largest distance of the mesh from the stress-free shape [m]: 0 if the mesh is that
+    shape, NaN if none can be computed at θ.
+    """
     if body.inverse_equilibrium is None:
         return 0.0
     if body.rest_shape_failure(theta) is not None:
@@ -338,7 +346,9 @@ def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
 
 
 def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
-    """Return constants, and E and ν at small strain, by name."""
+    """Return E and ν at small strain of each part, then the constants θ of the body without
+    coefficients of fields, by name with the region; stated moduli replace computed ones.
+    """
     moduli = {}
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
         young, poisson = engineering_constants(*lame)
@@ -397,8 +407,14 @@ class GraspCheck:
 def check_grasps(
     experiment: Experiment, mean_edge_m: float
 ) -> tuple[GraspCheck, ...]:
-    """Return a summary of the grasped nodes for each grasp of an experiment, see `GraspCheck`;
-    `mean_edge_m` is the mean edge length of the mesh [m].
+    """Return a summary of the grasped nodes for each grasp of the body in an experiment, without
+    obstacles, see `GraspCheck`.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    mean_edge_m : float
+        Mean edge length of the mesh [m].
     """
     points_m = experiment.body.nodes.points_m
     return tuple(
@@ -475,7 +491,9 @@ def grasp_sentence(grasp_check: GraspCheck) -> str:
 
 
 def grasp_concerns(grasp_check: GraspCheck) -> list[Concern]:
-    """Return a concern if rounding decides which nodes are held."""
+    """Return one concern if some nodes are so near to a face of the box that rounding decides
+    whether they are held; otherwise none.
+    """
     by_chance = bool(grasp_check.nearly_grasped or grasp_check.nearly_free)
     counts = {
         "nodes": grasp_check.nodes,

@@ -20,7 +20,7 @@ from ...recording.time_tables import FEWEST_SHARED_SAMPLES
 
 # First samples of a motion that contain all kinds of equations; more would not change derivatives.
 SAMPLES = 12
-# The same of a static experiment.
+# Number of first samples of a static experiment that contain all kinds of equations.
 STATIC_SAMPLES = 3
 # Step of the differences, which balances truncation and rounding of fourth-order differences.
 STEP = 1e-5
@@ -38,7 +38,9 @@ def first_sample_count(experiment: Experiment) -> int:
 
 
 def shortened_problem(problem: Problem) -> Problem:
-    """Return the problem with a few first samples of every experiment."""
+    """Return the problem with a few first samples of every experiment, also of those for
+    validation.
+    """
     short = tuple(
         shortened_experiment(e, first_sample_count(e))
         for e in problem.experiments

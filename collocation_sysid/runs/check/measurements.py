@@ -81,12 +81,12 @@ class RecordingCheck:
 
     @property
     def farthest_marker(self) -> MarkerCheck:
-        """The marker farthest from the body."""
+        """The marker farthest from the body; `ValueError` without markers."""
         return max(self.markers, key=lambda marker: marker.distance_m)
 
     @property
     def most_missing_marker(self) -> MarkerCheck:
-        """The marker with most samples missing."""
+        """The marker with most samples missing; `ValueError` without markers."""
         return max(self.markers, key=lambda marker: marker.missing)
 
 
@@ -151,7 +151,16 @@ def check_recording(
 def recording_concerns(
     recording: RecordingCheck, body: BodyCheck
 ) -> list[Concern]:
-    """Return concerns about the markers of a recording; each names the worst marker only."""
+    """Return up to four concerns about the markers of a recording; each names the worst marker
+    only. Empty without markers.
+
+    Parameters
+    ----------
+    recording : RecordingCheck
+        Recording to judge.
+    body : BodyCheck
+        Its body, which gives the scale of distances.
+    """
     if not recording.markers:
         return []
 

@@ -51,7 +51,7 @@ class ModeCheck:
     samples_per_period, steps_per_period : float
         Samples of the recording, and steps of the time grid.
     damping_ratio : float
-        Of the material.
+        Damping ratio of the mode by the material; 1 or more if it is overdamped.
     numerical_damping_ratio : float
         Damping ratio that the scheme adds; negative where it takes some away.
     period_error : float
@@ -160,9 +160,19 @@ def _reference_state(
     time_s: float,
     theta: Array,
 ) -> tuple[Array, str]:
-    """Return node positions (n, 3) [m] about which the body oscillates, and the name of this state.
+    """Return positions about which the body oscillates, and the name of this state: the equilibrium
+    if nodes are held and it can be found ("rest state"), else the undeformed shape, placed rigidly
+    ("undeformed shape").
 
-    The equilibrium if it can be found, else the undeformed shape.
+    Parameters
+    ----------
+    experiment : Experiment
+    is_prescribed : (n, 3)
+        Coordinates that are held.
+    time_s : float
+        Time of the poses and loads [s].
+    theta : (k,) array
+        Constants θ of the body.
     """
     if is_prescribed.any():
         try:
@@ -315,7 +325,9 @@ def mode_notes(motion: ModesCheck) -> list[str]:
 
 
 def _step_remedy(motion: ModesCheck) -> str:
-    """Return the remedy for too few steps: a setting, or a higher rate."""
+    """Return the remedy for too few steps: a setting of the substeps, or a higher rate if too many
+    would be needed.
+    """
     if motion.substeps_needed is None:
         return "record at a higher rate"
     return f"set transcription.{_substeps_setting(motion)}"
