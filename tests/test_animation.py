@@ -118,7 +118,7 @@ def test_a_film_is_a_gif_in_the_run_folder_by_default(run, tmp_path):
 def test_the_simulation_is_drawn_as_edges_over_the_fit(run):
     _, (swing, nod) = read_run(run)
     film = FilmFigure(swing)
-    assert [name for name, *_ in film.drawings] == ["fitted", "simulated"]
+    assert [each.name for each in film.drawings] == ["fitted", "simulated"]
     film.show_sample(3)
     (*_, fitted, _), (*_, simulated, title) = film.drawings
     assert len(fitted.faces.get_facecolor()) > 1
@@ -159,7 +159,7 @@ def test_the_body_fills_a_large_part_of_the_frame(run):
     film = FilmFigure(swing)
     film.show_sample(3)
     corners = np.concatenate(
-        [path.vertices for path in film.drawings[0][3].faces.get_paths()]
+        [path.vertices for path in film.drawings[0].body.faces.get_paths()]
     )
     width, height = np.ptp(corners, axis=0)
     room = film.figure.axes[0].get_ylim()[1] - HEAD_HEIGHT_MM - FOOT_HEIGHT_MM
@@ -170,7 +170,7 @@ def test_the_film_says_how_far_the_markers_are_off(run):
     _, (swing, _) = read_run(run)
     film = FilmFigure(swing)
     film.show_sample(8)
-    *_, title = film.drawings[0]
+    title = film.drawings[0].title
     assert title.get_text() == "fitted: 0.00 mm"
     assert film.time_label.get_text() == "0.08 s"
 

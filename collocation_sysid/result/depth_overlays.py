@@ -98,8 +98,11 @@ class DepthProjection:
         )
 
     def outlines(self, shape_m: Array, sample: int) -> Array:
-        """Return u and v (k, 2) of the faces that are turned to the camera; NaN in the row after
-        each face.
+        """Return u and v (k, 2) of the corners of the faces that are turned to the camera; NaN in
+        the row after each face.
+
+        Faces that are partly behind a camera with an image are left out. Units are those of
+        `image_points`.
 
         Parameters
         ----------
@@ -251,7 +254,9 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
 def save_overlays(
     experiments: Iterable[Experiment], folder: Path
 ) -> list[Path]:
-    """Draw `undeformed_rows` of all experiments into a folder, and return the files."""
+    """Draw `undeformed_rows` of all experiments into an existing folder, a picture for each depth
+    camera, and return the files; empty without depth cameras.
+    """
     return save_pictures(
         folder,
         with_unique_names(

@@ -39,7 +39,8 @@ def export_page(
     experiment: str | None = None,
     field: str | None = None,
 ) -> Path:
-    """Write an experiment of a run folder as a stand-alone web page, and return the page's file.
+    """Write an experiment of a run folder as a stand-alone web page, and return the page's file; an
+    existing file is replaced.
 
     Parameters
     ----------
@@ -48,7 +49,7 @@ def export_page(
     file : str or Path
         HTML file to write.
     experiment : str, optional
-        Name of the experiment; the first by default.
+        Name of the experiment; the first with a trajectory by default.
     field : str, optional
         Point or cell data of the frames that colour the fitted body, or the contact quantities
         "pressures_pa" or "gaps_m"; by default the strain of the fitted and the simulated body.
@@ -153,7 +154,10 @@ def view_run(
 
 
 def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
-    """Return times [s] and files of an experiment's frames.
+    """Return times [s] and files of an experiment's frames, in their order in the list of frames.
+
+    If the experiment has no folder of frames, those of the run folder itself are returned, which
+    belong to its only fitted experiment.
 
     Raises
     ------
@@ -268,7 +272,9 @@ class _FrameWindow:
         self.plotter.camera.zoom(1.4)  # the box is seen through its sphere
 
     def show_nearest_frame(self, time_s: float) -> None:
-        """Show the frame nearest to a time."""
+        """Show the frame nearest to a time [s], with measured markers, grasped nodes and obstacles
+        of the nearest sample, in place of the last one.
+        """
         mesh = self.meshes[int(np.abs(self.times - time_s).argmin())]
         sample = int(np.abs(self.replay.t_s - time_s).argmin())
         if self.replay.obstacles_m is not None:

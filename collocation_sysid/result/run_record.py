@@ -143,6 +143,8 @@ def _write_pictures(
 ) -> None:
     """Draw all pictures of a run, including the Jacobian's structure, and write them into its
     folder.
+
+    `say` is called with a sentence about what is being drawn.
     """
     say("drawing the pictures")
     # matplotlib takes a while to import, and nothing else needs it.
@@ -377,7 +379,8 @@ def _custom_sensor_columns(
 def _comparison_columns(
     t_s: Array, measured: Array, *models: Array | None
 ) -> Array:
-    """Return the columns time, measured values and the values of each model, as one array.
+    """Return the columns time, measured values and the values of each model, as one array (S, 1 + m
+    (1 + number of models)).
 
     `t_s` is (S,), `measured` and each of `models` (S, m); the columns of a model that is None are
     NaN.
@@ -390,8 +393,8 @@ def _comparison_columns(
 
 
 def _marker_places_m(finished: SolvedProblem, experiment: str) -> Array | None:
-    """Return the estimated places (M, 3) of the markers on the undeformed body; None where that
-    failed.
+    """Return the estimated places (M, 3) [m] of the markers of an experiment on the undeformed
+    body; None for a validation experiment whose forward simulation failed.
     """
     if experiment in finished.places:
         places = [

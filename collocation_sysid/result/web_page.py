@@ -25,7 +25,7 @@ from ..common.files import write_text_file
 from .pictures.projection import ParallelCamera
 from .replay import MotionRecord
 
-# More samples than this are thinned, to keep the page a few megabytes.
+# Largest number of samples on the page, which keeps it a few megabytes.
 MAX_PAGE_FRAMES = 300
 # Quantile of the strain at which the colour scale ends: strains in single corners are far larger.
 STRAIN_QUANTILE = 0.995
@@ -55,7 +55,11 @@ class Colouring:
 
     @classmethod
     def by_strain(cls, replay: MotionRecord) -> Colouring:
-        """Return the colouring of all trajectories by the largest principal strain."""
+        """Return the colouring of all trajectories, at least one, by the largest principal strain.
+
+        The scale reaches from 0 to the quantile `STRAIN_QUANTILE` of the strain of the first
+        trajectory.
+        """
         values = {
             name: surface_strain(replay, x)
             for name, x in _trajectories(replay).items()
@@ -260,8 +264,8 @@ def cells_below_faces(
 
 
 def _base64(array: NDArray[Any], data_type: str) -> str:
-    """Return an array as base64 text of its bytes in the NumPy data type `data_type`, such as
-    "<f4".
+    """Return an array, converted to the NumPy data type `data_type` such as "<f4", as base64 text
+    of its bytes in row-major order.
     """
     return base64.b64encode(
         np.ascontiguousarray(array, dtype=data_type).tobytes()

@@ -279,14 +279,14 @@ class UncertaintyResult:
 
     Attributes
     ----------
-    noise : str
-        Whether the noise level was stated or estimated from the residuals, see `Uncertainty`.
-    errors : str
-        Kind of error model, see `Uncertainty`.
+    noise : {"given", "estimated", "by-marker"}
+        Source of the variance: stated σ, one common factor, or one factor for each marker.
+    errors : {"independent", "autocorrelated"}
+        Correlation of the errors.
     reduced_chi_squared : float
         χ² over the degrees of freedom.
     noise_factors : mapping of str to float
-        Factor on the stated σ, by kind of measurement.
+        Standard deviation of the errors of each marker or other observable over σ, by name.
     autocorrelation : float
         Autocorrelation of the residuals between consecutive samples.
     names : tuple of str

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from ..methods.initial_trajectories import associated_at_guess
 from ..methods.reduced_space import ReducedSpace
-from ..methods.solution import Method, Solution, Status, Watch
+from ..methods.solution import Method, Solution, Status
 from ..methods.stiffness_scan import Scan
 from ..program.collocation import Collocation
 
@@ -77,7 +77,6 @@ def follow_starts(
     solver: Method,
     collocation: Collocation,
     scan: Scan,
-    watch: Watch | None,
     solve: Solve,
 ) -> CompletedStart:
     """Follow the starts of a scan to convergence and return the one with the lowest `robust_loss`.
@@ -95,8 +94,6 @@ def follow_starts(
         With the guesses of the scan's best stiffness.
     scan : Scan
         Scan with its starts; not modified.
-    watch : callable, optional
-        Not used: `solve` reports the iterations.
     solve : callable
         ``solve(method, collocation)``, with renewed correspondences.
     """

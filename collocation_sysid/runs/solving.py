@@ -211,7 +211,6 @@ def _solve_once(
                 solver,
                 collocation,
                 scan=scan,
-                watch=watch,
                 solve=lambda by, of: solve_with_renewed_correspondences(
                     by, of, watch=watch
                 ),

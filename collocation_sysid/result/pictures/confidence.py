@@ -110,7 +110,7 @@ def ellipse_outline(
 
 
 def confidence_ellipses(confidence: Confidence) -> Figure:
-    """Draw the joint 95 % region of every pair of parameters.
+    """Return a figure of the joint 95 % region of every pair of parameters.
 
     Axes are deviations from the estimate, in percent, or factors where these are large; the cross
     is the 95 % interval of each parameter alone. A narrow slanted region means that the data
@@ -241,7 +241,7 @@ class _DeviationAxis:
 
 
 def correlation_matrix(confidence: Confidence) -> Figure:
-    """Draw the correlation of every pair of parameters, as colours and numbers.
+    """Return a figure of the correlation of every pair of parameters, as colours and numbers.
 
     Parameters
     ----------
@@ -285,7 +285,10 @@ LEGEND_LINE_MM = 3.8
 
 
 def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Draw the contributions to the variance of each estimate as stacked bars.
+    """Return a figure of the contributions to the variance of each estimate as stacked bars.
+
+    The largest sources have colours of their own; the rest, and sources below
+    `SMALLEST_DRAWN_SHARE` of every variance, are drawn together as "others".
 
     Parameters
     ----------

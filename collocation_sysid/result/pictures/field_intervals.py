@@ -50,10 +50,11 @@ OTHER_REGION_COLOUR = np.array([0.85, 0.85, 0.85])
 
 
 def field_picture(replay: MotionRecord, name: str, values: Array) -> Figure:
-    """Draw the estimate and the ends of its interval on the body, and below them on a cut through
-    it.
+    """Return a figure of the estimate and the ends of its interval on the body, and below them on a
+    cut through it.
 
-    Colours fade to white where the posterior is hardly narrower than the prior.
+    Colours fade to white where the posterior is hardly narrower than the prior. Elements of other
+    regions are grey.
 
     Parameters
     ----------

@@ -33,8 +33,8 @@ RELATIVE_AMPLITUDE = 0.08
 
 
 def instability_picture(instability: StabilityLoss) -> Figure:
-    """Draw the body displaced along its unstable mode, coloured by the mode's amplitude, with its
-    stretches and wavelength as the title.
+    """Return a figure of the body displaced along its unstable mode, coloured by the mode's
+    amplitude, with its stretches and wavelength as the title.
     """
     extent_m = float(np.ptp(instability.positions_m, axis=0).max())
     shown_m = (

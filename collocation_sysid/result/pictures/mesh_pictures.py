@@ -37,7 +37,7 @@ from .scene import (
     sheet,
 )
 
-# More names than this would be a list, not a picture.
+# Largest number of markers whose names are written.
 MAX_WRITTEN_NAMES = 24
 # Height of the titles [mm].
 HEAD_MM = 6.0
@@ -45,13 +45,13 @@ HEAD_MM = 6.0
 FOOT_MM = 14.0
 # Distance between two views [mm].
 GAP_MM = 3.0
-# Height of a line of text.
+# Height of a line of text [mm].
 LINE_MM = 3.2
-# Mean width of a letter.
+# Mean width of a letter [mm].
 LETTER_MM = 1.4
 # Largest height of a view [mm], so that two fit on a page.
 MAX_BODY_HEIGHT_MM = 70.0
-# Shortest distance on paper at which two marks are drawn apart: nearer ones cover each other.
+# Shortest distance on paper at which two marks are drawn apart [mm]; nearer ones overlap.
 MIN_MARK_DISTANCE_MM = 0.4
 DECLARED_POSITION = "position given"
 UNSTATED_PLACE = "position not given"
@@ -77,7 +77,8 @@ MARK_STYLES: dict[str, dict[str, Any]] = {
 
 
 def mesh_picture(replay: MotionRecord) -> Figure:
-    """Draw the undeformed body from the front and from behind, with names of its markers.
+    """Return a figure of the undeformed body from the front and from behind, with grasped nodes,
+    markers and, if they are few, their names.
 
     Tendons are drawn through the body. A cross is the stated place of a marker whose estimated
     place differs; a frame surrounds a marker whose place was not stated.
@@ -295,8 +296,8 @@ def _write_names(
 
 
 def spread_levels(levels: Array, gap: float) -> Array:
-    """Return ascending levels (k,), moved as little as possible to be at least `gap` from each
-    other.
+    """Return ascending levels (k,), moved as little as possible (least squares) to be at least
+    `gap` from each other; the given levels must be ascending.
     """
     steps = gap * np.arange(len(levels))
     # The nearest ascending sequence to levels − steps: neighbours out of order share their mean.
@@ -315,7 +316,7 @@ HISTOGRAM_BINS = 24
 
 
 def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
-    """Draw histograms of the size and the quality of the elements.
+    """Return a figure with histograms of the size and the quality of the elements.
 
     The size is the root mean square edge, the quality the mean ratio 12 (3V)^(2/3) / Σ l², which is
     1 for the regular tetrahedron and near 0 for a flat one.

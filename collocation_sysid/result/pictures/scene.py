@@ -57,7 +57,9 @@ _GRASPED_STYLE = {
 
 
 def sheet(width_mm: float, height_mm: float) -> tuple[Figure, Axes]:
-    """Return a figure with one invisible pair of axes [mm], from the lower left corner."""
+    """Return a figure of a size [mm] and its only axes, which are invisible and fill it; their
+    coordinates are millimetres from the lower left corner.
+    """
     figure = fixed_figure(width_mm, height_mm)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0, width_mm), ylim=(0, height_mm))
@@ -118,7 +120,9 @@ class SheetView:
 
 
 def aspect_ratio(camera: ParallelCamera, points_m: Array) -> float:
-    """Return width over height of points (…, 3) in the picture of a camera."""
+    """Return width over height of points (…, 3) in the picture of a camera; NaN is ignored, and the
+    height must not be zero.
+    """
     low, high = _projected_extent(camera, points_m)
     return float((high - low)[0] / (high - low)[1])
 
@@ -126,9 +130,8 @@ def aspect_ratio(camera: ParallelCamera, points_m: Array) -> float:
 def _projected_extent(
     camera: ParallelCamera, points_m: Array
 ) -> tuple[Array, Array]:
-    """Return the lower left and the upper right corner (2,) [m] of points (…, 3) in the picture.
-
-    Points that are NaN are left out.
+    """Return the lower left and the upper right corner (2,) [m] of points (…, 3) in the picture of
+    a camera; points that are NaN are left out.
     """
     places = camera.project(points_m).reshape(-1, 2)
     return np.nanmin(places, axis=0), np.nanmax(places, axis=0)
@@ -158,7 +161,8 @@ class BodyDrawing:
     ----------
     axes : Axes
         Axes of a `sheet`.
-    view : DepthCameraModel
+    view : SheetView
+        Projection onto the sheet.
     surface : (F, 3)
         Nodes of the boundary triangles.
     parts : (F,), optional
@@ -246,17 +250,19 @@ class BodyDrawing:
             Points of depth cameras; unchanged by default.
         """
         camera = self.view.camera
-        polygons, brightness, faces = camera.visible_faces(
-            positions_m, self.surface
-        )
-        if (
-            colours is not None
-        ):  # colours that tell something are shaded half as much
+        visible_faces = camera.visible_faces(positions_m, self.surface)
+        faces = visible_faces.indices
+        brightness = visible_faces.brightness
+        if colours is not None:
+            # Colours of a field are shaded half as much, so that they can be compared.
             brightness = (1 + brightness) / 2
         unshaded = self.part_colours if colours is None else colours
         shaded: Any = brightness[:, None] * unshaded[faces]
         self.faces.set_verts(
-            list(self.view.origin_mm + self.view.mm_per_m * polygons)
+            list(
+                self.view.origin_mm
+                + self.view.mm_per_m * visible_faces.polygons
+            )
         )
         if self.edge_colour is not None:
             return

@@ -35,8 +35,8 @@ def spectrum_picture(
     fitted_m: Array | None,
     natural_hz: Array | None,
 ) -> Figure:
-    """Draw the spectral density of the measured tracks and of the residual, with the natural
-    frequencies.
+    """Return a figure of the spectral density of the measured tracks and of the residual, with the
+    natural frequencies.
 
     Parameters
     ----------
@@ -148,8 +148,8 @@ def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
 
 
 def _neighbour_groups(ascending: Array, gap: float) -> list[NDArray[np.int64]]:
-    """Return groups of indices of ascending values whose neighbours are nearer to each other than
-    `gap`.
+    """Return groups of indices of ascending values, in which neighbours are nearer to each other
+    than `gap`; every value is in one group.
     """
     breaks = np.flatnonzero(np.diff(ascending) >= gap) + 1
     return [
