@@ -357,7 +357,10 @@ class FilmFigure:
         )
         self.drawings: list[_DrawnTrajectory] = []
         view = SheetView.fit_points(
-            camera, everything, (width - 8, height), (4, FOOT_HEIGHT_MM)
+            camera,
+            everything,
+            room_mm=(width - 8, height),
+            corner_mm=(4, FOOT_HEIGHT_MM),
         )
         for path_m in np.moveaxis(replay.measured_m, 1, 0):
             axes.plot(

@@ -76,7 +76,7 @@ class ElementFields:
             )
             evaluators.append(body.make_evaluator(batch))
         volumes = body.stress_free_geometry(theta)[:, :, -1].sum(axis=1)
-        return cls(body, theta, evaluators, volumes)
+        return cls(body, theta, _evaluators=evaluators, _volumes=volumes)
 
     def evaluate_at(self, positions_m: ArrayLike) -> dict[str, Array]:
         """Return the fields at node positions, by `FIELD_NAMES`.

@@ -104,7 +104,12 @@ class SliderRange:
         is_logarithmic = not linear and value > 0
         low = max(low, bounds[0])
         high = min(high, bounds[1])
-        return cls(low, float(np.clip(value, low, high)), high, is_logarithmic)
+        return cls(
+            low,
+            float(np.clip(value, low, high)),
+            high=high,
+            is_logarithmic=is_logarithmic,
+        )
 
 
 class ParameterSliders:

@@ -278,7 +278,7 @@ def _depth_rows(
     if part is not None:
         surfaces = {
             reading.correspondences.camera.depth.name: SurfaceComparison.from_fit(
-                reading, part.x, values, part.phi
+                reading, part.x, values=values, phi=part.phi
             )
             for reading, values in part.depth_residuals
         }

@@ -211,8 +211,8 @@ def _corrected_estimate(
     combined = combine(
         name,
         optimum,
-        error,
-        before.systematic,
+        error=error,
+        systematic=before.systematic,
         known_effect=before.known_effect or 0.0,
         linear=linear,
         bounds=bounds,

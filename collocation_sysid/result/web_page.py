@@ -69,9 +69,9 @@ class Colouring:
         return cls(
             "strain",
             values,
-            0.0,
-            largest,
-            ("0", f"{100 * largest:.2g} % strain"),
+            low=0.0,
+            high=largest,
+            end_labels=("0", f"{100 * largest:.2g} % strain"),
         )
 
     @classmethod
@@ -90,9 +90,9 @@ class Colouring:
         return cls(
             name,
             {"fitted": values},
-            low,
-            high,
-            (f"{low:.3g}", f"{high:.3g} {name}"),
+            low=low,
+            high=high,
+            end_labels=(f"{low:.3g}", f"{high:.3g} {name}"),
         )
 
 

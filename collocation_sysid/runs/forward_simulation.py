@@ -131,7 +131,7 @@ def simulate_experiments(
 
     with counted_phase(StepUnit.SIMULATION, len(problem.experiments)):
         rollouts = map_experiments(
-            simulate_counted, problem.experiments, threads
+            simulate_counted, problem.experiments, threads=threads
         )
     return {
         e.name: each
@@ -310,7 +310,7 @@ def _predict_instruments(
     )
     surfaces = {
         reading.correspondences.camera.depth.name: SurfaceComparison.from_motion(
-            reading, trajectory.t_s, positions_m, phi
+            reading, trajectory.t_s, positions_m=positions_m, phi=phi
         )
         for reading in segment.depths
     }
@@ -337,7 +337,9 @@ def _blind_error(
     """
     phi = nuisance_of_fitted_recordings(segment, solution)
     try:
-        trajectory = _simulate(problem, segment, phi, solution.parameters)
+        trajectory = _simulate(
+            problem, segment, phi=phi, parameters=solution.parameters
+        )
     except (InputError, SimulationError):
         return None
     predicted, _ = _predict_instruments(segment, trajectory, phi=phi)
@@ -499,7 +501,7 @@ def _depth_differences(
         reading.residual_changes(
             observation,
             displacements_m[:, reading.correspondences.surface.nodes],
-            part.phi,
+            phi=part.phi,
         )[..., 0]
         for reading, observation in sights
     ]

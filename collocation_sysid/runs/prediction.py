@@ -164,19 +164,22 @@ def instrument_misfits(
         ratio = difference_m / sigma_m[:, None]
         results.append(
             _misfit(
-                "the markers", "sigma_m", ratio, f"{1e3 * rms_m:.3g} mm RMS"
+                "the markers",
+                "sigma_m",
+                ratio=ratio,
+                size=f"{1e3 * rms_m:.3g} mm RMS",
             )
         )
     for read, sensor in zip(
         predicted.wrenches, experiment.wrenches, strict=True
     ):
         ratio = (read - sensor.values) / sensor.sigmas
-        results.append(_misfit("the wrench", "sigma_n", ratio))
+        results.append(_misfit("the wrench", "sigma_n", ratio=ratio))
     for gauge in experiment.readings:
         ratio = (
             predicted.readings[gauge.name] - gauge.measured_values
         ) / gauge.sigma
-        results.append(_misfit(gauge.name, "its sigma", ratio))
+        results.append(_misfit(gauge.name, "its sigma", ratio=ratio))
     for name, error in predicted.depth.items():
         if error.rms_m is not None:
             size = f"{1e3 * error.rms_m:.3g} mm RMS"

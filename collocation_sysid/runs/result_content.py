@@ -91,7 +91,7 @@ class ReportedEstimate(Estimate):
             optimum = self.value if self.optimum is None else self.optimum
             return replace(self._statistical, value=optimum)
         at = IntervalCoordinate.for_estimate(
-            name, (self.value, self.optimum, *self.statistical95), linear
+            name, (self.value, self.optimum, *self.statistical95), linear=linear
         )
         correction = at.from_value(self.value) - at.from_value(self.optimum)
         low, high = (

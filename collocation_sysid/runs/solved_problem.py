@@ -175,8 +175,8 @@ class SolvedProblem:
         combined = combine(
             name,
             optimum,
-            error,
-            systematic,
+            error=error,
+            systematic=systematic,
             known_effect=known_effect,
             linear=linear,
             bounds=bounds,
@@ -206,8 +206,8 @@ class SolvedProblem:
         return budget(
             self.systematic_effects,
             self.uncertainty,
-            self.discretisation_errors,
-            self.start_parameters,
+            numerical=self.discretisation_errors,
+            parameters=self.start_parameters,
         )
 
     @property

@@ -354,7 +354,7 @@ def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
             reading.correspondences.camera.depth.name,
         ): (
             SurfaceComparison.from_fit(
-                reading, part.x, observation, part.phi
+                reading, part.x, values=observation, phi=part.phi
             ).error
         )
         for part in solution.parts

@@ -98,7 +98,13 @@ class WarmStart:
             )
             if not np.isfinite(all_values).all():
                 raise ValueError("a value that is not finite")
-        return cls(folder, values, nuisance, places_m, result.problem.substeps)
+        return cls(
+            folder,
+            values,
+            nuisance=nuisance,
+            places_m=places_m,
+            substeps=result.problem.substeps,
+        )
 
     @classmethod
     def of(cls, solution: Solution) -> WarmStart:
@@ -121,7 +127,13 @@ class WarmStart:
                 zip(markers, places, strict=True)
             )
         values = parameter_values(collocation, solution.q)
-        return cls(Path(), values, nuisance, places_m, collocation.substeps)
+        return cls(
+            Path(),
+            values,
+            nuisance=nuisance,
+            places_m=places_m,
+            substeps=collocation.substeps,
+        )
 
     def apply_to_problem(self, problem: Problem) -> Problem:
         """Return the problem with these estimates as its guesses, clipped to its bounds.

@@ -215,7 +215,7 @@ class HandBounds:
         return TimeDerivatives(
             np.array([farthest, np.radians(limits.rotation_deg)]),
             np.array([limits.speed_m_s, np.radians(angular_rate)]),
-            np.array([limits.acceleration_m_s2, np.radians(growth)]),
+            second=np.array([limits.acceleration_m_s2, np.radians(growth)]),
         )
 
     def shares(self, motion: HandMotion) -> dict[str, float]:

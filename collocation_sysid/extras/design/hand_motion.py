@@ -60,7 +60,9 @@ class TimeDerivatives(NamedTuple):
     def scaled(self, factor: float) -> TimeDerivatives:
         """Return value and derivatives multiplied by a factor."""
         return TimeDerivatives(
-            factor * self.value, factor * self.first, factor * self.second
+            factor * self.value,
+            factor * self.first,
+            second=factor * self.second,
         )
 
 
@@ -157,11 +159,11 @@ class HandMotion:
         return cls(
             duration_s,
             active_s,
-            float(rise * active_s),
-            largest_amplitude * np.tanh(share),
-            first_hz,
-            last_hz,
-            np.pi * phase,
+            rise_s=float(rise * active_s),
+            amplitude=largest_amplitude * np.tanh(share),
+            first_hz=first_hz,
+            last_hz=last_hz,
+            phase_rad=np.pi * phase,
         )
 
     @staticmethod
@@ -219,7 +221,9 @@ class HandMotion:
         return TimeDerivatives(
             window * wave,
             rate * wave + window * wave_rate,
-            curvature * wave + 2 * rate * wave_rate + window * wave_curvature,
+            second=curvature * wave
+            + 2 * rate * wave_rate
+            + window * wave_curvature,
         )
 
     def _window(self, t: Array) -> TimeDerivatives:
@@ -237,7 +241,9 @@ class HandMotion:
         value = u**3 * (10 - 15 * u + 6 * u**2)
         first = 30 * u**2 * (1 - u) ** 2 * slope
         second = 60 * u * (1 - u) * (1 - 2 * u) * slope**2
-        return TimeDerivatives(value[:, None], first[:, None], second[:, None])
+        return TimeDerivatives(
+            value[:, None], first[:, None], second=second[:, None]
+        )
 
 
 def angular_motion(

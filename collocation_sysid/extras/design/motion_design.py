@@ -107,7 +107,7 @@ class ErrorBars:
             {n: pick(e[n] for e in each) for n in each[0]}
             for pick in (min, max)
         )
-        return cls(errors[0].values, each[0], lowest, highest)
+        return cls(errors[0].values, each[0], lowest=lowest, highest=highest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,8 +213,8 @@ class MotionObjective:
         free = HandMotion.from_coefficients(
             coefficients,
             float(recording.since_start_s[-1]),
-            recording.highest_hz(self.limits),
-            self.bounds.reach,
+            highest_hz=recording.highest_hz(self.limits),
+            reach=self.bounds.reach,
         )
         return self.bounds.scale_to_limits(free)
 
@@ -224,7 +224,10 @@ class MotionObjective:
         """
         parameters = self.recording.problem.parameters
         return PredictedErrors.from_information(
-            self.known_information + information, parameters, self.constants, q
+            self.known_information + information,
+            parameters,
+            constants=self.constants,
+            q=q,
         )
 
     def first_guess(self, options: DesignOptions, say: Say) -> SearchResult:
@@ -497,7 +500,7 @@ def _draws_from_recordings(
     known = shared_information(linearise_fit(solution.collocation, solution.z))
     constants = ThetaMap(problem.parameters, problem.experiments[0].body)
     errors = PredictedErrors.from_information(
-        known, problem.parameters, constants, solution.q
+        known, problem.parameters, constants=constants, q=solution.q
     )
     # A poorly determined parameter is drawn as far around the estimate as around a guess.
     largest_deviation = np.log(options.spread)

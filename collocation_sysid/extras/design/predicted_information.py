@@ -194,7 +194,9 @@ class PredictedErrors:
         slopes |= {
             name: by_q / derived.values[name] for name, by_q in varying.items()
         }
-        return cls(covariance, values, slopes, estimated_count)
+        return cls(
+            covariance, values, slopes=slopes, estimated_count=estimated_count
+        )
 
     def slopes_of(self, names: Sequence[str]) -> Array:
         """Return the rows (k, nq) of `slopes` for these names; for all estimated parameters if
@@ -454,7 +456,9 @@ class FutureRecording:
         hand = rotation @ self.hand_m + translation + coordinates[:, :3]
         placed = hand - turned.apply(self.hand_m)
         return PoseSequence(
-            self.pose_times_s + self.template.t_s[0], placed, turned.as_quat()
+            self.pose_times_s + self.template.t_s[0],
+            placed,
+            quaternions_xyzw=turned.as_quat(),
         )
 
     def experiment(self, poses: PoseSequence) -> Experiment:
@@ -630,7 +634,7 @@ class LinearRecording:
             (block,) = recording.linearise(pulsed, q)[0].blocks
             change = (block.channels[1] - at_rest.channels[1]) / height
             answers.append(np.fft.rfft(change, length, axis=0))
-        return cls(recording, still, np.array(answers), length)
+        return cls(recording, still, responses=np.array(answers), length=length)
 
     def information(self, motion: HandMotion) -> Array:
         """Return the information (nq, nq) of a motion about the shared parameters, to first order

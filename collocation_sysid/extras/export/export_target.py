@@ -288,7 +288,7 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
     # In statics friction follows the displacement since the previous sample.
     ways = np.diff(states, axis=0, prepend=states[:1])
     forces = Forces.from_experiment(
-        experiment, experiment.t_s[:samples], body.theta
+        experiment, experiment.t_s[:samples], theta=body.theta
     ).total(states, ways)
     on_nodes = forces.reshape(samples, -1, 3)
     on_body = [-on_nodes[:, each.nodes].sum(axis=1) for each in body.obstacles]

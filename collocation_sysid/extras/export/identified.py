@@ -287,17 +287,17 @@ class IdentifiedBody:
         return cls(
             problem.title,
             result.trust.verdict,
-            warnings,
-            {
+            warnings=warnings,
+            parameters={
                 n: each
                 for n, each in result.parameters.items()
                 if n in result.values
             },
-            body,
-            body.theta_from_values(values),
-            corrected,
-            rolled_out_m,
-            touching,
+            body=body,
+            theta=body.theta_from_values(values),
+            experiment=corrected,
+            simulated_m=rolled_out_m,
+            experiment_with_obstacles=touching,
         )
 
     @property

@@ -343,7 +343,7 @@ def _compare_first_frequency(
     theirs = float(np.sqrt(oscillating[0])) / (2 * np.pi)
     dofs = np.flatnonzero(np.repeat(free, 3))
     in_vacuum = replace(body.experiment, air_density_kg_m3="none")
-    forces = Forces.from_experiment(in_vacuum, body.start_s, body.theta)
+    forces = Forces.from_experiment(in_vacuum, body.start_s, theta=body.theta)
     ours = natural_modes(
         forces, body.nodes_m, free_dofs=dofs, count=1
     ).frequencies_hz

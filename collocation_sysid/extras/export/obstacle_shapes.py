@@ -64,23 +64,31 @@ class Primitive:
             return cls(
                 kind,
                 np.zeros(0),
-                solid.point_m,
-                _rotation_of_z_to(solid.normal),
+                centre_m=solid.point_m,
+                rotation=_rotation_of_z_to(solid.normal),
             )
         if isinstance(solid, Sphere):
-            return cls(kind, np.array([solid.radius_m]), solid.centre_m, turn)
+            return cls(
+                kind,
+                np.array([solid.radius_m]),
+                centre_m=solid.centre_m,
+                rotation=turn,
+            )
         if isinstance(solid, Cuboid):
             return cls(
                 kind,
                 np.diff(solid.corners_m, axis=0)[0] / 2,
-                solid.tilt_centre_m,
-                turn,
+                centre_m=solid.tilt_centre_m,
+                rotation=turn,
             )
         assert isinstance(solid, (Cylinder, Capsule))
         way = np.diff(solid.ends_m, axis=0)[0]
         size = np.array([solid.radius_m, np.linalg.norm(way) / 2])
         return cls(
-            kind, size, solid.ends_m.mean(axis=0), _rotation_of_z_to(way)
+            kind,
+            size,
+            centre_m=solid.ends_m.mean(axis=0),
+            rotation=_rotation_of_z_to(way),
         )
 
     def pose_at(self, obstacle: Obstacle, t_s: float) -> tuple[Array, Rotation]:
@@ -376,7 +384,7 @@ def faceted_obstacles(body: IdentifiedBody) -> tuple[FacetedObstacle, ...]:
         width_m = float(np.average(law.widths_m, weights=area_m2))
         solid = offset_solid(obstacle.shape, width_m / 2)
         facets = Facets.from_solid(
-            solid, box_m.mean(axis=0), size_m, width_m / 2
+            solid, box_m.mean(axis=0), size_m=size_m, depth_m=width_m / 2
         )
         faces = law.surface.faces
         touching = np.unique(
@@ -462,6 +470,6 @@ class SharedContact:
         return cls(
             friction[0],
             max(stiffness),
-            max(width) / 2,
-            (sentence,) * bool(unlike),
+            particle_radius_m=max(width) / 2,
+            limitations=(sentence,) * bool(unlike),
         )

@@ -87,7 +87,7 @@ def write_rerun(
         recording = _Recording(place / RECORDING_FILE, result, replays=replays)
         limits = _limits(stresses)
         for replay, stress in zip(replays, stresses, strict=True):
-            recording.write_experiment(replay, stress, limits)
+            recording.write_experiment(replay, stress, limits=limits)
         recording.close()
     return [
         f"experiment '{replay.name}' has no frames, so that its surface has no stress"

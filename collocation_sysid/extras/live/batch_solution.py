@@ -59,7 +59,7 @@ def recording_from_log(
         for matrix, row in zip(matrices, at_samples, strict=True):
             matrix[:3, :3], matrix[:3, 3] = row.poses[k]
         smooth = grasps[number].poses.interpolation
-        poses = PoseSequence.from_matrices(t_s, matrices, smooth)
+        poses = PoseSequence.from_matrices(t_s, matrices, interpolation=smooth)
         grasps[number] = replace(grasps[number], poses=poses)
     markers = replace(experiment.markers, t_s=t_s, positions_m=tracks_m)
     readings = []

@@ -256,7 +256,7 @@ class LiveEstimator:
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
         self.prior = SquareRootInformation.empty(model.parameter_count)
         self.first_pass: WindowPass | None = None
-        self._combined = CombinedPasses(self.prior, [], [])
+        self._combined = CombinedPasses(self.prior, [], points=[])
         self._last_positions_m = np.full((1, 3), np.nan)
         self.second_pass: WindowPass | None = None
         self.log: list[LoggedRow] = []
@@ -690,7 +690,7 @@ class LiveEstimator:
             began = self.clock()
             again.repeat_rows([row] * count)
             took_s[count] = min(took_s.get(count, np.inf), self.clock() - began)
-        return TimeBudget.from_times(took_s[1], took_s[most], most)
+        return TimeBudget.from_times(took_s[1], took_s[most], many=most)
 
     def _start_pass(self, row: LoggedRow) -> None:
         """Start the first pass with the first row, and set unknown marker places from its
@@ -843,7 +843,7 @@ class LiveEstimator:
             1 / (deviation * self.model.collocation.reach_p * track.sweep.rates)
         )
         information = self._combined.information.with_rows(
-            np.zeros(size), slopes, track.sweep.transformed
+            np.zeros(size), slopes, parameters=track.sweep.transformed
         )
         return self._constrained_minimum(track, information)
 

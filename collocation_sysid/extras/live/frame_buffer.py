@@ -385,6 +385,6 @@ class FrameBuffer:
             if each[1] >= self.start_s - (0 if each[0] else room_s)
         ]
         return [
-            Sample((now_s - t_s) / step_s, values, of)
+            Sample((now_s - t_s) / step_s, values, instrument=of)
             for of, t_s, values in available
         ]

@@ -84,12 +84,15 @@ def read_problem(
         If the file or folder has no valid problem.
     """
     if not recording.is_dir():
-        return Problem.read(recording, overrides, allow_code)
+        return Problem.read(recording, overrides, allow_code=allow_code)
     home = Result.read(recording).problem_folder(
         recording, "which a replay needs"
     )
     return Problem.read(
-        recording / "problem.toml", overrides, allow_code, folder=home
+        recording / "problem.toml",
+        overrides,
+        allow_code=allow_code,
+        folder=home,
     )
 
 

@@ -388,7 +388,9 @@ class CombinedPasses(NamedTuple):
             or not repeated
             or len(remaining) > min(LARGEST_LAG, len(repeated))
         ):
-            return cls(track.information, residuals, track.linearisation_points)
+            return cls(
+                track.information, residuals, points=track.linearisation_points
+            )
         points = [
             *again.linearisation_points,
             *track.linearisation_points_from(again.rows),
@@ -396,7 +398,7 @@ class CombinedPasses(NamedTuple):
         return cls(
             track.sweep.with_residuals(again.information, remaining),
             [*repeated, *remaining],
-            points,
+            points=points,
         )
 
     def scatter(self, transformed: Array) -> ResidualScatter:

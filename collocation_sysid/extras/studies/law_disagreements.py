@@ -141,7 +141,7 @@ def _disagreement(
     with_law = line.with_source(
         LAW,
         float(np.sqrt(np.mean((coordinates - coordinates[0]) ** 2))),
-        coordinate,
+        coordinate=coordinate,
     )
     return Disagreement(
         name,

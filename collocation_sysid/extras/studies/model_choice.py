@@ -610,7 +610,9 @@ def _budget_record(
     )
     return {
         name: asdict(line)
-        for name, line in budget(sources, known, {}, parameters).items()
+        for name, line in budget(
+            sources, known, numerical={}, parameters=parameters
+        ).items()
     }
 
 

@@ -58,7 +58,9 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
     """
     try:
         problem = Problem.read(
-            planned["problem"], planned["overrides"], planned["allow_code"]
+            planned["problem"],
+            planned["overrides"],
+            allow_code=planned["allow_code"],
         )
         test_name = planned.get("test_name")
         if test_name is not None:

@@ -227,7 +227,7 @@ def plan_comparison(
     for start in range(starts.starts):
         start_overrides = [
             *overrides,
-            *starts.overrides(problem, truth or {}, start),
+            *starts.overrides(problem, truth or {}, start=start),
         ]
         file, _ = read_problem_file(problem.path, start_overrides)
         details = {"start": start, "allow_code": allow_code}

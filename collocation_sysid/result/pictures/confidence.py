@@ -74,8 +74,8 @@ class Confidence:
         return cls(
             names,
             values,
-            uncertainty.covariance[np.ix_(indices, indices)],
-            uncertainty.quantiles[indices],
+            covariance=uncertainty.covariance[np.ix_(indices, indices)],
+            quantiles=uncertainty.quantiles[indices],
         )
 
 
@@ -222,13 +222,15 @@ class _DeviationAxis:
             return cls(
                 reach,
                 (-size, 0.0, size),
-                (f"÷{factor:g}", "1", f"×{factor:g}"),
-                "",
+                labels=(f"÷{factor:g}", "1", f"×{factor:g}"),
+                unit="",
             )
         share = round_length(1 - np.exp(-0.9 * reach))
         number = f"{100 * share:g}"
         ticks = (float(np.log1p(-share)), 0.0, float(np.log1p(share)))
-        return cls(reach, ticks, (f"−{number}", "0", f"+{number}"), " [%]")
+        return cls(
+            reach, ticks, labels=(f"−{number}", "0", f"+{number}"), unit=" [%]"
+        )
 
     @property
     def limits(self) -> tuple[float, float]:

@@ -101,7 +101,7 @@ def field_picture(replay: MotionRecord, name: str, values: Array) -> Figure:
                 FOOT_MM + (1 - row) * (height + GAP_MM),
             )
             view = SheetView.fit_points(
-                camera, nodes_m, (width, height), corner
+                camera, nodes_m, room_mm=(width, height), corner_mm=corner
             )
             colours = scale.to_rgba(values[:, place])[:, :3]
             colours = (1 - np.nan_to_num(untold)) * colours + np.nan_to_num(
@@ -109,7 +109,10 @@ def field_picture(replay: MotionRecord, name: str, values: Array) -> Figure:
             )
             colours[np.isnan(values[:, place])] = OTHER_REGION_COLOUR
             BodyDrawing(axes, view, surface=faces).update(
-                nodes_m, no_nodes, np.zeros((0, 3)), colours[own[owners]]
+                nodes_m,
+                no_nodes,
+                markers_m=np.zeros((0, 3)),
+                colours=colours[own[owners]],
             )
             if row == 0:
                 axes.text(

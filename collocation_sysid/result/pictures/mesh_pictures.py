@@ -126,14 +126,16 @@ def mesh_picture(replay: MotionRecord) -> Figure:
     for camera, corner, mine in zip(
         (front, behind), corners, (first, ~first), strict=True
     ):
-        view = SheetView.fit_points(camera, everything, (width, height), corner)
+        view = SheetView.fit_points(
+            camera, everything, room_mm=(width, height), corner_mm=corner
+        )
         BodyDrawing(
             axes,
             view,
             surface=surface,
             parts=replay.surface_parts,
             nodes=replay.surface_nodes,
-        ).update(nodes_m, is_grasped, places_m)
+        ).update(nodes_m, is_grasped, markers_m=places_m)
         marks |= _draw_declared_positions(
             axes, view, places_m=places_m, declared_m=declared_m
         )
@@ -238,7 +240,7 @@ def _are_named_in_front(
     from behind.
     """
     hidden = [
-        camera.are_hidden(places_m, nodes_m, surface)
+        camera.are_hidden(places_m, nodes_m, surface=surface)
         for camera in (front, behind)
     ]
     is_in_front = front.depths_m(places_m) >= front.depths_m(nodes_m).mean()

@@ -108,7 +108,11 @@ class SheetView:
         room = np.asarray(room_mm, dtype=float)
         corner = np.asarray(corner_mm, dtype=float)
         scale = float(np.min(room / np.maximum(high - low, 1e-12)))
-        return cls(camera, scale, corner + room / 2 - scale * (low + high) / 2)
+        return cls(
+            camera,
+            scale,
+            origin_mm=corner + room / 2 - scale * (low + high) / 2,
+        )
 
     def moved_by(self, by_mm: ArrayLike) -> SheetView:
         """Return the view moved on the sheet by `by_mm` (2,)."""
@@ -281,10 +285,14 @@ class BodyDrawing:
             ]
             self.depth_points.set_data(
                 *self.view.to_sheet_mm(
-                    few_m[~camera.are_hidden(few_m, positions_m, self.surface)]
+                    few_m[
+                        ~camera.are_hidden(
+                            few_m, positions_m, surface=self.surface
+                        )
+                    ]
                 ).T
             )
-        hidden = camera.are_hidden(markers_m, positions_m, self.surface)
+        hidden = camera.are_hidden(markers_m, positions_m, surface=self.surface)
         self.hidden_markers.set_data(
             *self.view.to_sheet_mm(markers_m[hidden]).T
         )

@@ -152,9 +152,9 @@ def shapes_picture(
         body.update(
             positions_m[t],
             replay.is_prescribed[t],
-            measured_m[t],
-            colour,
-            obstacles_m,
+            markers_m=measured_m[t],
+            colours=colour,
+            outlines_m=obstacles_m,
         )
         text = {"ha": "center", "va": "center", "fontsize": SMALL_PT}
         middle = start + scale * (last - first) / 2

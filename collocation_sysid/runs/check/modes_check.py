@@ -128,7 +128,7 @@ def check_modes(
     )
     free = np.flatnonzero(~is_prescribed[least])
     modes = natural_modes(
-        Forces.from_experiment(experiment, time_s, theta),
+        Forces.from_experiment(experiment, time_s, theta=theta),
         x,
         free_dofs=free,
         count=MODE_COUNT,
@@ -140,7 +140,11 @@ def check_modes(
         limit = _damping_limit(findings[0])
         ratio = _oscillating_damping_ratio(findings[0].damping_ratio)
         needed = substeps_needed(
-            scheme, omega, experiment.timestep_s, limit, damping_ratio=ratio
+            scheme,
+            omega,
+            timestep_s=experiment.timestep_s,
+            damping_limit=limit,
+            damping_ratio=ratio,
         )
     return ModesCheck(
         experiment.name,
