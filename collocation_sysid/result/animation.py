@@ -470,7 +470,9 @@ class FilmFigure:
         mm_per_m: float,
         height_mm: float,
     ) -> None:
-        """Draw the axis directions, the scale bar and the legend around the body."""
+        """Draw the axis directions, the scale bar for `mm_per_m` and the legend below the body into
+        `axes`.
+        """
         draw_directions(axes, camera, origin_mm=(7.0, 4.0))
         draw_scale(axes, mm_per_m, corner_mm=(FILM_WIDTH_MM * 0.17, 4.0))
         named = ["grasped", "measured", "behind the body"]

@@ -129,7 +129,9 @@ def framed_figure(
 def style_axes(
     axes: Axes, title: str = "", xlabel: str = "", ylabel: str = ""
 ) -> None:
-    """Give axes a title, labels, the type sizes of this module, and a light frame and grid."""
+    """Give axes a title, labels of the x and the y axis (empty for none), the type sizes of this
+    module, and a light frame and grid.
+    """
     axes.set_title(title, fontsize=TEXT_PT, loc="left")
     axes.set_xlabel(xlabel, fontsize=TEXT_PT)
     axes.set_ylabel(ylabel, fontsize=TEXT_PT)

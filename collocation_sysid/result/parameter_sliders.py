@@ -352,7 +352,9 @@ class ParameterSliders:
 
 
 def _slider(widgets: Any, name: str, values: SliderRange) -> Any:
-    """Return the slider of a parameter, which reports its value when it is released."""
+    """Return the slider of a parameter for a range, which reports its value when it is released;
+    `widgets` is the module ipywidgets.
+    """
     common = {
         "description": symbol_with_unit(name),
         "continuous_update": False,

@@ -206,7 +206,7 @@ def _conclusions(result: Result) -> Iterator[str]:
 
 
 def _named_change(probe: Probe, result: Result, name: str) -> str:
-    """Return the change of the estimate `name` in a refit, with its symbol."""
+    """Return the change of the estimate `name` in a refit, with its symbol; the refit must have it."""
     return f"{symbol_of(name)} {_change_text(probe.moves[name], result.values[name].value)}"
 
 

@@ -160,8 +160,8 @@ def _write_pictures(
 
 
 def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
-    """Return the cell data that are the same in every frame: region numbers and spatially varying
-    constants.
+    """Return the cell data that are the same in every frame: region numbers, if there are several,
+    and spatially varying constants of a body.
 
     Each array has one row for each of the E elements. A constant has four: its estimate, the ends
     of its 95 % interval (suffixes ``_lower``, ``_upper``), and its posterior over its prior
@@ -297,10 +297,18 @@ def _depth_rows(
 def _surface_contact(
     finished: SolvedProblem, experiment: Experiment, positions_m: Array
 ) -> tuple[Array, Array] | None:
-    """Return gap [m] and contact pressure [Pa] on the boundary triangles, (T, F) each; None without
-    obstacles.
+    """Return gap [m] and contact pressure [Pa] on the boundary triangles at the estimates, (T, F)
+    each; None without obstacles.
 
-    `positions_m` are the node positions (T, n, 3) [m].
+    Poses are corrected by the nuisance parameters if the experiment was fitted.
+
+    Parameters
+    ----------
+    finished : SolvedProblem
+    experiment : Experiment
+        Experiment of the problem.
+    positions_m : (T, n, 3)
+        Node positions.
     """
     if not experiment.obstacles:
         return None

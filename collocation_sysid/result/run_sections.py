@@ -622,7 +622,9 @@ def _errors_text(
 
 
 def _unit_text(units: Mapping[str, str] | None, reading: str) -> str:
-    """Return the unit of a custom sensor after a space; "" if it states none."""
+    """Return the unit of the custom sensor `reading` after a space; "" if it states none or `units`
+    is None.
+    """
     unit = (units or {}).get(reading, "")
     return f" {unit}" if unit else ""
 

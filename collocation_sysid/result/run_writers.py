@@ -345,7 +345,12 @@ def require_replaceable(
     """Raise an `InputError` if a place for a run folder holds anything but an earlier run; a
     missing or empty folder passes.
 
-    Parameters are those of `replaced_folder`.
+    Parameters
+    ----------
+    target : Path
+        Place of the folder.
+    overwrite, marker_file, content_word
+        See `replaced_folder`.
 
     Raises
     ------

@@ -156,7 +156,9 @@ def _trajectories(replay: MotionRecord) -> dict[str, Array]:
 
 
 def _page_data(replay: MotionRecord, colouring: Colouring) -> dict[str, Any]:
-    """Return the data of the page, ready for JSON; arrays are in base64, see `_base64`."""
+    """Return the data of the page for an experiment and its colouring, ready for JSON; arrays are
+    in base64, see `_base64`, and samples are thinned to at most `MAX_PAGE_FRAMES`.
+    """
     samples = np.arange(
         0, len(replay.t_s), -(-len(replay.t_s) // MAX_PAGE_FRAMES)
     )

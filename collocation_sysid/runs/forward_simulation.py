@@ -121,6 +121,7 @@ def simulate_experiments(
         completed = 0.0
 
         def report(share: float) -> None:
+            """Add the increase of the completed share, from 0 to 1, to the counter of the phase."""
             nonlocal completed
             complete_steps(StepUnit.SIMULATION, share - completed)
             completed = share
@@ -334,6 +335,15 @@ def _blind_error(
 ) -> PredictionErrors | None:
     """Return the errors of a prediction of a recording with the nuisance parameters of the fitted
     recordings; None if the simulation fails.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its integrator and step are used.
+    segment : Transcription
+        Recording to be predicted, with its measurements.
+    solution : Solution
+        Solution of the fitted recordings.
     """
     phi = nuisance_of_fitted_recordings(segment, solution)
     try:
@@ -455,7 +465,16 @@ def _sensor_differences(
     part: ExperimentIterate, trajectory: Trajectory, share: float
 ) -> list[Array]:
     """Return `share` times the difference (simulated − fitted) of each custom sensor, (S, G, 3),
-    over σ; zero where a value is NaN.
+    over σ; zero where a value is NaN. Empty without custom sensors.
+
+    Parameters
+    ----------
+    part : ExperimentIterate
+        Fitted experiment at the solution.
+    trajectory : Trajectory
+        Its forward simulation.
+    share : float
+        Factor on all differences.
     """
     if not (segment := part.segment).custom_sensors:
         return []
@@ -562,11 +581,11 @@ def _step_error_share(problem: Problem, segment: Transcription) -> float | None:
 
 
 def _step_s(problem: Problem, segment: Transcription) -> float:
-    """Return the step of the forward simulation [s]: the stated one, by default finer than the grid
-    of the fit.
+    """Return the step of the forward simulation of a recording [s]: the stated one, by default
+    finer than the grid of the fit.
 
-    The default is at most a quarter of the sample interval and at most half the grid step, unless
-    that makes too many steps.
+    The default is the sample interval over four, or over twice the substeps of the fit if these are
+    more, unless that makes more than the largest number of steps.
     """
     count = min(max(4, 2 * segment.substeps), MOST_STEPS - 1)
     return problem.rollout.timestep_s or segment.experiment.timestep_s / count

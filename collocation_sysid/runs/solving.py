@@ -334,6 +334,15 @@ def _best_of_second_start(
 
     Without a second start the first solution is returned; after an interrupt it is returned as
     interrupted.
+
+    Parameters
+    ----------
+    solver : Method
+        Method to use.
+    first : Solution
+        Converged solution.
+    watch : callable or None
+        Called with every iteration of the second search.
     """
     other = second_start_parameters(first)
     if other is None:
@@ -428,8 +437,9 @@ def second_start_parameters(solution: Solution) -> Parameters | None:
 
 
 def _usual_modulus(name: str, young_pa: float) -> float:
-    """Return the starting value of one of the `LAME` constants: `USUAL_POISSON` for a Poisson's
-    ratio, or the modulus [Pa] that follows from it and from Young's modulus.
+    """Return the starting value of the constant `name`, one of the `LAME` constants with its
+    region: `USUAL_POISSON` for a Poisson's ratio, or the modulus [Pa] that follows from it and from
+    Young's modulus `young_pa`.
     """
     value = (
         USUAL_POISSON

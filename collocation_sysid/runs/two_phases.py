@@ -242,7 +242,20 @@ def _solve_with_phases(
     warm_start: WarmStart,
     solve_once: SolveOnce,
 ) -> Solution:
-    """Solve with given phases, from the parameters of an earlier answer."""
+    """Return the solution of a problem with given phases, from the parameters of an earlier answer.
+
+    Parameters
+    ----------
+    problem : Problem
+    search : _PhaseSearch
+        Its two-phase field.
+    phase : (E,) array
+        Phases of the elements: 1 in inclusions, 0 elsewhere.
+    warm_start : WarmStart
+        Estimates to start from.
+    solve_once : callable
+        See `solve_two_phases`.
+    """
     own = replace(search.modes, phase=phase)
     return solve_once(problem.with_fields({search.name: own}), warm_start)
 
@@ -341,6 +354,14 @@ def _linearise_in_elements(
 ) -> _LinearisedMeasurements:
     """Return the measurements linearised at a solution with the logarithm of the constant in every
     element as a parameter, instead of the shapes of the field.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem with the two-phase field `search`.
+    search : _PhaseSearch
+    solution : Solution
+        Solution with a smooth field or with phases.
     """
     body = _two_phase_body(solution, search)
     part = body.parts[search.number]
@@ -416,9 +437,17 @@ def _samples(
 def _fit_with_elements(
     problem: Problem, solution: Solution, search: _PhaseSearch
 ) -> LinearisedFit:
-    """Return the linearised fit at a solution, with the elements' logarithms as further parameters.
+    """Return the linearised fit at a solution, with the elements' logarithms as further parameters,
+    whose values are zero.
 
-    The values of these parameters are zero.
+    Parameters
+    ----------
+    problem : Problem
+        Problem whose field is an `ElementLogarithms`.
+    solution : Solution
+        Solution that gives positions and all other parameters.
+    search : _PhaseSearch
+        Names of the elements' logarithms.
     """
     solved = solution.collocation
     elements = set(search.elements)

@@ -179,7 +179,9 @@ def combined_concerns(
 def _undetermined_concern(
     name: str, estimate: ReportedEstimate, shares: Mapping[str, float]
 ) -> Concern:
-    """Return the concern about an undetermined estimate, with the largest share of its budget."""
+    """Return the concern about the undetermined estimate `name`, with the first, largest share of
+    its budget `shares`, which must not be empty.
+    """
     source, share = next(iter(shares.items()))
     low, high = estimate.combined95 or (np.nan, np.nan)
     data = {
@@ -255,8 +257,8 @@ def _prediction_concerns(
 def _unseen_depth_concerns(
     name: str, rollout: ForwardSimulation | str
 ) -> Iterator[Concern]:
-    """Yield a concern for each depth camera without a point within its gate of the simulated
-    surface; none if the simulation failed.
+    """Yield a concern for each depth camera of the experiment `name` without a point within its
+    gate of the simulated surface; none if the simulation failed (`rollout` is its reason).
     """
     for camera, error in (
         rollout.depth.items() if isinstance(rollout, ForwardSimulation) else ()
@@ -329,8 +331,8 @@ def _forward_concerns(
 def _depth_concerns(
     name: str, rollout: ForwardSimulation, solution: Solution
 ) -> Iterator[Concern]:
-    """Yield concerns about predicted depth, against the larger of the fitted residuals and the
-    noise.
+    """Yield concerns about the predicted depth of the experiment `name`, in stated σ without
+    outliers, against the larger of the fitted residuals of all cameras and the noise.
     """
     fitted = [error.tame_sigmas for error in depth_errors(solution).values()]
     yardstick = max(1.0, root_mean(np.square(fitted)) if fitted else 0.0)
@@ -399,7 +401,8 @@ def modes_by_experiment(
     """Return the natural modes of each body at the estimates, by experiment; empty if the search
     failed.
 
-    Static experiments, and those without an equilibrium, are left out.
+    All moving experiments of the problem count, also those for validation; those without an
+    equilibrium of the body are left out.
     """
     motions = {}
     substeps = solution.collocation.substeps

@@ -409,8 +409,21 @@ def design_motion(
 def _evaluate_design(
     judge: MotionObjective, best: SearchResult, add: bool
 ) -> Design:
-    """Return the design with the best motion, its error bars and its simulation; `best` must have
-    coefficients.
+    """Return the design with the best motion, its error bars and its simulation.
+
+    Parameters
+    ----------
+    judge : MotionObjective
+        Objective that was minimised.
+    best : SearchResult
+        Result of the search, which must have coefficients.
+    add : bool
+        Whether the new recording complements the existing ones.
+
+    Raises
+    ------
+    SimulationError
+        If the motion cannot be simulated at some draw.
     """
     assert best.coefficients is not None
     recording = judge.recording
@@ -440,9 +453,10 @@ def _evaluate_design(
 
 
 def _before(judge: MotionObjective, add: bool) -> ErrorBars | None:
-    """Return the error bars to compare with: those of the existing recordings if the new one is
-    added, else those of the motion in the problem; None if that has no motion or cannot be
-    simulated.
+    """Return the error bars to compare with, from the draws of `judge`.
+
+    If the new recording is added (`add`) they are those of the existing recordings, else those of
+    the motion in the problem; None if that has no motion or cannot be simulated.
     """
     if add:
         return ErrorBars.from_draws([judge.errors(0.0, q) for q in judge.draws])

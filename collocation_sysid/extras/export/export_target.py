@@ -319,7 +319,7 @@ def values_as_text(
     values: Iterable[float] | Array, separator: str = " "
 ) -> str:
     """Return numbers, of an array in row-major order, as text from which they are read back
-    exactly.
+    exactly, with `separator` between them.
     """
     return separator.join(
         repr(float(value)) for value in np.ravel(np.asarray(values))

@@ -148,8 +148,9 @@ def _geom_attributes(solid: Solid) -> str:
 
 
 def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
-    """Return the XML of the constraints between the mocap bodies and the bodies that carry grasped
-    nodes.
+    """Return the XML of the constraints between the mocap bodies of the grasps and the bodies that
+    carry grasped nodes; empty without grasps. They are as stiff as the timestep `step_s` [s]
+    allows.
     """
     return "".join(
         f'<weld body1="hand{k}" body2="grasp{k}" relpose="0 0 0 1 0 0 0" '
@@ -319,6 +320,14 @@ def _compare_first_frequency(
     here [Hz], in vacuum and without rigid modes.
 
     The stiffness in MuJoCo follows from central differences of its forces.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+    mujoco : module
+        Module of MuJoCo.
+    model : MjModel
+        Exported model.
     """
     data = mujoco.MjData(model)
     free = ~body.is_node_prescribed

@@ -225,7 +225,9 @@ class _Recording:
         return self.rr.new_entity_path(list(parts))
 
     def _write_parameters(self, result: Result, span_s: Array) -> None:
-        """Write each parameter with its combined interval as constant curves."""
+        """Write each parameter of a result with its combined interval, if known, as constant curves
+        between the two times `span_s` [s].
+        """
         for name, each in result.values.items():
             curves = {"value": each.value}
             if each.combined95 is not None:
@@ -320,7 +322,18 @@ class _Recording:
         stress: Array | None,
         limits: tuple[float, float],
     ) -> None:
-        """Write the deforming surface; samples that are not finite are left out."""
+        """Write the deforming surface and the largest stress at each sample; samples that are not
+        finite are left out.
+
+        Parameters
+        ----------
+        replay : MotionRecord
+            It has shapes.
+        stress : (T, F) array or None
+            Von Mises stress on the surface [Pa], which colours it; None for grey.
+        limits : (low, high)
+            Ends of the colour scale [Pa].
+        """
         rr = self.rr
         shapes_m = replay.shapes_m
         assert shapes_m is not None
@@ -362,8 +375,21 @@ class _Recording:
         colour: tuple[int, int, int],
         radius_m: float,
     ) -> None:
-        """Write points (k, 3) [m] at each time; points that are not finite are left out. Nothing is
-        written if none remains.
+        """Write points at each time; points that are not finite are left out. Nothing is written if
+        none remains.
+
+        Parameters
+        ----------
+        path : str
+            Path of the entity.
+        t_s : (T,) array
+            Times [s].
+        points_m : sequence of T (k, 3) arrays
+            Points at each time [m]; their number may change.
+        colour : tuple of int
+            Red, green and blue, from 0 to 255.
+        radius_m : float
+            Radius of a point [m].
         """
         rr = self.rr
         there = [each[np.isfinite(each).all(axis=1)] for each in points_m]
@@ -429,7 +455,9 @@ class _Recording:
     def _write_curve(
         self, path: str, t_s: Array, values: Sequence[float] | Array
     ) -> None:
-        """Write a number over time; times at which it is not finite are left out."""
+        """Write a number `values` (T,) over the times `t_s` (T,) [s] under the entity `path`; times
+        at which it is not finite are left out.
+        """
         curve = np.asarray(values, dtype=float)
         is_finite = np.isfinite(curve)
         if is_finite.any():
@@ -439,7 +467,9 @@ class _Recording:
     def _send(
         self, path: str, t_s: Array, columns: Any, counts: Sequence[int] | None
     ) -> None:
-        """Send columns at times [s]; `counts` are the numbers of rows per time, None for one."""
+        """Send columns of the entity `path` at the times `t_s` (T,) [s]; `counts` are the numbers
+        of rows per time, None for one row each.
+        """
         times = [self.rr.TimeColumn(TIMELINE, duration=t_s)]
         data = columns if counts is None else columns.partition(counts)
         self.stream.send_columns(path, times, data)

@@ -300,7 +300,9 @@ def _bind_material(pxr: Any, prim: Any, material: Any) -> None:
 
 
 def _set_token(pxr: Any, prim: Any, name: str, text: str) -> None:
-    """Set a uniform token attribute of a prim."""
+    """Set the uniform token attribute `name` of a prim to `text`, in place; `pxr` are the modules
+    of `_import_usd`.
+    """
     kind = pxr.Sdf.ValueTypeNames.Token
     fixed = pxr.Sdf.VariabilityUniform
     prim.CreateAttribute(name, kind, False, fixed).Set(text)
@@ -356,7 +358,8 @@ def _set_poses(
     """Place a prim at positions (T, 3) [m] and rotations (T) at times (T,) [s]; its default pose is
     that of the first row.
 
-    With empty `t_s` there is one row, which holds for all time.
+    With empty `t_s` there is one row, which holds for all time. The prim is modified in place;
+    `pxr` are the modules of `_import_usd`.
     """
     codes = (_rate_hz(t_s) * t_s).tolist()
     wxyz = rotations.as_quat(scalar_first=True)
@@ -371,7 +374,11 @@ def _set_poses(
 def _add_obstacle(
     pxr: Any, stage: Any, path: str, obstacle: Obstacle, body: IdentifiedBody
 ) -> None:
-    """Add an obstacle with its friction to the stage under `path`; it is kinematic if it moves."""
+    """Add an obstacle with its friction to the stage, in place, under `path`.
+
+    It is a kinematic rigid body if it moves; otherwise it stays at its pose of the first sample of
+    `body`. Rounded edges are left out.
+    """
     shape = Primitive.from_solid(obstacle.shape)
     t_s = body.experiment.t_s
     frame = path

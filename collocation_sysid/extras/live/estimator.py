@@ -671,8 +671,15 @@ class LiveEstimator:
         return poses, trial.blocks[0].stored_rows[0].x
 
     def _measure_times(self, trial: WindowPass, row: LoggedRow) -> TimeBudget:
-        """Return the measured computing times of one and of many repeated rows, each the shortest
-        of several measurements.
+        """Return the computing times of one and of many repeated rows, each the shortest of
+        `TIMING_REPETITIONS` measurements.
+
+        Parameters
+        ----------
+        trial : WindowPass
+            Pass with enough rows to be repeated; not modified.
+        row : LoggedRow
+            Input of every repeated row.
         """
         took_s: dict[int, float] = {}
         most = min(
@@ -983,8 +990,18 @@ class LiveEstimator:
     def _catch_up(self, began: float, notes: list[str]) -> int:
         """Complete a second pass that lags by few rows, if there is time, before new rows come.
 
-        Return the number of rows that were computed again; 0 without a second pass, if it is a
-        trial of a search, or if the remaining rows do not fit into the budget beside a usual frame.
+        Parameters
+        ----------
+        began : float
+            Time at which the frame began, by `clock`.
+        notes : list of str
+            Extended in place.
+
+        Returns
+        -------
+        int
+            Number of rows that were computed again; 0 without a second pass, if it is a trial of a
+            search, or if the remaining rows do not fit into the budget beside a usual frame.
         """
         again = self.second_pass
         if again is None or again.base is None:

@@ -367,7 +367,9 @@ class FrameBuffer:
         latest_s = now_s - self.neighbouring_samples * self.interval_s + room_s
 
         def ready(of: int, t_s: float) -> bool:
-            """Return whether the rows that a sample needs are available."""
+            """Return whether the rows that a sample at t_s needs are available; `of` is the number
+            of its instrument, 0 for markers.
+            """
             if not of:
                 return t_s <= latest_s
             instrument = self.instruments[of - 1]

@@ -368,8 +368,9 @@ class CombinedPasses(NamedTuple):
     def from_passes(
         cls, track: WindowPass, again: WindowPass | None
     ) -> CombinedPasses:
-        """Return the joint information of a pass and of a repetition that has nearly caught up with
-        it: the samples that both have count from the repetition, the rest from the pass.
+        """Return the joint information of a pass `track` and of a repetition `again` that has
+        nearly caught up with it: the samples that both have count from the repetition, the rest
+        from the pass.
 
         If the repetition is None, has failed, has no base (a trial of other initial values), or
         lags behind by more than `LARGEST_LAG` samples or than its own samples, the information is

@@ -124,8 +124,18 @@ def _disagreement(
     values: Mapping[str, float],
     budget_line: Mapping[str, object] | None,
 ) -> Disagreement:
-    """Return the disagreement of one parameter: its values by model, and the chosen model's budget
-    with the choice of the law as a further source; without a budget line the intervals are None.
+    """Return the disagreement of one parameter.
+
+    Parameters
+    ----------
+    name : str
+        Name of the parameter.
+    values : mapping of str to float
+        Positive estimates by model, the chosen one first.
+    budget_line : mapping or None
+        Fields of the chosen model's `BudgetLine`, to which the choice of the law is added as a
+        further source; None if it is unknown, which leaves budget and interval None and the share
+        0.
     """
     if budget_line is None:
         return Disagreement(

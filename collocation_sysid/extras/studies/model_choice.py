@@ -307,8 +307,8 @@ def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
 
 
 def _failed_prediction(row: Row, chosen: Row) -> str:
-    """Return a sentence on a model with which some held-out samples cannot be predicted, and on its
-    AIC if that speaks for it.
+    """Return a sentence on the model `row`, with which some held-out samples cannot be predicted,
+    and on its AIC if that is lower than that of the `chosen` model by more than `NO_SUPPORT`.
     """
     without = " and ".join(
         f"'{name}'" for name, rms in row["predictions"].items() if not rms
@@ -584,9 +584,19 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
 def _budget_record(
     problem: Problem, solution: Solution, fit: LinearisedFit
 ) -> dict[str, Any]:
-    """Return the uncertainty budget of each estimate, without noise of the poses, step and mesh.
+    """Return the uncertainty budget of each estimate, without noise of the poses, step and mesh, as
+    the fields of `BudgetLine` by name.
 
     Empty if the error bars cannot be computed.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem with the options of the uncertainty.
+    solution : Solution
+        Its converged solution.
+    fit : LinearisedFit
+        The measurements linearised at the solution.
     """
     options = problem.uncertainty
     parameters = solution.collocation.parameters
@@ -674,8 +684,8 @@ def _without_later_wrench(grasp: Grasp, end_s: float) -> Grasp:
 
 
 def _without_later_values(gauge: Gauge, end_s: float) -> Gauge:
-    """Return the custom sensor without measurements after a time [s]; itself if none would
-    remain.
+    """Return the custom sensor `gauge` with measurements after `end_s` [s] replaced by NaN; itself
+    if none would remain.
     """
     values = np.where(
         (gauge.sample_times_s > end_s)[:, None], np.nan, gauge.measured_values
@@ -721,8 +731,22 @@ def _prediction_error(
     a simulation.
 
     The measurements are markers [m] or, without any, forces [N] on the complete specimen, or
-    stresses [Pa] of a specimen without a mesh; `unit` says which. Samples up to `start_s` are
-    ignored; the RMS is None without samples.
+    stresses [Pa] of a specimen without a mesh; "unit" says which.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Recording with all its measurements.
+    rollout : ForwardSimulation
+        Simulation at the same samples.
+    start_s : float
+        Samples up to this time are ignored.
+
+    Returns
+    -------
+    dict
+        "rms" (None without samples), "unit", "samples", and "blocks", `BLOCKS` sums of squares in
+        the order of time.
     """
     markers = experiment.markers
     unit = "m"

@@ -277,7 +277,15 @@ def variants(
 def file_variants(
     problems: Sequence[Problem], overrides: Sequence[str]
 ) -> list[ModelVariant]:
-    """Return problem files of the same recordings as models, named after the files.
+    """Return problem files of the same recordings as models, named after the files (with their
+    paths if two files have the same name).
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        At least one problem, each with its file.
+    overrides : sequence of str
+        Overrides "key=value" of all files.
 
     Raises
     ------

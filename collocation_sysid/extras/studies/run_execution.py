@@ -248,8 +248,15 @@ class RunStore:
     ) -> Record | None:
         """Return the record of a run; None if the run should be executed again.
 
-        A run is repeated if it crashed, or if it exceeded a time limit below the present one (None:
-        no limit). A run that ended with an error is not repeated.
+        A run is repeated if it crashed, or if it exceeded a time limit below the present one. A run
+        that ended with an error is not repeated.
+
+        Parameters
+        ----------
+        key : str
+            Key of the run.
+        time_limit_s : float or None
+            Present time limit [s]; None for no limit.
         """
         record = self.load(key)
         if record is None or record["outcome"] == CRASHED:
@@ -369,8 +376,17 @@ def run_all(
 def _result_record(
     future: Future, planned: PlannedRun, limits: RunOptions
 ) -> Record:
-    """Return the record of a run from its future; if that raises, a record of a crash, because its
-    worker was lost.
+    """Return the record of a run from its finished future; if that raises, a record of a crash,
+    because its worker was lost.
+
+    Parameters
+    ----------
+    future : Future
+        Future of the record.
+    planned : PlannedRun
+        The run.
+    limits : RunOptions
+        Options with the time limit, which the record of a crash contains.
     """
     try:
         return future.result()

@@ -456,7 +456,16 @@ def sweep_sentences(rows: Sequence[Row]) -> list[str]:
 
 
 def sweep_views(rows: Sequence[Row], varied_keys: Sequence[str]) -> list[Table]:
-    """Return tables of estimates and quality by swept values."""
+    """Return tables of estimates and quality, a line for each run with the values of the swept
+    keys.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row`, at least one.
+    varied_keys : sequence of str
+        Swept keys.
+    """
     places = {
         short: _varied_cell(key) for key, short in shortened_keys(varied_keys)
     }
@@ -572,8 +581,16 @@ def _table_view(
     number_columns: Mapping[str, Cell],
     rows: Sequence[Row],
 ) -> Table:
-    """Return a table with a line for each row and a column for each cell; the first columns are
-    `names`.
+    """Return a table with a line for each row and a column for each cell.
+
+    Parameters
+    ----------
+    title : str
+        Title; empty for none.
+    names, number_columns : mapping of heading to Cell
+        Cells of the first columns, which name the row, and of the others.
+    rows : sequence of Row
+        Rows in the order of the lines.
     """
     columns = {**names, **number_columns}
     cells = tuple(tuple(cell(row) for cell in columns.values()) for row in rows)

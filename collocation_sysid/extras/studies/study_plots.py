@@ -229,9 +229,16 @@ def basins(
     rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: bool
 ) -> Figure:
     """Return a figure of the start points over each pair of parameters, a row of panels for each
-    method.
+    method; a single parameter is paired with itself.
 
-    Guesses are drawn relative to `centre`: the truth, or the best answer.
+    Parameters
+    ----------
+    rows : sequence of Row
+        Runs with a guess of each parameter.
+    centre : mapping of str to float
+        Reference by name, relative to which guesses are drawn.
+    is_truth_known : bool
+        Whether the reference is the truth, otherwise the best estimate; for the labels.
     """
     names = list(centre)
     pairs = list(itertools.combinations(names, 2)) or [(names[0], names[0])]
@@ -361,7 +368,15 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
 def sweep_plots(
     rows: Sequence[Row], varied_keys: Sequence[str]
 ) -> dict[str, Figure]:
-    """Return the figures of a sweep by file name without suffix; empty if no run has a result."""
+    """Return the figures of a sweep by file name without suffix; empty if no run has a result.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        One for each run.
+    varied_keys : sequence of str
+        Swept keys.
+    """
     if all(row["rms_m"] is None for row in rows):
         return {}
     return {"sweep": estimates_against(rows, varied_keys)}
@@ -373,7 +388,14 @@ def estimates_against(
     """Return a figure of estimates with their 95 % intervals: a row for each parameter, a column
     for each swept key.
 
-    Answers that did not converge are crosses. Values of the first other key have colours.
+    Estimates that did not converge are crosses. Values of the first other key have colours.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        One for each run, at least one with a result.
+    varied_keys : sequence of str
+        Swept keys.
     """
     names = parameters_in(rows)
     width = max(PAGE_MM / 2, min(PAGE_MM, 80.0 * len(varied_keys)))

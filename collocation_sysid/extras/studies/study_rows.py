@@ -265,8 +265,8 @@ def _parameter_columns(
 
 
 def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
-    """Return the names of the parameters for which the first of at least one row has a column with
-    this prefix.
+    """Return the names of the parameters for which the first of `rows`, at least one, has a column
+    with the prefix `kind`.
     """
     return [
         name.removeprefix(kind) for name in rows[0] if name.startswith(kind)
@@ -354,9 +354,16 @@ def reference_parameters(
     rows: Sequence[Row], yardstick: SuccessCriterion
 ) -> dict[str, float]:
     """Return the parameters relative to which guesses are measured: the truth, or the estimates of
-    the best run of at least one row.
+    the best run.
 
     Empty if there is no truth and the best run did not converge.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        At least one run.
+    yardstick : SuccessCriterion
+        True values; if there are any, one for each estimated parameter (otherwise `KeyError`).
     """
     names = parameters_in(rows)
     if yardstick.truth:

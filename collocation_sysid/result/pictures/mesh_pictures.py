@@ -238,6 +238,20 @@ def _are_named_in_front(
 ) -> NDArray[np.bool_]:
     """Return for each marker (M,) whether its name is written in the front view, else in the one
     from behind.
+
+    It is the view in which the marker is not hidden; if it is hidden in both or in none, the nearer
+    one.
+
+    Parameters
+    ----------
+    front, behind : ParallelCamera
+        Cameras of the two views.
+    places_m : (M, 3)
+        Places of the markers.
+    nodes_m : (n, 3)
+        Nodes of the body.
+    surface : (F, 3)
+        Nodes of the boundary triangles.
     """
     hidden = [
         camera.are_hidden(places_m, nodes_m, surface=surface)

@@ -142,10 +142,11 @@ def _projected_extent(
 
 
 def with_nearby_outlines(points_m: Array, outlines_m: Array | None) -> Array:
-    """Return points (T, n, 3) of a body joined with outlines (T, o, 3) of obstacles near it.
+    """Return the points (T, n, 3) of a body joined with the outlines (T, o, 3) of obstacles near
+    it, as (T, n + o, 3).
 
-    Outline points further away than half the body's extent are moved to that distance. Without
-    outlines (None) the points alone are returned.
+    Outline points further away than half the body's extent are moved to that distance; NaN stays
+    NaN. Without outlines (None) the points alone are returned.
     """
     if outlines_m is None:
         return points_m
@@ -340,8 +341,8 @@ def draw_directions(
     origin_mm: ArrayLike,
     length_mm: float = 5.0,
 ) -> None:
-    """Draw arrows along x, y and z from `origin_mm` (2,); an axis nearly along the viewing
-    direction is left out.
+    """Draw arrows of `length_mm` along x, y and z from `origin_mm` (2,) on a sheet, as the camera
+    projects them; an axis nearly along the viewing direction is left out.
     """
     start = np.asarray(origin_mm, dtype=float)
     for letter, direction in zip("xyz", camera.project(np.eye(3)), strict=True):
@@ -397,7 +398,9 @@ def part_legend_handle(part: int, name: str) -> Line2D:
 def draw_legend(
     axes: Axes, entries: Sequence[Line2D], corner_mm: ArrayLike
 ) -> None:
-    """Draw one line of legend whose upper left corner is at `corner_mm` (2,)."""
+    """Draw one line of legend with these entries into the axes of a sheet; its upper left corner is
+    at `corner_mm` (2,).
+    """
     names = [str(entry.get_label()) for entry in entries]
     place: Any = tuple(np.asarray(corner_mm))
     box = Legend(

@@ -143,7 +143,9 @@ def _draw_parameters(
     names: Sequence[str],
     truth: Mapping[str, float] | None,
 ) -> None:
-    """Draw the parameters over the iterations, relative to `truth` or to their final values."""
+    """Draw the named parameters over the iterations into `axes`, relative to `truth` or, if that is
+    None, to their final values; a reference of zero counts as 1.
+    """
     axes.axhline(1.0, color=BLACK, lw=0.6)
     numbers = [iteration.number for iteration in history]
     for k, name in enumerate(names if history else ()):

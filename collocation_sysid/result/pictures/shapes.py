@@ -315,7 +315,19 @@ def field_shapes(
 def _surface_field(
     replay: MotionRecord, body: Body, constants: Mapping[str, float], field: str
 ) -> SurfaceField:
-    """Return a field of the elements, a key of `FIELD_TITLES`, on the boundary triangles."""
+    """Return a field of the elements on the boundary triangles of an experiment.
+
+    Parameters
+    ----------
+    replay : MotionRecord
+        Experiment with shapes.
+    body : Body
+        Its body.
+    constants : mapping of name to value
+        Constants of the body.
+    field : str
+        Key of `FIELD_TITLES`.
+    """
     elements = ElementFields.from_body(body, body.theta_from_values(constants))
     cells = body.mesh.surface_cells
 

@@ -378,7 +378,14 @@ def _simulated_fields(
     """Return the fields of `QuickCheck` and the totals of `CheckResult` for simulations at the
     guess.
 
-    The collocation may be that of the first samples.
+    Parameters
+    ----------
+    problem : Problem
+        Complete problem.
+    collocation : Collocation
+        Program that was simulated, perhaps that of the first samples.
+    z : (variables,) array
+        Its variables.
     """
     positions_m = {}
     for part in collocation.iterates(z):
@@ -462,7 +469,9 @@ def _program_fields(
 def _natural_modes(
     problem: Problem, collocation: Collocation
 ) -> tuple[ModesCheck, ...]:
-    """Return the natural modes at the guess of all fitted experiments that move."""
+    """Return the natural modes at the guess of all fitted experiments that move, with the scheme
+    and step of the collocation.
+    """
     scheme = as_scheme(collocation.scheme)
     guesses = problem.parameters.guesses
     return tuple(
@@ -480,7 +489,16 @@ def _natural_modes(
 def _concerns(
     problem: Problem, findings: CheckResult, unstable: Sequence[Instability]
 ) -> tuple[Concern, ...]:
-    """Return the expected problems, the likeliest mistakes first."""
+    """Return the expected problems, the likeliest mistakes first.
+
+    Parameters
+    ----------
+    problem : Problem
+    findings : CheckResult
+        Findings; its concerns are not used.
+    unstable : sequence of Instability
+        Losses of stability in the simulation at the guess.
+    """
     experiments = problem.experiments
     parameters = problem.parameters
     bodies = findings.bodies

@@ -323,8 +323,8 @@ def _rest_shape(body: Body) -> str | None:
 
 
 def _rest_shape_change_m(body: Body, theta: Array) -> float:
-    """Return the largest distance of the mesh from the stress-free shape [m]: 0 if the mesh is that
-    shape, NaN if none can be computed at θ.
+    """Return the largest distance of the mesh of a body from its stress-free shape [m]: 0 if the
+    mesh is that shape, NaN if none can be computed at the constants θ (k,).
     """
     if body.inverse_equilibrium is None:
         return 0.0

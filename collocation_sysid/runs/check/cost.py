@@ -264,10 +264,18 @@ def _estimated_sweeps_s(
     factorisation: Choice,
 ) -> float | None:
     """Return the estimated time of all sweeps of a solve [s], from one timed sweep over the first
-    rows of each experiment.
+    rows of each experiment; None if the equations cannot be solved.
 
-    None if the equations cannot be solved. `z` has the variables of the program `short` at the
-    start.
+    Parameters
+    ----------
+    collocation : Collocation
+        Complete program, which gives the number of rows.
+    short : Collocation
+        Program of the first samples.
+    z : (variables,) array
+        Variables of `short` at the start.
+    factorisation : {"auto", "band", "sparse", "supernodal"}
+        Option of reduced space.
     """
     total = 0.0
     for segment, part in zip(

@@ -190,8 +190,19 @@ def _difference_step(collocation: Collocation) -> float:
 def _slope_error(
     function, gradient, z: Array, rng: np.random.Generator, step: float
 ) -> float:
-    """Return the relative error of a gradient along a random direction, at a point near z, with
-    central differences of `function`.
+    """Return the relative error of a gradient along a random direction, at a random point near z,
+    from central differences.
+
+    Parameters
+    ----------
+    function, gradient : callable
+        Functions of the variables: the value, and its gradient (variables,).
+    z : (variables,) array
+        Centre of the random points.
+    rng : Generator
+        Source of the random numbers; its state advances.
+    step : float
+        Step of the differences.
     """
     point = z + 1e-3 * rng.normal(size=len(z))
     direction = rng.normal(size=len(z))

@@ -194,6 +194,17 @@ def _mode_findings(
 ) -> tuple[ModeCheck, ...]:
     """Return frequency, samples and steps per period, damping ratio, and the errors of the scheme
     in period and damping, for each mode, lowest first.
+
+    Parameters
+    ----------
+    modes : Modes
+        Natural modes.
+    experiment : Experiment
+        Its sampling interval is used.
+    scheme : Scheme
+        Time scheme.
+    step_s : float
+        Step of the time grid [s].
     """
     findings = []
     for frequency, ratio in zip(
