@@ -177,6 +177,7 @@ def surface_rows(surface: SurfaceComparison, up: Array) -> Array:
     Parameters
     ----------
     surface : SurfaceComparison
+        Points of one depth camera and the surface.
     up : (3,)
         Unit vector against gravity.
 

@@ -36,6 +36,7 @@ class ElementFields:
     Attributes
     ----------
     body : Body
+        Body whose fields are evaluated.
     theta : (k,)
         Constants of the body.
     """
@@ -84,6 +85,7 @@ class ElementFields:
         Parameters
         ----------
         positions_m : (T, n, 3)
+            Node positions [m]; (n, 3) for T = 1.
 
         Returns
         -------

@@ -118,6 +118,7 @@ class ParameterSliders:
     Parameters
     ----------
     problem : Problem
+        Its integrator and step are used.
     experiment : Experiment
         The recording.
     segment : Transcription

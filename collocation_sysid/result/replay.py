@@ -111,6 +111,7 @@ class MotionRecord:
     up : (3,)
         Unit vector against gravity; z where there is no gravity.
     marker_names : (M,) str
+        Names of the markers.
     marker_places_m : (M, 3)
         Estimated places of the markers on the undeformed body.
     declared_places_m : (M, 3)

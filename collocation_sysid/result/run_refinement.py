@@ -200,12 +200,15 @@ def _corrected_estimate(
     Parameters
     ----------
     name : str
+        Name of the estimate.
     before : ReportedEstimate
+        The estimate in the result, of which systematic effects are kept.
     optimum : Estimate
         The estimate at the optimum, before any correction.
     error : DiscretisationError
         The measured discretisation error.
     parameters : Parameters
+        Parameters with their coordinates and bounds.
     """
     linear, bounds = parameters.scale_and_bounds(name)
     combined = combine(

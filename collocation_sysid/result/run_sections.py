@@ -220,6 +220,7 @@ def verdict_section(
     Parameters
     ----------
     trust : Assessment
+        Verdict with its concerns.
     linked : bool
         Whether each reason links to its remedy on the same page.
     max_reasons : int, optional
@@ -565,6 +566,7 @@ def _simulation_lines(
     name : str
         Name of the experiment.
     simulated : SimulatedExperiment
+        Errors of its forward simulation.
     """
     kind = "forward simulation" if simulated.fitted else "validation"
     if simulated.failed is not None:

@@ -50,13 +50,17 @@ def write_vtu(
     Parameters
     ----------
     path : str or Path
+        File to write; an existing one is replaced.
     points_m : (n, 3)
         Positions of the points.
     cells : (E, nodes per cell)
         Point indices of each cell.
     meshio_type : {"tetra", "tetra10"}
+        Kind of the cells.
     point_data : mapping of name to (n,) or (n, k), optional
+        Data at the points.
     cell_data : mapping of name to (E,) or (E, k), optional
+        Data of the cells.
 
     Raises
     ------
@@ -174,11 +178,13 @@ def write_frames(
     cells : (E, nodes per element)
         Node indices of each element.
     element : Element
+        Kind of the elements.
     undeformed_m : (n, 3)
         Nodes of the undeformed body.
     point_series : mapping of name to (T, n) or (T, n, k), optional
         Further data at the points.
     max_frames : int
+        Largest number of frames.
     fields : ElementFields, optional
         Stress, energy density and det F of each element.
     cell_data : mapping of name to (E,), optional

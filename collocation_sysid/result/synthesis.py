@@ -115,6 +115,7 @@ def write_data(
     Parameters
     ----------
     problem : Problem
+        Problem with a guess of every parameter.
     folder : str or Path
         Created if missing; gets ``<experiment>_markers.csv`` if there are markers,
         ``<experiment>_poses.csv`` (``_poses_2`` … by the number of the grasp) for grasps whose
@@ -366,6 +367,7 @@ def _refuse_foreign(
     Parameters
     ----------
     problem : Problem
+        Problem whose files are protected.
     place : Path
         The folder.
     files : iterable of Path

@@ -220,6 +220,7 @@ def surface_strain(replay: MotionRecord, positions_m: Array) -> Array:
     Parameters
     ----------
     replay : MotionRecord
+        Experiment, for mesh and surface.
     positions_m : (T, n, 3)
         Node positions of one of its trajectories.
     """

@@ -292,7 +292,9 @@ def _predict_instruments(
     Parameters
     ----------
     segment : Transcription
+        Recording with its instruments.
     trajectory : Trajectory
+        Simulated motion at its samples.
     phi : (k,) array
         Nuisance parameters of the recording.
 
@@ -404,10 +406,13 @@ def step_error(
     ----------
     problem : Problem
     solution : Solution
+        Converged solution.
     fit : LinearisedFit
         The measurements linearised at the solution.
     rollouts : mapping of experiment name to ForwardSimulation or str
+        Forward simulations, or why there is none.
     estimates : mapping of name to Estimate
+        Estimates at the solution, with their statistical intervals.
 
     Returns
     -------

@@ -111,6 +111,7 @@ def solve_refined(
     Parameters
     ----------
     problem : Problem
+        Problem that was solved; its experiments for validation are left out.
     solution : WarmStart
         The solution of the problem.
     estimates : mapping of name to Estimate

@@ -54,6 +54,7 @@ class CopyError:
     copied : str
         The name of the fitted recording that is nearest.
     error : PredictionErrors
+        Errors of its measurements as a prediction.
     """
 
     copied: str

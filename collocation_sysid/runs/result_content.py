@@ -168,6 +168,7 @@ class FieldResult:
     Attributes
     ----------
     shapes : FieldResolution
+        Number of shapes, and how much of the prior variance they represent.
     range : (least, most)
         Range of its values in the elements.
     determined_share : float or None
@@ -235,6 +236,7 @@ class RecordingsAgreement:
     chi_squared : float
         χ² of their differences.
     degrees_of_freedom : int
+        Number of recordings that determine the parameter, less one.
     disagree : bool
         Whether the differences are significant.
     """
@@ -261,6 +263,7 @@ class ProfileResult:
     threshold : float
         Rise of the loss at the ends of the interval.
     sentence : str
+        Result in words.
     """
 
     interval: tuple[float | None, float | None]
@@ -332,7 +335,9 @@ class ScanResult:
     samples : int
         Number of samples that were simulated.
     time_s : float
+        Duration of the scan.
     sentence : str
+        Result in words.
     """
 
     reason: str
@@ -355,6 +360,7 @@ class FittedExperiment:
     samples, missing : int
         Numbers of marker samples that are present, and that are missing.
     static : bool
+        Whether it is a series of equilibria.
     notes : tuple of str
         Sentences on the nuisance parameters of this recording.
     wrench_rms_n, wrench_rms_nm, reading_rms
@@ -400,6 +406,7 @@ class FitResult:
     rms_m, noise_rms_m : float
         RMS distance of all markers, and that expected from the stated noise.
     experiments : mapping of name to FittedExperiment
+        Residuals of each fitted experiment.
     wrench_rms_n, wrench_rms_nm : float or None
         RMS differences of all forces and torques.
     symmetry : mapping of experiment to int, optional
@@ -605,6 +612,7 @@ class Result:
         Parameters
         ----------
         run : str or Path
+            The run folder.
         expected : str
             What is expected, for the message if the folder has no result.
 

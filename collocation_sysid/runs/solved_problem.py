@@ -59,7 +59,9 @@ class SolvedProblem:
     Attributes
     ----------
     problem : Problem
+        The problem that was solved.
     solution : Solution
+        Its solution, converged or not.
     rollouts : mapping of experiment name to ForwardSimulation or str
         Forward simulations, or the reason why there is none.
     uncertainty : Uncertainty or None

@@ -56,6 +56,7 @@ def solve(
     Parameters
     ----------
     problem : Problem
+        Problem to solve; not modified.
     method : str or Method, optional
         A name, or a callable that solves a `Collocation`, such as a method with other options; the
         problem's own by default.
@@ -301,6 +302,7 @@ def _solve_from_scan(
     Parameters
     ----------
     solver : Method
+        Method to use.
     failed : Solution
         The failed search.
     watch : callable or None
@@ -376,7 +378,9 @@ def solve_with_renewed_correspondences(
     Parameters
     ----------
     solver : Method
+        Method to use.
     collocation : Collocation
+        Program with guesses; not modified.
     watch : callable or None
         Called with every iteration.
     start : (variables,) array, optional

@@ -92,6 +92,7 @@ class _SmoothFitQuality:
     Attributes
     ----------
     chi_squared : float
+        χ² of the measurements.
     misfit : float
         χ² per measurement.
     determined : float
@@ -321,11 +322,13 @@ class _LinearisedMeasurements:
     Attributes
     ----------
     fit : LinearisedFit
+        Fit with the elements' logarithms as further parameters.
     columns : (E,) int array
         Columns of the elements' logarithms in the fit.
     base : (E,) array
         Logarithms relative to the mean at which the measurements are linearised.
     faces : InternalFaces
+        Faces between elements of the part.
     deviation : float
         Prior standard deviation of the logarithm of the contrast.
     """
@@ -398,9 +401,11 @@ def _samples(
     Parameters
     ----------
     draws : PosteriorDraws
+        Draws of phases and contrasts.
     fit : LinearisedFit
         Fit with the elements' logarithms as further parameters.
     search : _PhaseSearch
+        The two-phase field.
     solution : Solution
         Its estimates are the mean of the other parameters.
 

@@ -66,12 +66,15 @@ def solution_concerns(
     Parameters
     ----------
     solution : Solution
+        Solution, converged or not.
     rollouts : mapping of experiment name to ForwardSimulation or str
         Forward simulations, or the reason why there is none.
     motions : iterable of ModesCheck
         Natural modes at the estimates.
     uncertainty : Uncertainty or None
+        Statistical uncertainty; None without error bars.
     diagnoses : sequence of MarkerDiagnosis
+        Findings in the residuals.
     """
     status = solution.status
     yield from body_concerns(solution)

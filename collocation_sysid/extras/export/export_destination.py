@@ -27,6 +27,7 @@ class ExportDestination:
     Attributes
     ----------
     format_name : str
+        Name of the format, such as "mujoco".
     folder : Path
         Folder of the files.
     main_file : Path

@@ -47,6 +47,7 @@ class ExportedFiles:
     Attributes
     ----------
     files : mapping of file name to text
+        Content of each file; arrays and poses are written separately.
     limitations : tuple of str
         What the target cannot express, and what was done instead.
     """
@@ -255,6 +256,7 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
     Parameters
     ----------
     body : IdentifiedBody
+        Body with its recording.
     samples : int
         Number of samples; more than one for static recordings only.
 

@@ -73,6 +73,7 @@ class IdentifiedRegion:
     lambda_pa, mu_pa, young_pa, poisson : float
         Elastic constants at rest and small strain, of the long-term energy.
     density_kg_m3 : float
+        Density.
     damping : str
         Name of the damping law.
     gamma_r_s, gamma_m_1_s : float
@@ -171,6 +172,7 @@ class IdentifiedBody:
     parameters : mapping of name to ReportedEstimate
         Estimates of the run.
     body : Body
+        The body, without obstacles.
     theta : (k,)
         Constants of the body at the estimates.
     experiment : Experiment

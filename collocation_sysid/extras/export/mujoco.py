@@ -436,8 +436,11 @@ def _set_grasp_state(
     Parameters
     ----------
     body : IdentifiedBody
+        Body with the poses.
     mujoco : module
+        Module of MuJoCo.
     data : MjData
+        Modified in place.
     time_and_step_s : (float, float)
         Time and timestep [s]; velocities lead to the pose one step later.
     """

@@ -160,6 +160,7 @@ class Facets:
         Parameters
         ----------
         solid : Solid
+            Solid in the frame of its obstacle.
         centre_m : (3,)
             Centre of the square for a plane.
         size_m : float

@@ -37,6 +37,7 @@ def recording_from_log(
     Parameters
     ----------
     model : StreamingModel
+        Model whose experiment gives everything but the measurements.
     intake : FrameBuffer
         Buffer with the samples that still wait for rows, which are included.
     log : sequence of LoggedRow

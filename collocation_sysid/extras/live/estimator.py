@@ -183,6 +183,7 @@ class LiveEstimator:
         One experiment; of its recording only the grasps, the markers and the sampling rate are
         used.
     options : LiveOptions
+        Window and computing time.
     clock : callable
         Function that returns a time [s] for the budget; `time.thread_time` excludes the time of
         other processes.

@@ -285,6 +285,7 @@ class FrameBuffer:
         t_s : float
             Time [s], later than that of the previous pose.
         positions_m : (G, 3)
+            Positions of the moving grasps [m].
         quaternions : (G, 4)
             Unit quaternions x y z w of the moving grasps.
         """

@@ -181,6 +181,7 @@ def _draw_parameter(
     Parameters
     ----------
     figure : Figure
+        Modified in place.
     k : int
         Index of the panel, from the top.
     count : int
@@ -190,6 +191,7 @@ def _draw_parameter(
     t_s : (T,)
         Times of the updates.
     updates : sequence of LiveUpdate
+        Updates that contain the parameter.
     """
     estimates = [update.estimates[name] for update in updates]
     value = np.array([each.value for each in estimates])

@@ -119,6 +119,7 @@ def data_concerns(
     Parameters
     ----------
     scatter : ResidualScatter
+        Size and autocorrelation of the residuals.
     counts : Counter
         Numbers of irregularities, by kind; those of outliers ("wild") and of restarts
         ("begun anew") are used.
@@ -163,6 +164,7 @@ def estimate_concerns(
     Parameters
     ----------
     estimates : mapping of name to Estimate
+        Current estimates.
     distance : float
         Distance of the estimate from the linearisation point, in standard errors.
     """

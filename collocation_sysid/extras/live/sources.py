@@ -164,6 +164,7 @@ def paced_frames(
     Parameters
     ----------
     frames : iterator of Frame
+        Frames to pass on unchanged.
     rate_hz : float
         Frames per second, above zero.
     clock, wait : callable

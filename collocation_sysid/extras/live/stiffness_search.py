@@ -34,6 +34,7 @@ class StiffnessSearch:
     Parameters
     ----------
     model : StreamingModel
+        Model whose guesses are replaced.
     phi : (k,)
         Nuisance parameters of every trial.
 

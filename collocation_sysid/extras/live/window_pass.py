@@ -63,6 +63,7 @@ class WindowPass:
     Parameters
     ----------
     model : StreamingModel
+        Model of the recording.
     p : (P,)
         Linearisation point, parameters that are not transformed.
     prior : SquareRootInformation
@@ -354,6 +355,7 @@ class CombinedPasses(NamedTuple):
     Attributes
     ----------
     information : SquareRootInformation
+        Information in transformed parameters, including the priors.
     residuals : list of LinearisedResidual
         Linearised residuals of all samples.
     points : list of (P,)

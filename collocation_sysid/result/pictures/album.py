@@ -47,6 +47,7 @@ def all_pictures(
     replays : sequence of MotionRecord
         The experiments; the mesh is drawn with grasps and markers of the first.
     result : Result
+        Content of ``result.json`` of the same run.
     truth : mapping, optional
         True parameters by name, see `convergence`.
     """

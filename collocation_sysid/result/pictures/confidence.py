@@ -44,6 +44,7 @@ class Confidence:
     Attributes
     ----------
     names : (k,) str
+        Names of the parameters.
     values : (k,)
         The estimates.
     covariance : (k, k)

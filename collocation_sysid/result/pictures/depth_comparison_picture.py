@@ -131,6 +131,7 @@ def _new_panels(
     times : (m,)
         Times of the samples, one column each.
     rows : int
+        Number of rows of panels.
 
     Returns
     -------

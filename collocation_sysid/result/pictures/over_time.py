@@ -336,6 +336,7 @@ def sensor_picture(
     samples : (S, 1 + 3m)
         Time [s], and m numbers as measured, fitted and simulated; NaN where there are none.
     names : sequence of m str
+        Titles of the numbers.
     units : sequence of m str, or empty
         Units of the numbers; not written if empty.
     """

@@ -169,6 +169,7 @@ class ParallelCamera:
         Parameters
         ----------
         points_m : (k, 3)
+            Points [m]; NaN where missing.
         positions_m : (n, 3)
             Positions of the nodes.
         surface : (F, 3)

@@ -99,6 +99,7 @@ class SheetView:
         Parameters
         ----------
         camera : ParallelCamera
+            Viewing direction.
         points_m : (…, 3)
             Points to show; NaN is ignored.
         room_mm, corner_mm : (2,)

@@ -238,6 +238,7 @@ def _camera_facing_weights(
     Parameters
     ----------
     replay : MotionRecord
+        Experiment, for its surface and the upward direction.
     positions_m : (T, n, 3)
         Positions of the nodes.
     weights : (T, F)
@@ -286,7 +287,9 @@ def field_shapes(
     Parameters
     ----------
     replay : MotionRecord
+        Experiment with shapes.
     body : Body
+        Its body.
     constants : mapping of name to value
         Constants of the body, for stresses and energies.
     field : str or None

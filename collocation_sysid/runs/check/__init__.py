@@ -114,6 +114,7 @@ class QuickCheck:
     Attributes
     ----------
     bodies : tuple of BodyCheck
+        One for each body.
     recordings : tuple of RecordingCheck, one for each experiment
     holds : tuple of GraspCheck, one for each grasp
     """
@@ -156,6 +157,7 @@ class CheckResult(QuickCheck):
     causes : tuple of Hypothesis
         Likely errors in the description; their sentences are the first warnings.
     notes : tuple of str
+        Sentences for information, without a remedy.
     concerns : tuple of Concern
         Expected problems, with the remedy; `warnings` are their sentences.
     """

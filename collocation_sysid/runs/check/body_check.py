@@ -55,6 +55,7 @@ class ElementShape:
     aspect_ratio : float
         Longest edge over smallest height: 1.22 for the regular tetrahedron.
     longest_edge_m : float
+        Length of the longest edge.
     """
 
     element: int
@@ -70,6 +71,7 @@ class Slenderness:
     Attributes
     ----------
     length_m, thickness_m : float
+        Longest extent, and thickness where the body bends.
     cells_across : float
         Thickness over the size of a cell of six tetrahedra.
     """
@@ -119,9 +121,11 @@ def element_concerns(
     Parameters
     ----------
     body : Body
+        Body with its mesh and elements.
     theta : array
         Constants θ at the guess.
     shape : Slenderness
+        Slenderness of the body.
     worst : ElementShape
         Element of the lowest quality.
     """
@@ -198,6 +202,7 @@ class BodyCheck:
     experiments : tuple of str
         Names of its experiments.
     element : str
+        Name of the element, such as "tet10".
     nodes, elements : int
         Numbers of nodes and elements.
     volume_m3, mass_kg : float
@@ -380,6 +385,7 @@ class GraspCheck:
     Attributes
     ----------
     experiment : str
+        Name of the experiment.
     nodes : int
         Number of nodes.
     low_m, high_m : (3,) corners of the box around them, on the undeformed body

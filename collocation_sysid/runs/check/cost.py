@@ -143,7 +143,9 @@ class MethodCost:
     Attributes
     ----------
     method : str
+        Name of the method.
     memory_mb : float
+        Estimated memory [MB].
     time_s : float or None
         None where it is unknown: the equations at the guess cannot be solved.
     """
@@ -165,6 +167,7 @@ def method_costs(
     Parameters
     ----------
     collocation : Collocation
+        Program of the complete recordings.
     short : Collocation
         First samples of the same experiments, in which sweeps are timed.
     z : (variables,) array

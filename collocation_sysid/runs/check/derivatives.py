@@ -57,6 +57,7 @@ def shortened_experiment(experiment: Experiment, samples: int) -> Experiment:
     Parameters
     ----------
     experiment : Experiment
+        Experiment to shorten; not modified.
     samples : int
         Least number of samples.
     """
@@ -106,6 +107,7 @@ def derivative_errors(
     Parameters
     ----------
     collocation : Collocation
+        Program without lifted variables.
     z : (variables,) array
         Start.
 

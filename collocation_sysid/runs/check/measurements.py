@@ -28,6 +28,7 @@ class MarkerCheck:
     Attributes
     ----------
     name : str
+        Name of the marker.
     distance_m : float
         Distance from the body, or from the node it was attached to.
     samples, missing : int
@@ -51,13 +52,17 @@ class RecordingCheck:
     Attributes
     ----------
     experiment : str
+        Name of the experiment.
     validation, static : bool
+        Whether it is for validation, and whether it is a series of equilibria.
     duration_s, rate_hz : float
+        Duration, and samples per second.
     frames : int
         Number of sample times.
     samples, missing : int
         Numbers of marker samples that are present, and that are missing.
     markers : tuple of MarkerCheck
+        One for each marker; empty without markers.
     instruments : tuple of str
         Other instruments, in words.
     air_density_kg_m3 : float

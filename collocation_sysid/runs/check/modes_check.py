@@ -48,6 +48,7 @@ class ModeCheck:
     Attributes
     ----------
     frequency_hz : float
+        Undamped natural frequency.
     samples_per_period, steps_per_period : float
         Samples of the recording, and steps of the time grid.
     damping_ratio : float
@@ -73,13 +74,16 @@ class ModesCheck:
     Attributes
     ----------
     experiment : str
+        Name of the experiment.
     about : str
         State about which the body oscillates: "rest state" or "undeformed shape".
     modes : tuple of ModeCheck, by frequency
     scheme : str
+        Name of the time scheme.
     timestep_s : float
         Step of the time grid.
     duration_s : float
+        Duration of the recording.
     substeps_needed : int or None
         The fewest with which the scheme damps and slows the first mode little; None if too many.
     not_oscillating : int
@@ -113,7 +117,9 @@ def check_modes(
     Parameters
     ----------
     experiment : Experiment
+        Experiment that moves.
     scheme : Scheme
+        Time scheme of the solve.
     step_s : float
         Step of the time grid [s].
     theta : array
