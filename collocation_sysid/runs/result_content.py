@@ -434,7 +434,12 @@ class SimulatedExperiment:
     failed : str, optional
         Why there is no simulation.
     rms_m, max_m : float, optional
-        RMS and largest distance of the markers.
+        RMS and largest distance of the markers [m]; 0 without markers.
+    wrench_rms_n, wrench_rms_nm, reading_rms
+        RMS differences of forces [N], torques [N m] and custom sensors, by name; None if not
+        measured.
+    reading_unit : mapping of name to str, optional
+        Units of the custom sensors that state one.
     nuisance, places_m : mapping, optional
         Nuisance parameters and marker places that were fitted to a recording for validation.
     depth : mapping of depth camera to DepthError
@@ -530,7 +535,18 @@ class ProgramSize:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Software, platform and problem files from which the result was made."""
+    """Software, platform and problem files from which the result was made.
+
+    Attributes
+    ----------
+    version, casadi, numpy, python, platform : str
+        Versions of this package, CasADi, NumPy and Python, and the platform.
+    problem_file, problem_sha256 : str or None
+        Path of the problem file and hash of its text as it was run; None for a problem without a
+        file.
+    mesh_sha256 : tuple of str
+        Hash of the mesh of each body.
+    """
 
     version: str
     casadi: str
@@ -566,12 +582,59 @@ class Elapsed:
 class Result:
     """The content of ``result.json``; the attributes are its keys.
 
-    `timing_s` is the time of the method's iterations alone, `elapsed_s` that of the complete run.
-    `missing` names checks that were left out after Ctrl-C, and is empty if all were done. `basis`
-    names what the values refer to: the damping law, and what sets the scale; `budget` has each
-    source's share of an estimate's variance; `probes` are refits with an assumption relaxed and,
-    where requested, of parts of the data. `uncertainty` is None without error bars, `scan` None
-    without a scan.
+    Attributes
+    ----------
+    schema : int
+        Version of the format.
+    status, message : str
+        How the search ended, as a keyword and as a sentence.
+    converged : bool
+        Whether an optimum was found.
+    missing : str
+        Checks that were left out after Ctrl-C; empty if all were done.
+    trust : Assessment
+        Verdict with its concerns.
+    method, title : str
+        Name of the method, and title of the problem.
+    parameters, derived : mapping of name to ReportedEstimate
+        All parameters, coefficients of fields included, and moduli that follow from them.
+    basis : tuple of str
+        Sentences on what the values refer to: the damping law, and what sets the scale.
+    budget : mapping of name to mapping of source to float
+        Share of each source in the variance of each estimate, largest first; empty without error
+        bars.
+    probes : tuple of Probe
+        Refits with an assumption relaxed and, where requested, of parts of the data.
+    places : mapping of experiment to mapping of marker to MarkerPlace
+        Estimated places of the markers on the undeformed body.
+    nuisance : mapping of experiment to mapping of label to NuisanceResult
+        Other nuisance parameters.
+    fields : mapping of name to FieldResult
+        Constants that vary in space.
+    uncertainty : UncertaintyResult or None
+        Statistics behind the error bars; None without error bars.
+    scan : ScanResult or None
+        Scan of the stiffness; None if there was none.
+    fit, rollout : FitResult, ForwardResult
+        Errors of the fit and of the forward simulations.
+    residuals : tuple of MarkerDiagnosis
+        Findings in the residuals.
+    dynamics : DynamicsResult
+        Residuals of the equations of motion.
+    iterations, evaluations : int
+        Numbers of iterations and of evaluations of the search.
+    timing_s : Timing
+        Time of the method's iterations alone.
+    elapsed_s : Elapsed
+        Time of the complete run.
+    problem : ProgramSize
+        Size of the discretised problem.
+    notes : tuple of str
+        Notes on the problem, the solve and its uncertainty.
+    history : tuple of Iteration
+        Iterations of the search.
+    provenance : Provenance
+        Software and files.
     """
 
     schema: int

@@ -47,7 +47,7 @@ class ExportedFiles:
     Attributes
     ----------
     files : mapping of file name to text
-        Content of each file; arrays and poses are written separately.
+        Content of each file; `write_export` adds ``identified.json`` and the poses.
     limitations : tuple of str
         What the target cannot express, and what was done instead.
     """

@@ -30,7 +30,17 @@ from ...runs.warm_start import WarmStart
 
 @dataclass(frozen=True)
 class IdentifiedBranch:
-    """Viscoelastic branch: share of the long-term stiffness, and relaxation time [s]."""
+    """Viscoelastic branch.
+
+    Attributes
+    ----------
+    name : str
+        Name of the branch.
+    share : float
+        Its stiffness over the long-term stiffness.
+    tau_s : float
+        Relaxation time [s].
+    """
 
     name: str
     share: float
