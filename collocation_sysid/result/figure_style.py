@@ -147,7 +147,9 @@ def style_axes(
 
 
 def add_legend(axes: Axes, title: str = "") -> None:
-    """Add a small legend with a white background, readable over lines."""
+    """Add a small legend with a white background, readable over lines, and a title, if any, to
+    axes.
+    """
     box = axes.legend(
         title=title, fontsize=SMALL_PT, title_fontsize=SMALL_PT, framealpha=0.85
     )

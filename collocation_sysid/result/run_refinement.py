@@ -133,7 +133,9 @@ def with_refinement(
     def corrected(
         values: Mapping[str, ReportedEstimate],
     ) -> dict[str, ReportedEstimate]:
-        """Return estimates by name, corrected where the refinement measured their error."""
+        """Return estimates by name, corrected where the refinement measured their error, otherwise
+        unchanged.
+        """
         return {
             name: _corrected_estimate(
                 name,

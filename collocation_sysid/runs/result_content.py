@@ -236,7 +236,7 @@ class RecordingsAgreement:
     chi_squared : float
         χ² of their differences.
     degrees_of_freedom : int
-        Number of recordings that determine the parameter, less one.
+        Number of recordings that determine the parameter, less one, at least 0.
     disagree : bool
         Whether the differences are significant.
     """

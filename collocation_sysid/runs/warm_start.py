@@ -59,12 +59,13 @@ class WarmStart:
 
     @classmethod
     def from_result(cls, result: Result, folder: Path) -> WarmStart:
-        """Return the estimates of a result.
+        """Return the estimates of a result at its optimum, that is without the correction for
+        discretisation errors.
 
         Raises
         ------
         InputError
-            If a value is not finite.
+            If a value is not finite; `folder` is named in the message.
         """
         both = {**result.parameters, **result.derived}
         # The optimum solves the equations of the trajectory in the folder, not the corrected value.

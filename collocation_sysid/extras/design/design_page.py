@@ -27,7 +27,9 @@ from .motion_design import Design
 
 
 def design_summary(design: Design, folder: Path) -> list[Shown]:
-    """Return a design on one screen, as lines and tables."""
+    """Return a design on one screen, as lines and tables: whether the search was interrupted, the
+    error bars, the limits that are reached, and the `folder` to which it was written.
+    """
     tried = len(design.best.history)
     interrupted = Line(
         f"interrupted: the best of the {tried} motions so far", "check"

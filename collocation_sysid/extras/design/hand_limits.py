@@ -106,12 +106,13 @@ class Limits(Section):
 
     @classmethod
     def read(cls, path: str | Path) -> Limits:
-        """Read limits.toml.
+        """Read limits.toml from a file.
 
         Raises
         ------
         InputError
-            Naming the file, the key or line, what was found and what was expected.
+            If the file is missing, is no TOML, or has a key or value that is not allowed; the
+            message names the file, the key or line, what was found and what was expected.
         """
         file = Path(path)
         content = parse_toml(read_text(file, "a file of limits (TOML)"), file)
@@ -123,12 +124,13 @@ class Limits(Section):
             ) from error
 
     def bounds_from(self, hand_m: Array) -> HandBounds:
-        """Return the limits of a hand that starts at a position (3,) in the poses' world [m].
+        """Return the limits of a hand that starts at the position `hand_m` (3,) in the world frame
+        of the poses [m].
 
         Raises
         ------
         InputError
-            If it starts outside the workspace.
+            If it starts outside the workspace or on its boundary.
         """
         low, high = (np.array(corner) - hand_m for corner in self.workspace_m)
         if not ((low < 0) & (high > 0)).all():

@@ -268,19 +268,8 @@ class MotionObjective:
         )
 
     def value(self, coefficients: Array, bound: float) -> float:
-        """Return the logarithm of the error bar of a motion, combined over the draws; between one
-        and two times `FORBIDDEN` if a marker leaves the views, between two and three times if a
-        simulation fails.
-
-        If the value at the middle of the prior exceeds `bound`, it is returned, and the other draws
-        are not simulated.
-
-        Parameters
-        ----------
-        coefficients : (d,) array
-            Coefficients of the motion.
-        bound : float
-            Bound beyond which the value need not be exact.
+        """Return the logarithm of the error bar of a motion at the first draw, to first order; the
+        bound, the second argument, is not used.
         """
         experiment = self.recording.experiment(
             self.recording.poses(self.motion(coefficients))

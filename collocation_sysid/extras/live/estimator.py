@@ -476,8 +476,9 @@ class LiveEstimator:
 
     def _repeat_until_settled(self, began: float, notes: list[str]) -> int:
         """Compute the rows in the window again, without a time limit, until no further pass is
-        needed or `FINAL_PASSES` passes are done; return the number of rows. `notes` are extended in
-        place.
+        needed or `FINAL_PASSES` passes are done; return the number of rows.
+
+        `began` is the time at which the work began, by `clock`; `notes` are extended in place.
         """
         rows_per_frame, self.rows = self.rows, FINAL_PASSES * len(self.log)
         try:

@@ -108,8 +108,16 @@ def model_rows(
 
 
 def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
-    """Return the row of a model from its fits by name of the held-out recording; "" is the fit to
-    all. Unknown values are None.
+    """Return the row of a model from its fits, without the columns that compare models; see
+    `model_rows`.
+
+    Parameters
+    ----------
+    label : str
+        Name of the model.
+    fits : mapping of str to mapping
+        Results of `fit_record` by name of the held-out recording, "" for the fit to all; empty
+        mappings for runs without a result.
     """
     complete_fit = fits.get("", {})
     predictions = {
@@ -173,8 +181,9 @@ def _add_criterion(rows: Sequence[Row]) -> None:
 
 
 def _add_ratios(rows: Sequence[Row]) -> None:
-    """Add to each row, in place, the logarithm of the ratio of its prediction error to the smallest
-    one, with its standard error; None without a prediction.
+    """Add "log_ratio", the logarithm of the ratio of its prediction error to the smallest one, and
+    its standard error "log_ratio_error" to each row, in place; both None without a prediction of
+    all held-out data.
     """
     best = _best_prediction(rows)
     for row in rows:
@@ -673,8 +682,8 @@ def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
 
 
 def _without_later_wrench(grasp: Grasp, end_s: float) -> Grasp:
-    """Return the grasp with measurements of its sensor after `end_s` [s] replaced by NaN; unchanged
-    without a sensor.
+    """Return a copy of the grasp with measurements of its sensor after `end_s` [s] replaced by NaN;
+    the grasp itself without a sensor.
     """
     wrench = grasp.wrench
     if wrench is None:

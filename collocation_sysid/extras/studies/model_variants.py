@@ -497,8 +497,16 @@ def _with_part_material(
 
 
 def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
-    """Return the shear modulus at small strain [Pa] from the guesses or fixed values of the part
-    whose constants begin with `prefix`, or else those of the body; None if unknown.
+    """Return the shear modulus at small strain [Pa] that follows from guesses or fixed values; None
+    if unknown.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Table by parameter name.
+    prefix : str
+        Prefix of the constants of a part, such as "tip."; constants that the part lacks are those
+        without a prefix.
     """
 
     def guess(name: str) -> float:

@@ -46,7 +46,9 @@ class NumberColumn:
     has_median: bool = True
 
     def format(self, value: float | None) -> str:
-        """Return a number as text; a dash for None."""
+        """Return `value` times the factor as text in the format of the column; a dash for None.
+        With the default format, magnitudes from 100 on are rounded to whole numbers.
+        """
         if value is None:
             return "–"
         value *= self.factor
@@ -154,9 +156,10 @@ class SuccessCriterion(Options):
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95 % interval of a success rate (E. B. Wilson, J. Am. Stat. Assoc. 22, 1927).
+    """Return the 95 % interval of a success rate (E. B. Wilson, J. Am. Stat. Assoc. 22, 1927).
 
-    Unlike the normal approximation it holds at rates of 0 and 1 and for few trials.
+    Unlike the normal approximation it holds at rates of 0 and 1 and for few of the `trials`. It is
+    (0, 1) without trials, begins at 0 without `successes`, and ends at 1 without failures.
     """
     if trials == 0:
         return 0.0, 1.0

@@ -310,8 +310,8 @@ def marker_errors(
 
 
 def rms_over_markers(squares: Array) -> Array:
-    """Return the root mean square distance (T,) from squared distances (T, M); NaN without any
-    marker.
+    """Return the root mean square distance (T,) from squared distances (T, M) of the markers, of
+    which NaN are left out; NaN for samples without any marker.
     """
     present = np.isfinite(squares)
     total = np.where(present, squares, 0.0).sum(axis=1)

@@ -104,7 +104,9 @@ class ParallelCamera:
         )
 
     def turned(self, angle_deg: float, up: ArrayLike) -> ParallelCamera:
-        """Return the camera moved around the body by an angle [°] about `up` (3,)."""
+        """Return the camera moved around the body by an angle [°] about `up` (3,), a unit vector;
+        counter-clockwise as seen from above.
+        """
         turn = Rotation.from_rotvec(
             np.radians(angle_deg) * np.asarray(up, dtype=float)
         )

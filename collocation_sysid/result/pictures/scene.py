@@ -385,7 +385,7 @@ def legend_handles(*entries: str) -> list[Line2D]:
 
 
 def part_legend_handle(part: int, name: str) -> Line2D:
-    """Return the legend handle of the part of the body with index `part`."""
+    """Return the legend handle of the part of the body with index `part`, with the label `name`."""
     look: Any = {
         **_GRASPED_STYLE,
         "ms": 4.0,

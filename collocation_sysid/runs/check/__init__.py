@@ -543,10 +543,10 @@ def _concerns(
 def _contact_concerns(
     simulated: Collocation, z: Array, is_complete: bool
 ) -> list[Concern]:
-    """Return concerns about contact at the guess.
+    """Return concerns about contact in the simulation with the variables z at the guess.
 
-    `is_complete` is false if only the first samples were simulated: then only about penetration at
-    the start.
+    `is_complete` is false if only the first samples were simulated: then there are only concerns
+    about penetration at the start.
     """
     concerns = contact_concerns(
         contact_summaries_of_parts(simulated.iterates(z)), AT_THE_GUESS

@@ -342,8 +342,8 @@ def _rest_shape_change_m(body: Body, theta: Array) -> float:
 
 
 def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
-    """Yield a concern for each field whose shapes represent too little of the prior variance; keys
-    are names of constants.
+    """Yield a concern for each field, by name of the constant, whose shapes represent less than the
+    share `LEAST_FIELD_VARIANCE` of the prior variance.
     """
     for name, field in fields.items():
         if field.share < LEAST_FIELD_VARIANCE:
