@@ -258,7 +258,9 @@ class MotionObjective:
                 )
 
         def value(coefficients: Array, _: float) -> float:
-            """Return the logarithm of the error bar to first order."""
+            """Return the logarithm of the error bar at the first draw, to first order; the bound is not
+            used.
+            """
             information = linear.information(self.motion(coefficients))
             return self.criterion.log_size(self.errors(information, middle))
 
@@ -268,8 +270,19 @@ class MotionObjective:
         )
 
     def value(self, coefficients: Array, bound: float) -> float:
-        """Return the logarithm of the error bar of a motion at the first draw, to first order; the
-        bound, the second argument, is not used.
+        """Return the logarithm of the error bar of a motion, combined over the draws; between one
+        and two times `FORBIDDEN` if a marker leaves the views, between two and three times if a
+        simulation fails.
+
+        If the value at the middle of the prior exceeds `bound`, it is returned, and the other draws
+        are not simulated.
+
+        Parameters
+        ----------
+        coefficients : (d,) array
+            Coefficients of the motion.
+        bound : float
+            Bound beyond which the value need not be exact.
         """
         experiment = self.recording.experiment(
             self.recording.poses(self.motion(coefficients))
