@@ -315,22 +315,8 @@ class FilmFigure:
         surface_m = shown[0][1][:, np.unique(replay.surface)]
         is_finite = np.isfinite(surface_m).all(axis=(1, 2))
         surface_m = surface_m[is_finite]
-        outlines_m = replay.obstacles_m
         camera = ParallelCamera.facing_motion(surface_m, replay.up)
-        surroundings_m = with_nearby_outlines(
-            surface_m, None if outlines_m is None else outlines_m[is_finite]
-        )
-        depth_points_m = [
-            rows[np.isfinite(rows[:, 4]), 5:]
-            for rows in replay.visible_points.values()
-        ]
-        everything = np.vstack(
-            [
-                surroundings_m.reshape(-1, 3),
-                replay.measured_m.reshape(-1, 3),
-                *depth_points_m,
-            ]
-        )
+        everything = _points_to_show_m(replay, surface_m, samples=is_finite)
         compared = [
             (n, m)
             for n, _, m in shown
@@ -362,6 +348,53 @@ class FilmFigure:
             room_mm=(width - 8, height),
             corner_mm=(4, FOOT_HEIGHT_MM),
         )
+        self._draw_bodies(
+            axes,
+            view,
+            trajectories=shown,
+            top_mm=total - 3 - (head - HEAD_HEIGHT_MM),
+        )
+        self._draw_annotations(
+            axes, camera, mm_per_m=view.mm_per_m, height_mm=total
+        )
+        self.cursor = (
+            self._draw_errors(
+                compared, width, height_mm=height, figure_height_mm=total
+            )
+            if compared
+            else None
+        )
+        self.time_label = axes.text(
+            FILM_WIDTH_MM - 4,
+            4.0,
+            "",
+            ha="right",
+            va="center",
+            fontsize=TEXT_PT,
+        )
+
+    def _draw_bodies(
+        self,
+        axes: Axes,
+        view: SheetView,
+        trajectories: Sequence[tuple[str, Array, Array]],
+        top_mm: float,
+    ) -> None:
+        """Draw the paths of the measured markers, and add a body without shape yet and its title to
+        `drawings` for each trajectory; the first body is shaded, further ones are wire frames.
+
+        Parameters
+        ----------
+        axes : Axes
+            Axes of the sheet.
+        view : SheetView
+            Projection onto the sheet.
+        trajectories : sequence of (str, (T, n, 3), (T, M, 3))
+            Label, node positions and marker positions [m] of each trajectory.
+        top_mm : float
+            Upper edge of the titles on the sheet [mm].
+        """
+        replay = self.replay
         for path_m in np.moveaxis(replay.measured_m, 1, 0):
             axes.plot(
                 *view.to_sheet_mm(path_m).T,
@@ -369,11 +402,10 @@ class FilmFigure:
                 lw=0.6,
                 zorder=0.2,
             )
-        for k, (name, positions, markers) in enumerate(shown):
-            top = total - 3 - (head - HEAD_HEIGHT_MM)
+        for k, (name, positions, markers) in enumerate(trajectories):
             wire = GREEN if k else None
             title = axes.text(
-                4 + k * FILM_WIDTH_MM / 4, top, "", va="top", fontsize=TEXT_PT, zorder=6,
+                4 + k * FILM_WIDTH_MM / 4, top_mm, "", va="top", fontsize=TEXT_PT, zorder=6,
                 color=wire or BLACK,
             )  # fmt: skip
             body = BodyDrawing(
@@ -393,24 +425,6 @@ class FilmFigure:
                     title=title,
                 )
             )
-        self._draw_annotations(
-            axes, camera, mm_per_m=view.mm_per_m, height_mm=total
-        )
-        self.cursor = (
-            self._draw_errors(
-                compared, width, height_mm=height, figure_height_mm=total
-            )
-            if compared
-            else None
-        )
-        self.time_label = axes.text(
-            FILM_WIDTH_MM - 4,
-            4.0,
-            "",
-            ha="right",
-            va="center",
-            fontsize=TEXT_PT,
-        )
 
     def _draw_errors(
         self,
@@ -520,6 +534,38 @@ class FilmFigure:
             now_s = replay.t_s[sample] - replay.t_s[0]
             self.cursor.set_xdata([now_s, now_s])
         self.time_label.set_text(f"{replay.t_s[sample] - replay.t_s[0]:.2f} s")
+
+
+def _points_to_show_m(
+    replay: MotionRecord, surface_m: Array, samples: NDArray[np.bool_]
+) -> Array:
+    """Return all points (p, 3) [m] that a film has to show: the surface of the body, obstacles near
+    it, measured markers (NaN where missing) and compared points of depth cameras.
+
+    Parameters
+    ----------
+    replay : MotionRecord
+        Experiment.
+    surface_m : (t, s, 3)
+        Surface nodes at the samples that are shown.
+    samples : (T,)
+        Mask of these t samples.
+    """
+    outlines_m = replay.obstacles_m
+    surroundings_m = with_nearby_outlines(
+        surface_m, None if outlines_m is None else outlines_m[samples]
+    )
+    depth_points_m = [
+        rows[np.isfinite(rows[:, 4]), 5:]
+        for rows in replay.visible_points.values()
+    ]
+    return np.vstack(
+        [
+            surroundings_m.reshape(-1, 3),
+            replay.measured_m.reshape(-1, 3),
+            *depth_points_m,
+        ]
+    )
 
 
 def _with_even_pixels(height_mm: float) -> float:

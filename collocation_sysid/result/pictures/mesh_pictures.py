@@ -167,22 +167,34 @@ def mesh_picture(replay: MotionRecord) -> Figure:
         corner_mm=(COLUMN_MM / 2 - 12, 4.0),
         longest_mm=15.0,
     )
-    entries = ["grasped"] if is_grasped.any() else []
-    entries += ["markers", "behind the body"] if len(names) else []
+    lines = _legend_lines(replay, marks)
+    for k, handles in enumerate(lines):
+        draw_legend(axes, handles, corner_mm=(1.0, total - 1.5 - k * LINE_MM))
+    return figure
+
+
+def _legend_lines(replay: MotionRecord, marks: set[str]) -> list[list[Line2D]]:
+    """Return the lines of the legend of a mesh, without empty ones: grasped nodes and markers, the
+    kinds of `marks` that were drawn (keys of `MARK_STYLES`), and the parts if there are several.
+    """
+    entries = ["grasped"] if replay.is_prescribed.any() else []
+    if len(replay.marker_names):
+        entries += ["markers", "behind the body"]
     lines = [
         legend_handles(*entries),
-        [Line2D([], [], label=w, **MARK_STYLES[w]) for w in sorted(marks)],
+        [
+            Line2D([], [], label=name, **MARK_STYLES[name])
+            for name in sorted(marks)
+        ],
     ]
-    if len(part_names) > 1:
+    if len(replay.part_names) > 1:
         lines.append(
             [
                 part_legend_handle(k, name or "rest")
-                for k, name in enumerate(part_names)
+                for k, name in enumerate(replay.part_names)
             ]
         )
-    for k, handles in enumerate(filter(None, lines)):
-        draw_legend(axes, handles, corner_mm=(1.0, total - 1.5 - k * LINE_MM))
-    return figure
+    return [handles for handles in lines if handles]
 
 
 def _draw_declared_positions(

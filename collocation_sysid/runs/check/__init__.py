@@ -309,24 +309,21 @@ def check_problem(
         (z, start_notes) = initial_variables(collocation)
     report_progress("computing natural modes and testing the description")
     causes = misspecification_hypotheses(problem)
-    fit_s = (
-        FIT_SIMULATIONS
-        * total_s
-        * min(1.0, CHECKED_SAMPLES / _grid_rows(collocation))
-    )
-    sensed = any(
+    has_both = any(
         e.wrenches and e.markers.sample_count for e in problem.experiments
     )
-    if sensed and not causes and (full or fit_s <= LONGEST_SIMULATION_S):
-        report_progress(
-            "comparing the wrenches with the prediction from the markers"
-        )
-        causes = rank(wrench_mistakes(collocation))
-    elif sensed and not causes:
-        notes.append(
-            "the wrenches were not compared with the prediction from the markers, which would "
-            f"take about {fit_s:.2g} s; check --full does it"
-        )
+    if has_both and not causes:
+        fit_s = _wrench_comparison_s(collocation, total_s)
+        if full or fit_s <= LONGEST_SIMULATION_S:
+            report_progress(
+                "comparing the wrenches with the prediction from the markers"
+            )
+            causes = rank(wrench_mistakes(collocation))
+        else:
+            notes.append(
+                "the wrenches were not compared with the prediction from the markers, which would "
+                f"take about {fit_s:.2g} s; check --full does it"
+            )
     findings = CheckResult(
         **_simulated_fields(problem, simulated, z=z),
         timesteps=_grid_rows(collocation),
@@ -372,6 +369,14 @@ def check_problem(
     findings = replace(findings, concerns=concerns)
     known = [note for note in problem.notes if note not in findings.warnings]
     return replace(findings, notes=(*known, *notes))
+
+
+def _wrench_comparison_s(collocation: Collocation, total_s: float) -> float:
+    """Return the estimated time [s] to fit the first samples to the markers alone, for the
+    comparison with the wrenches; `total_s` is the time to simulate the complete recordings.
+    """
+    share = min(1.0, CHECKED_SAMPLES / _grid_rows(collocation))
+    return FIT_SIMULATIONS * total_s * share
 
 
 def _simulated_fields(
