@@ -31,7 +31,11 @@ from collocation_sysid.result.animation import (
     film_samples,
 )
 from collocation_sysid.result.figure_style import GREEN
-from collocation_sysid.result.interactive_view import frame_files, view_run
+from collocation_sysid.result.interactive_view import (
+    export_page,
+    frame_files,
+    view_run,
+)
 from collocation_sysid.result.replay import read_run, run_headline
 from collocation_sysid.result.web_page import (
     Colouring,
@@ -378,6 +382,23 @@ def test_the_view_finds_the_frames(run):
     frames = frame_files(run, "swing")
     assert len(frames) == 9
     assert all(file.is_file() for _, file in frames)
+
+
+def test_an_experiment_for_validation_has_no_frames_of_another(run, tmp_path):
+    page = tmp_path / "page.html"
+    with pytest.raises(InputError, match="'nod' of this run has no"):
+        export_page(run, page, "nod", field="det_f")
+    assert not page.exists()
+    assert export_page(run, page, "nod").exists()
+
+
+def test_a_field_can_colour_the_simulated_body(run, tmp_path):
+    _, replays = read_run(run)
+    nod = next(each for each in replays if each.name == "nod")
+    values = np.ones((len(nod.t_s), len(nod.surface)))
+    colouring = Colouring.by_field("ones", values, trajectory="simulated")
+    file = write_page(nod, tmp_path / "page.html", colouring=colouring)
+    assert "1 ones" in file.read_text(encoding="utf-8")
 
 
 @pytest.mark.slow  # starting VTK takes longer than everything else here

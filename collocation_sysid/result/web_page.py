@@ -75,8 +75,10 @@ class Colouring:
         )
 
     @classmethod
-    def by_field(cls, name: str, values: Array) -> Colouring:
-        """Return the colouring of the fitted body by given values.
+    def by_field(
+        cls, name: str, values: Array, trajectory: str = "fitted"
+    ) -> Colouring:
+        """Return the colouring of one trajectory, the only one that is shown, by given values.
 
         Parameters
         ----------
@@ -84,12 +86,14 @@ class Colouring:
             Name of the quantity, which the label of the upper end contains.
         values : (T, F)
             Value at each sample on each boundary triangle; NaN is ignored for the limits.
+        trajectory : {"fitted", "simulated"}
+            Trajectory to show, which the experiment must have.
         """
         low = float(np.nanmin(values))
         high = float(np.nanmax(values))
         return cls(
             name,
-            {"fitted": values},
+            {trajectory: values},
             low=low,
             high=high,
             end_labels=(f"{low:.3g}", f"{high:.3g} {name}"),
