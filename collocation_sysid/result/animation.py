@@ -313,7 +313,7 @@ class FilmFigure:
         ]
         # A forward simulation that goes astray may leave the picture; fit and markers may not.
         surface_m = shown[0][1][:, np.unique(replay.surface)]
-        is_finite = np.isfinite(surface_m).all(axis=(1, 2))
+        is_finite = np.asarray(np.isfinite(surface_m).all(axis=(1, 2)))
         surface_m = surface_m[is_finite]
         camera = ParallelCamera.facing_motion(surface_m, replay.up)
         everything = _points_to_show_m(replay, surface_m, samples=is_finite)
