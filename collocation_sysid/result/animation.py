@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
@@ -17,6 +18,7 @@ from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from ..common.array_types import Array
@@ -52,7 +54,7 @@ FILM_WIDTH_MM = 160.0
 MAX_BODY_HEIGHT_MM = 110.0
 # Smallest height of the body [mm], for the panel of errors beside it.
 MIN_BODY_HEIGHT_MM = 30.0
-# Width of a film in pixels, even for H.264 (see `_stiffening_of_interval`); smaller for GIF, which
+# Width of a film in pixels, even for H.264 (see `_with_even_pixels`); smaller for GIF, which
 # compresses badly.
 PIXELS_WIDE = {".mp4": 1280, ".gif": 800}
 # Height of the titles above the body [mm].
@@ -61,7 +63,7 @@ HEAD_HEIGHT_MM = 12.0
 FOOT_HEIGHT_MM = 12.0
 # Height of the headline, if there is one [mm].
 HEADLINE_HEIGHT_MM = 5.0
-# Width of the panel of marker errors beside the body.
+# Width of the panel of marker errors beside the body [mm].
 ERROR_PANEL_WIDTH_MM = 60.0
 # Colour of the paths of measured markers.
 MARKER_PATH_COLOUR = "#C4CBD4"
@@ -69,6 +71,7 @@ MARKER_PATH_COLOUR = "#C4CBD4"
 MAX_FILM_FRAMES = 3000
 # Samples per second of a static experiment, whose recording may have taken a second or a day.
 STATIC_SAMPLES_PER_SECOND = 8
+# Default labels of the fitted and the simulated trajectory.
 TRAJECTORY_NAMES = ("fitted", "simulated")
 
 ProgressCallback = Callable[[float], None]
@@ -145,7 +148,7 @@ def film(
     names: tuple[str, str] = TRAJECTORY_NAMES,
     headline: str = "",
 ) -> Path:
-    """Film one experiment and return the file.
+    """Film one experiment and return the file; an existing file is replaced at the end.
 
     Parameters
     ----------
@@ -159,7 +162,12 @@ def film(
     names : (str, str)
         Labels of the fitted and of the simulated trajectory.
     headline : str
-        Text above the body.
+        Text above the body; empty for none.
+
+    Raises
+    ------
+    InputError
+        If ffmpeg is missing for .mp4, or the film would have too many frames.
     """
     picture = FilmFigure(replay, names, headline=headline)
     t_s = replay.t_s
@@ -211,12 +219,14 @@ def experiment_named(
 
 
 def film_samples(t_s: Array, fps: float, slowdown: float) -> NDArray[np.int64]:
-    """Return the indices (k,) of the samples nearest to the times of a film's frames.
+    """Return the indices (k,) of the samples to show in a film's frames.
+
+    The samples are taken as evenly spaced; the last frame shows the last sample or one before it.
 
     Parameters
     ----------
     t_s : (T,)
-        Times of the samples.
+        Times of the samples [s].
     fps : float
         Frames per second.
     slowdown : float
@@ -241,12 +251,46 @@ def film_samples(t_s: Array, fps: float, slowdown: float) -> NDArray[np.int64]:
     )
 
 
+class _DrawnTrajectory(NamedTuple):
+    """Trajectory of a film with its drawing.
+
+    Attributes
+    ----------
+    name : str
+        Label of the trajectory.
+    positions_m : (T, n, 3)
+        Positions of the nodes.
+    markers_m : (T, M, 3)
+        Positions of the markers.
+    body : BodyDrawing
+        Drawing of the body.
+    title : Text
+        Title above the body.
+    """
+
+    name: str
+    positions_m: Array
+    markers_m: Array
+    body: BodyDrawing
+    title: Text
+
+
 class FilmFigure:
     """Figure that shows the samples of a film one after another.
+
+    Parameters
+    ----------
+    replay : MotionRecord
+        Experiment with at least one trajectory.
+    names : (str, str)
+        Labels of the fitted and of the simulated trajectory.
+    headline : str
+        Text above the body; empty for none.
 
     Attributes
     ----------
     figure : Figure
+        The figure, which `show_sample` changes in place.
     """
 
     figure: Figure
@@ -269,24 +313,10 @@ class FilmFigure:
         ]
         # A forward simulation that goes astray may leave the picture; fit and markers may not.
         surface_m = shown[0][1][:, np.unique(replay.surface)]
-        is_finite = np.isfinite(surface_m).all(axis=(1, 2))
+        is_finite = np.asarray(np.isfinite(surface_m).all(axis=(1, 2)))
         surface_m = surface_m[is_finite]
-        outlines_m = replay.obstacles_m
         camera = ParallelCamera.facing_motion(surface_m, replay.up)
-        surroundings_m = with_nearby_outlines(
-            surface_m, None if outlines_m is None else outlines_m[is_finite]
-        )
-        depth_points_m = [
-            rows[np.isfinite(rows[:, 4]), 5:]
-            for rows in replay.visible_points.values()
-        ]
-        everything = np.vstack(
-            [
-                surroundings_m.reshape(-1, 3),
-                replay.measured_m.reshape(-1, 3),
-                *depth_points_m,
-            ]
-        )
+        everything = _points_to_show_m(replay, surface_m, samples=is_finite)
         compared = [
             (n, m)
             for n, _, m in shown
@@ -311,33 +341,19 @@ class FilmFigure:
             va="top",
             fontsize=TEXT_PT,
         )
-        self.drawings = []
+        self.drawings: list[_DrawnTrajectory] = []
         view = SheetView.fit_points(
-            camera, everything, (width - 8, height), (4, FOOT_HEIGHT_MM)
+            camera,
+            everything,
+            room_mm=(width - 8, height),
+            corner_mm=(4, FOOT_HEIGHT_MM),
         )
-        for path_m in np.moveaxis(replay.measured_m, 1, 0):
-            axes.plot(
-                *view.to_sheet_mm(path_m).T,
-                color=MARKER_PATH_COLOUR,
-                lw=0.6,
-                zorder=0.2,
-            )
-        for k, (name, positions, markers) in enumerate(shown):
-            top = total - 3 - (head - HEAD_HEIGHT_MM)
-            wire = GREEN if k else None
-            title = axes.text(
-                4 + k * FILM_WIDTH_MM / 4, top, "", va="top", fontsize=TEXT_PT, zorder=6,
-                color=wire or BLACK,
-            )  # fmt: skip
-            body = BodyDrawing(
-                axes,
-                view,
-                surface=replay.surface,
-                parts=replay.surface_parts,
-                nodes=replay.surface_nodes,
-                edge_colour=wire,
-            )
-            self.drawings.append((name, positions, markers, body, title))
+        self._draw_bodies(
+            axes,
+            view,
+            trajectories=shown,
+            top_mm=total - 3 - (head - HEAD_HEIGHT_MM),
+        )
         self._draw_annotations(
             axes, camera, mm_per_m=view.mm_per_m, height_mm=total
         )
@@ -356,6 +372,59 @@ class FilmFigure:
             va="center",
             fontsize=TEXT_PT,
         )
+
+    def _draw_bodies(
+        self,
+        axes: Axes,
+        view: SheetView,
+        trajectories: Sequence[tuple[str, Array, Array]],
+        top_mm: float,
+    ) -> None:
+        """Draw the paths of the measured markers, and add a body without shape yet and its title to
+        `drawings` for each trajectory; the first body is shaded, further ones are wire frames.
+
+        Parameters
+        ----------
+        axes : Axes
+            Axes of the sheet.
+        view : SheetView
+            Projection onto the sheet.
+        trajectories : sequence of (str, (T, n, 3), (T, M, 3))
+            Label, node positions and marker positions [m] of each trajectory.
+        top_mm : float
+            Upper edge of the titles on the sheet [mm].
+        """
+        replay = self.replay
+        for path_m in np.moveaxis(replay.measured_m, 1, 0):
+            axes.plot(
+                *view.to_sheet_mm(path_m).T,
+                color=MARKER_PATH_COLOUR,
+                lw=0.6,
+                zorder=0.2,
+            )
+        for k, (name, positions, markers) in enumerate(trajectories):
+            wire = GREEN if k else None
+            title = axes.text(
+                4 + k * FILM_WIDTH_MM / 4, top_mm, "", va="top", fontsize=TEXT_PT, zorder=6,
+                color=wire or BLACK,
+            )  # fmt: skip
+            body = BodyDrawing(
+                axes,
+                view,
+                surface=replay.surface,
+                parts=replay.surface_parts,
+                nodes=replay.surface_nodes,
+                edge_colour=wire,
+            )
+            self.drawings.append(
+                _DrawnTrajectory(
+                    name,
+                    positions,
+                    markers_m=markers,
+                    body=body,
+                    title=title,
+                )
+            )
 
     def _draw_errors(
         self,
@@ -415,7 +484,9 @@ class FilmFigure:
         mm_per_m: float,
         height_mm: float,
     ) -> None:
-        """Draw the axis directions, the scale bar and the legend around the body."""
+        """Draw the axis directions, the scale bar for `mm_per_m` and the legend below the body into
+        `axes`.
+        """
         draw_directions(axes, camera, origin_mm=(7.0, 4.0))
         draw_scale(axes, mm_per_m, corner_mm=(FILM_WIDTH_MM * 0.17, 4.0))
         named = ["grasped", "measured", "behind the body"]
@@ -429,37 +500,72 @@ class FilmFigure:
         )
 
     def show_sample(self, sample: int) -> None:
-        """Show the sample with index `sample`."""
+        """Change the figure to the sample with index `sample`."""
         replay = self.replay
         measured = replay.measured_m[sample]
-        for name, positions, markers, drawn, title in self.drawings:
+        for drawn in self.drawings:
             outlines_m = (
                 None
                 if replay.obstacles_m is None
                 else replay.obstacles_m[sample]
             )
-            drawn.update(
-                positions[sample],
+            drawn.body.update(
+                drawn.positions_m[sample],
                 replay.is_prescribed[sample],
-                measured,
-                None,
-                outlines_m,
-                replay.depth_points_m(sample),
+                markers_m=measured,
+                outlines_m=outlines_m,
+                depth_points_m=replay.depth_points_m(sample),
             )
-            distances = np.linalg.norm(markers[sample] - measured, axis=1)
+            distances = np.linalg.norm(
+                drawn.markers_m[sample] - measured, axis=1
+            )
             present = distances[np.isfinite(distances)]
             off = (
                 f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm"
                 if len(present)
                 else "no markers"
             )
-            title.set_text(
-                name if markers is replay.measured_m else f"{name}: {off}"
+            drawn.title.set_text(
+                drawn.name
+                if drawn.markers_m is replay.measured_m
+                else f"{drawn.name}: {off}"
             )
         if self.cursor is not None:
             now_s = replay.t_s[sample] - replay.t_s[0]
             self.cursor.set_xdata([now_s, now_s])
         self.time_label.set_text(f"{replay.t_s[sample] - replay.t_s[0]:.2f} s")
+
+
+def _points_to_show_m(
+    replay: MotionRecord, surface_m: Array, samples: NDArray[np.bool_]
+) -> Array:
+    """Return all points (p, 3) [m] that a film has to show: the surface of the body, obstacles near
+    it, measured markers (NaN where missing) and compared points of depth cameras.
+
+    Parameters
+    ----------
+    replay : MotionRecord
+        Experiment.
+    surface_m : (t, s, 3)
+        Surface nodes at the samples that are shown.
+    samples : (T,)
+        Mask of these t samples.
+    """
+    outlines_m = replay.obstacles_m
+    surroundings_m = with_nearby_outlines(
+        surface_m, None if outlines_m is None else outlines_m[samples]
+    )
+    depth_points_m = [
+        rows[np.isfinite(rows[:, 4]), 5:]
+        for rows in replay.visible_points.values()
+    ]
+    return np.vstack(
+        [
+            surroundings_m.reshape(-1, 3),
+            replay.measured_m.reshape(-1, 3),
+            *depth_points_m,
+        ]
+    )
 
 
 def _with_even_pixels(height_mm: float) -> float:

@@ -29,7 +29,7 @@ SHOWN_RECORDINGS = 4
 
 
 def quick_check_tables(quick_check: QuickCheck) -> list[Shown]:
-    """Return tables of the bodies and of the measurements, which need no simulation."""
+    """Return a table for each body and one of the measurements, which need no simulation."""
     return [
         *map(_body_section, quick_check.bodies),
         _measurements_section(quick_check),
@@ -119,8 +119,8 @@ def _body_section(body: BodyCheck) -> Table:
 
 
 def _rest_shape(body: BodyCheck) -> str:
-    """Return a text on the stress-free shape: that it is not stated, or how far it differs from the
-    mesh, or that none was found.
+    """Return a text on the rest shape of a body whose mesh is not stated to be stress-free: that
+    nothing is stated, how far the stress-free shape differs from the mesh, or that none was found.
     """
     if body.rest_shape is None:
         return "not stated; set object.rest_shape"
@@ -133,9 +133,9 @@ def _rest_shape(body: BodyCheck) -> str:
 def _motion_section(findings: CheckResult) -> list[Shown]:
     """Return the table of natural modes; empty if all experiments are static.
 
-    The table has the lowest modes, at most `SHOWN_MODES`, of the first recording that is not
+    The table has the lowest modes, at most `SHOWN_MODES`, of the first fitted recording that is not
     static. If there are others, a line with the first mode [Hz] of each follows, at most
-    `SHOWN_RECORDINGS`.
+    `SHOWN_RECORDINGS`; those without a mode are left out.
     """
     if not findings.motions:  # equilibria only
         return []
@@ -178,7 +178,9 @@ def _motion_section(findings: CheckResult) -> list[Shown]:
 
 
 def _measurements_section(findings: QuickCheck) -> Table:
-    """Return the table of recordings: samples, markers, air and grasps."""
+    """Return the table of at most `SHOWN_RECORDINGS` recordings with samples, markers and grasps,
+    and of the air densities of all.
+    """
     rows = {}
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
         kind = ", validation" if recording.validation else ""
@@ -201,7 +203,7 @@ def _measurements_section(findings: QuickCheck) -> Table:
 
 def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
     """Return table rows with a sentence on each grasp of an experiment, by label; several grasps
-    are numbered from 1.
+    are numbered from 1. Empty without grasps.
     """
     own = [
         grasp_sentence(grasp)
@@ -224,8 +226,8 @@ def _air_description(density_kg_m3: float) -> str:
 
 
 def _marker_summary(recording: RecordingCheck) -> str:
-    """Return how many markers a recording has, how many samples are missing, and the farthest
-    marker.
+    """Return how many markers a recording has, how many samples are missing, the farthest marker,
+    and the other instruments, in words; without markers the instruments alone.
     """
     if not recording.markers:
         besides = "" if recording.test else ", no markers"

@@ -72,7 +72,10 @@ class DepthProjection:
             Unit vector against gravity.
         """
         return cls(
-            view, skin, phi, ParallelCamera.facing_motion(shape_m[None], up)
+            view,
+            skin,
+            phi=phi,
+            parallel_camera=ParallelCamera.facing_motion(shape_m[None], up),
         )
 
     def image_points(self, camera_m: Array, world_m: Array) -> Array:
@@ -98,8 +101,11 @@ class DepthProjection:
         )
 
     def outlines(self, shape_m: Array, sample: int) -> Array:
-        """Return u and v (k, 2) of the faces that are turned to the camera; NaN in the row after
-        each face.
+        """Return u and v (k, 2) of the corners of the faces that are turned to the camera; NaN in
+        the row after each face.
+
+        Faces that are partly behind a camera with an image are left out. Units are those of
+        `image_points`.
 
         Parameters
         ----------
@@ -119,7 +125,7 @@ class DepthProjection:
             self.skin.plane_triangles[self.skin.is_facing(shape_m, eye_m)]
         ]
         closed = corners[:, [0, 1, 2, 0]].reshape(-1, 3)
-        own_m = self.view.to_camera_m(self.phi, closed, sample)
+        own_m = self.view.to_camera_m(self.phi, closed, sample=sample)
         if self.view.depth.camera.matrix is not None:
             is_in_front = np.repeat(
                 (own_m[:, 2].reshape(-1, 4) > 0).all(axis=1), 4
@@ -171,6 +177,7 @@ def surface_rows(surface: SurfaceComparison, up: Array) -> Array:
     Parameters
     ----------
     surface : SurfaceComparison
+        Points of one depth camera and the surface.
     up : (3,)
         Unit vector against gravity.
 
@@ -225,7 +232,9 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
     nuisance = NuisanceMap.from_experiment(experiment)
     by_camera = {}
     for number, depth in enumerate(experiment.depths):
-        view = DepthCameraModel.from_experiment(experiment, number, nuisance)
+        view = DepthCameraModel.from_experiment(
+            experiment, number, nuisance=nuisance
+        )
         skin = VisibleSurface.from_body(experiment.body, depth)
         shape_m = skin.initial_positions_m(experiment, depth)
         shown = DepthProjection.facing_shape(
@@ -239,8 +248,8 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
         rows = shown.point_rows(
             depth.first_sample_with_points,
             points_m,
-            view.rays[depth.first_sample_with_points],
-            np.full(len(points_m), np.nan),
+            rays=view.rays[depth.first_sample_with_points],
+            distances_m=np.full(len(points_m), np.nan),
         )
         by_camera[depth.name] = np.vstack(
             [rows, shown.outline_rows(depth.first_sample_with_points, shape_m)]
@@ -251,7 +260,9 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
 def save_overlays(
     experiments: Iterable[Experiment], folder: Path
 ) -> list[Path]:
-    """Draw `undeformed_rows` of all experiments into a folder, and return the files."""
+    """Draw `undeformed_rows` of all experiments into an existing folder, a picture for each depth
+    camera, and return the files; empty without depth cameras.
+    """
     return save_pictures(
         folder,
         with_unique_names(

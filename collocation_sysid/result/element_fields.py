@@ -36,6 +36,7 @@ class ElementFields:
     Attributes
     ----------
     body : Body
+        Body whose fields are evaluated.
     theta : (k,)
         Constants of the body.
     """
@@ -76,7 +77,7 @@ class ElementFields:
             )
             evaluators.append(body.make_evaluator(batch))
         volumes = body.stress_free_geometry(theta)[:, :, -1].sum(axis=1)
-        return cls(body, theta, evaluators, volumes)
+        return cls(body, theta, _evaluators=evaluators, _volumes=volumes)
 
     def evaluate_at(self, positions_m: ArrayLike) -> dict[str, Array]:
         """Return the fields at node positions, by `FIELD_NAMES`.
@@ -84,6 +85,7 @@ class ElementFields:
         Parameters
         ----------
         positions_m : (T, n, 3)
+            Node positions [m]; (n, 3) for T = 1.
 
         Returns
         -------
@@ -120,8 +122,8 @@ class ElementFields:
 
 
 def field_kernel(element: Element, law: PointLaw) -> ElementKernel:
-    """Return the compiled fields at a quadrature point times its volume; see `ElementKernel` for
-    the inputs.
+    """Return the compiled fields of `FIELD_NAMES` at a quadrature point times its volume; see
+    `ElementKernel` for the inputs.
     """
     point = quadrature_point(element, law, "x")
     fields = ca.vertcat(*_point_fields(law, point.local_constants))

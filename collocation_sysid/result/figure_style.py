@@ -54,7 +54,9 @@ class NotebookFigure(Figure):
     """Figure that a notebook shows, with or without pyplot."""
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
-        """Return the figure as PNG bytes with its width for a notebook, at 96 pixels per inch."""
+        """Return the figure as PNG bytes, with its width in pixels for a notebook, at 96 pixels per
+        inch.
+        """
         png = BytesIO()
         self.savefig(png, dpi=RESOLUTION_DPI)
         return png.getvalue(), {"width": round(96 * self.get_figwidth())}
@@ -71,7 +73,9 @@ class NotebookFigure(Figure):
 
 
 def symbol_as_mathtext(name: str) -> str:
-    """Return the symbol of a parameter for matplotlib, followed by the name of its region."""
+    """Return the symbol of a parameter as mathematical text of matplotlib, followed by the name of
+    its region, if any.
+    """
     symbol, _, region = symbol_of(name).partition(" ")
     letter, _, index = symbol.partition("_")
     written = rf"${letter}_{{\mathrm{{{index}}}}}$" if index else f"${symbol}$"
@@ -79,7 +83,7 @@ def symbol_as_mathtext(name: str) -> str:
 
 
 def new_figure(width_mm: float, height_mm: float) -> Figure:
-    """Return an empty figure that arranges its axes automatically."""
+    """Return an empty figure of a size [mm] that arranges its axes automatically."""
     figure = NotebookFigure(
         figsize=(width_mm / 25.4, height_mm / 25.4), layout="constrained"
     )
@@ -88,8 +92,8 @@ def new_figure(width_mm: float, height_mm: float) -> Figure:
 
 
 def fixed_figure(width_mm: float, height_mm: float) -> Figure:
-    """Return an empty figure whose axes stay in place, also if matplotlib is configured to arrange
-    axes automatically.
+    """Return an empty figure of a size [mm] whose axes stay in place, also if matplotlib is
+    configured to arrange axes automatically.
     """
     size = (width_mm / 25.4, height_mm / 25.4)
     return NotebookFigure(figsize=size, layout="none")  # type: ignore[arg-type]
@@ -125,7 +129,9 @@ def framed_figure(
 def style_axes(
     axes: Axes, title: str = "", xlabel: str = "", ylabel: str = ""
 ) -> None:
-    """Give axes a title, labels, the type sizes of this module, and a light frame and grid."""
+    """Give axes a title, labels of the x and the y axis (empty for none), the type sizes of this
+    module, and a light frame and grid.
+    """
     axes.set_title(title, fontsize=TEXT_PT, loc="left")
     axes.set_xlabel(xlabel, fontsize=TEXT_PT)
     axes.set_ylabel(ylabel, fontsize=TEXT_PT)
@@ -141,7 +147,9 @@ def style_axes(
 
 
 def add_legend(axes: Axes, title: str = "") -> None:
-    """Add a small legend with a white background, readable over lines."""
+    """Add a small legend with a white background, readable over lines, and a title, if any, to
+    axes.
+    """
     box = axes.legend(
         title=title, fontsize=SMALL_PT, title_fontsize=SMALL_PT, framealpha=0.85
     )
@@ -175,7 +183,7 @@ def add_figure_legend(figure: Figure, columns: int, **how: Any) -> None:
     columns : int
         Number of entries in a row.
     **how
-        Further arguments of `Figure.add_legend`.
+        Further arguments of `Figure.legend`, which replace the default place and look.
     """
     handles, labels = (
         figure.axes[0].get_legend_handles_labels() if figure.axes else ([], [])
@@ -196,10 +204,11 @@ def format_plain_numbers(axis: Axis, form: str = "g") -> None:
 
 
 def make_log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
-    """Make the y axis logarithmic, with plain numbers where these are short.
+    """Make the y axis logarithmic, with plain numbers where these are short (from 0.001 to
+    100,000).
 
     The limits are widened to span at least the ratio `least_ratio`, so that at least two numbers
-    are shown.
+    are shown. Data must have been drawn before.
     """
     axes.set_yscale("log")
     low, high = axes.get_ylim()

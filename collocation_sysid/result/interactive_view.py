@@ -39,7 +39,8 @@ def export_page(
     experiment: str | None = None,
     field: str | None = None,
 ) -> Path:
-    """Write an experiment of a run folder as a stand-alone web page, and return the page's file.
+    """Write an experiment of a run folder as a stand-alone web page, and return the page's file; an
+    existing file is replaced.
 
     Parameters
     ----------
@@ -48,10 +49,11 @@ def export_page(
     file : str or Path
         HTML file to write.
     experiment : str, optional
-        Name of the experiment; the first by default.
+        Name of the experiment; the first with a trajectory by default.
     field : str, optional
         Point or cell data of the frames that colour the fitted body, or the contact quantities
-        "pressures_pa" or "gaps_m"; by default the strain of the fitted and the simulated body.
+        "pressures_pa" or "gaps_m", which experiments for validation have, too; by default the
+        strain of the fitted and the simulated body.
 
     Raises
     ------
@@ -62,11 +64,13 @@ def export_page(
     replay = experiment_named(replays, experiment, run=run)
     with damaged_run_refused(Path(run)):
         text = run_headline(result)
-    colouring = (
-        None
-        if field is None
-        else Colouring.by_field(field, field_on_faces(run, replay, field=field))
-    )
+    colouring = None
+    if field is not None:
+        colouring = Colouring.by_field(
+            field,
+            field_on_faces(run, replay, field=field),
+            trajectory="simulated" if replay.positions_m is None else "fitted",
+        )
     return write_page(replay, file, headline=text, colouring=colouring)
 
 
@@ -86,7 +90,7 @@ def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
         and (contact_values := getattr(replay, field)) is not None
     ):
         return contact_values
-    frames = frame_files(Path(run), replay.name)
+    frames = _frames_of_fit(run, replay)
     cells = cells_below_faces(replay.tetrahedra, replay.surface)
     with _damaged_frames_refused(Path(run)):
         shown = []
@@ -139,7 +143,7 @@ def view_run(
         )
     _, replays = read_run(run)
     replay = experiment_named(replays, experiment, run=run)
-    frames = frame_files(Path(run), replay.name)
+    frames = _frames_of_fit(run, replay)
     with _damaged_frames_refused(Path(run)):
         scene = _FrameWindow(
             frames, field, replay=replay, off_screen=screenshot is not None
@@ -153,7 +157,10 @@ def view_run(
 
 
 def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
-    """Return times [s] and files of an experiment's frames.
+    """Return times [s] and files of an experiment's frames, in their order in the list of frames.
+
+    If the experiment has no folder of frames, those of the run folder itself are returned, which
+    belong to its only fitted experiment.
 
     Raises
     ------
@@ -163,11 +170,7 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
     listings = (run / experiment / FRAMES_FILE, run / FRAMES_FILE)
     listing = next((each for each in listings if each.is_file()), None)
     if listing is None:
-        raise InputError(
-            f"experiment '{experiment}' of this run has no {FRAMES_FILE}: only fitted experiments "
-            "have frames; use --html to view others",
-            run,
-        )
+        raise _missing_frames(run, experiment)
     with _damaged_frames_refused(run):
         sets = ElementTree.parse(listing).getroot().iter("DataSet")
         frames = [
@@ -181,6 +184,30 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
                 "it lists no frames, or frames that are not in the folder"
             )
         return frames
+
+
+def _missing_frames(run: str | Path, experiment: str) -> InputError:
+    """Return the error for an experiment of a run without frames."""
+    return InputError(
+        f"experiment '{experiment}' of this run has no {FRAMES_FILE}: only fitted experiments "
+        "have frames; to view others, use --html without --field",
+        run,
+    )
+
+
+def _frames_of_fit(
+    run: str | Path, replay: MotionRecord
+) -> list[tuple[float, Path]]:
+    """Return times [s] and files of the frames of a fitted experiment, see `frame_files`.
+
+    Raises
+    ------
+    InputError
+        If the experiment was not fitted, or has no frames or damaged ones.
+    """
+    if replay.positions_m is None:
+        raise _missing_frames(run, replay.name)
+    return frame_files(Path(run), replay.name)
 
 
 def _damaged_frames_refused(run: Path) -> AbstractContextManager[None]:
@@ -268,7 +295,9 @@ class _FrameWindow:
         self.plotter.camera.zoom(1.4)  # the box is seen through its sphere
 
     def show_nearest_frame(self, time_s: float) -> None:
-        """Show the frame nearest to a time."""
+        """Show the frame nearest to a time [s], with measured markers, grasped nodes and obstacles
+        of the nearest sample, in place of the last one.
+        """
         mesh = self.meshes[int(np.abs(self.times - time_s).argmin())]
         sample = int(np.abs(self.replay.t_s - time_s).argmin())
         if self.replay.obstacles_m is not None:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 MISSING = "run.interactive() needs ipywidgets: pip install 'collocation-sysid[interactive]'"
 # Least ratio of the ends of a slider to its middle; an interval may be too short to see an effect.
 LEAST_RATIO = 1.5
-# Ends of a slider beyond the ends of the combined interval, in half widths of that interval.
+# Distance of a slider's ends from those of the combined interval, in half widths of the interval.
 WIDENING = 2.0
 # Steps of a slider.
 STEPS = 200
@@ -54,6 +54,7 @@ class SliderRange:
     low, value, high : float
         Ends and first value.
     is_logarithmic : bool
+        Whether the slider has a logarithmic scale.
     """
 
     low: float
@@ -71,15 +72,18 @@ class SliderRange:
     ) -> SliderRange:
         """Return a range around an estimate.
 
-        It reaches three half widths of the combined interval to either side, at least a factor of
-        1.5, and not beyond the bounds.
+        It reaches three half widths of the combined interval to either side (on a logarithmic scale
+        unless `linear` or the value is not positive), at least a factor of 1.5 or half of the
+        value, and not beyond the bounds. Without an interval the least range is used.
 
         Parameters
         ----------
         estimate : ReportedEstimate
+            Estimate with its combined interval.
         linear : bool
             Whether the parameter is estimated on a linear scale.
         bounds : (lower, upper)
+            Bounds of the parameter.
         """
         value = estimate.value
         interval = estimate.combined95 or (value, value)
@@ -100,7 +104,12 @@ class SliderRange:
         is_logarithmic = not linear and value > 0
         low = max(low, bounds[0])
         high = min(high, bounds[1])
-        return cls(low, float(np.clip(value, low, high)), high, is_logarithmic)
+        return cls(
+            low,
+            float(np.clip(value, low, high)),
+            high=high,
+            is_logarithmic=is_logarithmic,
+        )
 
 
 class ParameterSliders:
@@ -109,6 +118,7 @@ class ParameterSliders:
     Parameters
     ----------
     problem : Problem
+        Its integrator and step are used.
     experiment : Experiment
         The recording.
     segment : Transcription
@@ -229,7 +239,9 @@ class ParameterSliders:
 
     @property
     def values(self) -> dict[str, float]:
-        """All parameters by name: those of the sliders, what is tied to them, and the others."""
+        """All parameters by name: those of the sliders, those tied to them, and the others at the
+        optimum.
+        """
         chosen = {name: each.value for name, each in self.sliders.items()}
         return self._parameters.with_guess(chosen).guesses
 
@@ -341,7 +353,9 @@ class ParameterSliders:
 
 
 def _slider(widgets: Any, name: str, values: SliderRange) -> Any:
-    """Return the slider of a parameter, which reports its value when it is released."""
+    """Return the slider of a parameter for a range, which reports its value when it is released;
+    `widgets` is the module ipywidgets.
+    """
     common = {
         "description": symbol_with_unit(name),
         "continuous_update": False,
@@ -375,7 +389,7 @@ def _sensor_columns(t_s: Array, measured: Array, simulated: Array) -> Array:
 
 
 def _png(figure: Figure) -> bytes:
-    """Return a figure as PNG."""
+    """Return a figure as bytes of a PNG file."""
     png = BytesIO()
     figure.savefig(png, dpi=PICTURE_DPI)
     return png.getvalue()

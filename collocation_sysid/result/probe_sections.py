@@ -116,7 +116,10 @@ def is_deeper_check_worthwhile(result: Result) -> bool:
 
 
 def _shown_estimates(result: Result) -> list[str]:
-    """Return the names of the estimates that the table has as columns, at most `MAX_ESTIMATES`."""
+    """Return the names of the estimates that the table has as columns, at most `MAX_ESTIMATES`:
+    those with a statistical interval, Young's modulus first, then parameters; other derived moduli
+    are left out.
+    """
     known = [n for n, each in result.values.items() if each.statistical95]
     first = [name for name in known if name in STIFFNESS_NAMES[:1]]
     return [
@@ -203,7 +206,7 @@ def _conclusions(result: Result) -> Iterator[str]:
 
 
 def _named_change(probe: Probe, result: Result, name: str) -> str:
-    """Return the change of the estimate `name` in a refit, with its symbol."""
+    """Return the change of the estimate `name` in a refit, with its symbol; the refit must have it."""
     return f"{symbol_of(name)} {_change_text(probe.moves[name], result.values[name].value)}"
 
 

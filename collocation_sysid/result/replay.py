@@ -111,6 +111,7 @@ class MotionRecord:
     up : (3,)
         Unit vector against gravity; z where there is no gravity.
     marker_names : (M,) str
+        Names of the markers.
     marker_places_m : (M, 3)
         Estimated places of the markers on the undeformed body.
     declared_places_m : (M, 3)
@@ -141,12 +142,9 @@ class MotionRecord:
         posterior over its prior standard deviation; NaN in elements of other regions.
     visible_points : mapping of name to (k, 8)
         For each depth camera, rows of points: time [s], image coordinates u and v, depth [m],
-        distance
-        behind the surface [m] (NaN for points that do not count), and position in the world [m].
-        For
-        some samples, rows of outlines follow: time, u, v, and NaN else; a row without u and v ends
-        each
-        face.
+        distance behind the surface [m] (NaN for points that do not count), and position in the
+        world [m]. For some samples, rows of outlines follow: time, u, v, and NaN else; a row
+        without u and v ends each face.
     reading_units : mapping of name to str
         Units of the custom sensors that state one.
     strain : (T,), or None
@@ -196,14 +194,19 @@ class MotionRecord:
         readings: Mapping[str, Array] | None = None,
         contact: tuple[Array, Array] | None = None,
     ) -> MotionRecord:
-        """Gather the motion of an experiment.
+        """Return the motion of an experiment; obstacles' nodes are left out.
+
+        `fields` and `visible_points` stay empty.
 
         Parameters
         ----------
         experiment : Experiment
+            Recording with the measured markers.
         fitted, simulated : ((T, n, 3), (T, M, 3)), optional
-            Positions of nodes and markers [m], of the fit and of the forward simulation.
+            Positions of nodes and markers [m], of the fit and of the forward simulation; None if
+            there is none.
         natural_hz : (k,), optional
+            Natural frequencies [Hz].
         places_m : (M, 3), optional
             Estimated places of the markers; the stated ones by default.
         wrenches, readings
@@ -299,9 +302,9 @@ class MotionRecord:
     def to_arrays(self, prefix: str = "") -> dict[str, Array]:
         """Return the arrays to store in a file, by name; attributes that are None are left out.
 
-        The names begin with `prefix`, except those of the body, which all experiments of a run
-        share but specimens.
-        Simulated positions are rounded to single precision.
+        The names begin with `prefix`, except those of the body (`BODY_ARRAYS`), which all
+        experiments of a run share except specimens. Simulated positions are rounded to single
+        precision. "residuals_m", the fitted minus the measured markers, is added if there is a fit.
         """
         stored: dict[str, Any] = {
             key: getattr(self, key) for key in ARRAY_LAYOUT
@@ -349,6 +352,8 @@ class MotionRecord:
     def from_arrays(cls, name: str, arrays: Mapping[str, Any]) -> MotionRecord:
         """Return the experiment called `name` from the arrays of a run, see
         `MotionRecord.to_arrays`.
+
+        Names begin with `name` and a slash, or have no prefix if there are no such names.
 
         Raises
         ------
@@ -455,7 +460,11 @@ def nodes_of_faces(
 
 
 def _require_shapes(arrays: Mapping[str, Any]) -> None:
-    """Refuse arrays of a file whose sizes, types or values are inconsistent, by a ValueError."""
+    """Raise a `ValueError` if sizes, types or values of arrays from a file are inconsistent.
+
+    `arrays` are by name as in `ARRAY_LAYOUT`, where None means that an array is missing, and by the
+    groups of `GROUP_PREFIXES`.
+    """
     sizes: dict[str, int] = {}
     for key, (kinds, letters) in ARRAY_LAYOUT.items():
         if (array := arrays.get(key)) is None:
@@ -582,7 +591,9 @@ def read_arrays(run: Path) -> dict[str, NDArray[Any]]:
 
 
 def damaged_run_refused(run: Path) -> AbstractContextManager[None]:
-    """Return a context that turns errors from damaged files of a run into an InputError."""
+    """Return a context that turns errors from damaged files of a run into an `InputError` that
+    names the files; an `InputError` itself passes.
+    """
     return damage_refused(
         run, f"{RESULT_FILE} or {ARRAYS_FILE}", remedy="solve the problem again"
     )

@@ -46,6 +46,7 @@ class StudySummary:
     Attributes
     ----------
     title : str
+        Title of the study.
     problem : str
         Name of the problem.
     headline : tuple of str
@@ -53,7 +54,9 @@ class StudySummary:
     runs : tuple of mapping
         One record for each finished run.
     notes : tuple of str
+        Sentences that explain the tables.
     tables : tuple of Table
+        Tables of the results.
     failures : tuple of str
         One sentence for each run that ended without a result.
     """
@@ -119,7 +122,10 @@ def report_text(report: TitledParts, file: Path) -> str:
 
 
 def report_html(report: TitledParts) -> str:
-    """Return a report as the HTML text of one page that contains its pictures."""
+    """Return a report as the HTML text of one page that contains its pictures.
+
+    Nothing is loaded from a network; pictures are embedded.
+    """
     page = (
         files("collocation_sysid.result")
         .joinpath("report.html")

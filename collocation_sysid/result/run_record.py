@@ -143,6 +143,8 @@ def _write_pictures(
 ) -> None:
     """Draw all pictures of a run, including the Jacobian's structure, and write them into its
     folder.
+
+    `say` is called with a sentence about what is being drawn.
     """
     say("drawing the pictures")
     # matplotlib takes a while to import, and nothing else needs it.
@@ -158,8 +160,8 @@ def _write_pictures(
 
 
 def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
-    """Return the cell data that are the same in every frame: region numbers and spatially varying
-    constants.
+    """Return the cell data that are the same in every frame: region numbers, if there are several,
+    and spatially varying constants of a body.
 
     Each array has one row for each of the E elements. A constant has four: its estimate, the ends
     of its 95 % interval (suffixes ``_lower``, ``_upper``), and its posterior over its prior
@@ -276,7 +278,7 @@ def _depth_rows(
     if part is not None:
         surfaces = {
             reading.correspondences.camera.depth.name: SurfaceComparison.from_fit(
-                reading, part.x, values, part.phi
+                reading, part.x, values=values, phi=part.phi
             )
             for reading, values in part.depth_residuals
         }
@@ -295,10 +297,18 @@ def _depth_rows(
 def _surface_contact(
     finished: SolvedProblem, experiment: Experiment, positions_m: Array
 ) -> tuple[Array, Array] | None:
-    """Return gap [m] and contact pressure [Pa] on the boundary triangles, (T, F) each; None without
-    obstacles.
+    """Return gap [m] and contact pressure [Pa] on the boundary triangles at the estimates, (T, F)
+    each; None without obstacles.
 
-    `positions_m` are the node positions (T, n, 3) [m].
+    Poses are corrected by the nuisance parameters if the experiment was fitted.
+
+    Parameters
+    ----------
+    finished : SolvedProblem
+    experiment : Experiment
+        Experiment of the problem.
+    positions_m : (T, n, 3)
+        Node positions.
     """
     if not experiment.obstacles:
         return None
@@ -377,7 +387,8 @@ def _custom_sensor_columns(
 def _comparison_columns(
     t_s: Array, measured: Array, *models: Array | None
 ) -> Array:
-    """Return the columns time, measured values and the values of each model, as one array.
+    """Return the columns time, measured values and the values of each model, as one array (S, 1 + m
+    (1 + number of models)).
 
     `t_s` is (S,), `measured` and each of `models` (S, m); the columns of a model that is None are
     NaN.
@@ -390,8 +401,8 @@ def _comparison_columns(
 
 
 def _marker_places_m(finished: SolvedProblem, experiment: str) -> Array | None:
-    """Return the estimated places (M, 3) of the markers on the undeformed body; None where that
-    failed.
+    """Return the estimated places (M, 3) [m] of the markers of an experiment on the undeformed
+    body; None for a validation experiment whose forward simulation failed.
     """
     if experiment in finished.places:
         places = [

@@ -46,7 +46,8 @@ def refine_run(
 
     ``refinement.json`` holds the levels; levels that it holds already are not solved again. In
     ``result.json`` the values of parameters and moduli are corrected for the measured error, their
-    combined intervals and the budget contain it, and the verdict takes it into account.
+    combined intervals and the budget contain it, and the verdict takes it into account. Both files
+    are updated after each level. Pictures are not drawn again.
 
     Parameters
     ----------
@@ -68,7 +69,8 @@ def refine_run(
     Raises
     ------
     InputError
-        If the folder holds no converged run of a problem file, or files of the problem are missing.
+        If the folder holds no converged run of a problem file, files of the problem are missing, or
+        a finer problem cannot be solved.
     KeyboardInterrupt
         After an interrupt; the levels that were finished are in the folder.
     """
@@ -131,7 +133,9 @@ def with_refinement(
     def corrected(
         values: Mapping[str, ReportedEstimate],
     ) -> dict[str, ReportedEstimate]:
-        """Return estimates by name, corrected where the refinement measured their error."""
+        """Return estimates by name, corrected where the refinement measured their error, otherwise
+        unchanged.
+        """
         return {
             name: _corrected_estimate(
                 name,
@@ -177,7 +181,9 @@ def with_refinement(
 def _estimates_at_optimum(
     result: Result, parameters: Parameters
 ) -> dict[str, Estimate]:
-    """Return the estimates before the correction of the discretisation error, by name."""
+    """Return the estimates of parameters and derived moduli, without coefficients of fields, before
+    the correction of the discretisation error, by name.
+    """
     return {
         name: each.at_optimum(name, linear=name in parameters.linear_names)
         for name, each in result.values.items()
@@ -196,19 +202,22 @@ def _corrected_estimate(
     Parameters
     ----------
     name : str
+        Name of the estimate.
     before : ReportedEstimate
+        The estimate in the result, of which systematic effects are kept.
     optimum : Estimate
         The estimate at the optimum, before any correction.
     error : DiscretisationError
         The measured discretisation error.
     parameters : Parameters
+        Parameters with their coordinates and bounds.
     """
     linear, bounds = parameters.scale_and_bounds(name)
     combined = combine(
         name,
         optimum,
-        error,
-        before.systematic,
+        error=error,
+        systematic=before.systematic,
         known_effect=before.known_effect or 0.0,
         linear=linear,
         bounds=bounds,
@@ -221,7 +230,9 @@ def _updated_shares(
     before: ReportedEstimate,
     after: ReportedEstimate,
 ) -> dict[str, float]:
-    """Return the contributions to an estimate's variance with the measured discretisation error.
+    """Return the contributions to an estimate's variance with the measured discretisation error,
+    largest first; they sum to one. Without a combined standard error before or after they are
+    unchanged.
 
     Parameters
     ----------
@@ -247,8 +258,15 @@ def _updated_shares(
 
 
 def _known_levels(file: Path, names: Iterable[str]) -> list[RefinementLevel]:
-    """Return the levels that an earlier call finished, with the values of `names` alone; empty if
-    none.
+    """Return the levels that an earlier call finished, with the values of `names` alone; empty
+    without a file.
+
+    Raises
+    ------
+    InputError
+        If the file is a link or was not written by this program.
+    KeyError, ValueError
+        If the file is damaged, or lacks one of the names.
     """
     if not file.is_file():
         return []

@@ -101,15 +101,17 @@ LEADING_PICTURES = ("tracks", "wrench", "reading", "depth")
 def run_summary(
     result: Result, folder: Path | None = None, budget: bool = False
 ) -> list[Shown]:
-    """Return the description of a run that fits on one screen.
+    """Return the description of a run that fits on one screen: outcome, verdict, estimates, fit,
+    notes, probes, and the diagnoses of the largest residuals.
 
     Parameters
     ----------
     result : Result
+        Content of ``result.json``.
     folder : Path, optional
-        The run folder, which the last line names.
+        The run folder, which the last line names; no such line by default.
     budget : bool
-        Whether to add the complete table of contributions to each variance.
+        Whether to add the complete table of contributions to each variance, if there is a budget.
     """
     largest = sorted(result.residuals, key=lambda each: -each.rms_m)[
         :SHOWN_DIAGNOSES
@@ -218,6 +220,7 @@ def verdict_section(
     Parameters
     ----------
     trust : Assessment
+        Verdict with its concerns.
     linked : bool
         Whether each reason links to its remedy on the same page.
     max_reasons : int, optional
@@ -318,8 +321,8 @@ def _undetermined_sentence(result: Result) -> list[str]:
 
 
 def _coverage_sentence(result: Result) -> str:
-    """Return what the combined intervals contain, and which discretisation error they do not
-    contain.
+    """Return a sentence on what the combined intervals contain, and which discretisation error they
+    do not contain; equilibria have no step error, specimens neither.
     """
     moving = any(not each.static for each in result.fit.experiments.values())
     meshed = any(each.test is None for each in result.fit.experiments.values())
@@ -343,7 +346,8 @@ def _coverage_sentence(result: Result) -> str:
 
 def _largest_contributions(result: Result) -> list[str]:
     """Return the main sources of uncertainty of the estimates whose uncertainty is mostly
-    systematic.
+    systematic, that is whose combined standard uncertainty exceeds `SYSTEMATIC_RATIO` times the
+    statistical one.
 
     There is one sentence for each of at most `SHOWN_BUDGETS` estimates, the most systematic first.
     """
@@ -376,7 +380,9 @@ def _largest_contributions(result: Result) -> list[str]:
 
 
 def budget_table(result: Result) -> Table:
-    """Return the table of contributions to the variance of each estimate, in percent."""
+    """Return the table of contributions to the variance of each estimate, in percent; sources with
+    less than `SMALLEST_SHOWN_SHARE` of every variance are left out.
+    """
     lines = result.budget
     shown = main_sources(lines, SMALLEST_SHOWN_SHARE)
     rows = [
@@ -394,6 +400,9 @@ def budget_table(result: Result) -> Table:
 def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
     """Return the cells of an estimate after its name: value, combined uncertainty and interval,
     statistical and systematic uncertainty, guess, and a remark.
+
+    Unknown numbers are empty. Instead of an interval the cell says whether the parameter is at its
+    bound or not determined, and instead of a guess whether it is fixed or tied.
     """
     each = result.values[name]
     interval = _interval_text(each.combined95)
@@ -557,6 +566,7 @@ def _simulation_lines(
     name : str
         Name of the experiment.
     simulated : SimulatedExperiment
+        Errors of its forward simulation.
     """
     kind = "forward simulation" if simulated.fitted else "validation"
     if simulated.failed is not None:
@@ -590,7 +600,8 @@ def _simulation_lines(
 def _errors_text(
     error: PredictionErrors, units: Mapping[str, str] | None
 ) -> str:
-    """Return the errors of a prediction in words; "" if nothing is compared.
+    """Return the errors of a prediction in words; "" if nothing is compared. Errors that are None
+    or zero are left out.
 
     `units` are the units of custom sensors by name; None if none states a unit.
     """
@@ -613,7 +624,9 @@ def _errors_text(
 
 
 def _unit_text(units: Mapping[str, str] | None, reading: str) -> str:
-    """Return the unit of a custom sensor after a space; "" if it states none."""
+    """Return the unit of the custom sensor `reading` after a space; "" if it states none or `units`
+    is None.
+    """
     unit = (units or {}).get(reading, "")
     return f" {unit}" if unit else ""
 
@@ -637,7 +650,9 @@ def _millimetres(metres: float) -> str:
 
 
 def _forces_text(*sizes: float | None) -> str:
-    """Return a force [N] and a torque [N m] in words; "" if neither is measured (None or zero)."""
+    """Return RMS or σ of a force [N] and a torque [N m], in this order, in words; sizes that are
+    None or zero are left out.
+    """
     pairs = zip(sizes, ("N", "N m"), strict=True)
     return ", ".join(f"{short(size)} {unit}" for size, unit in pairs if size)
 
@@ -651,7 +666,9 @@ def _notes_section(result: Result) -> TitledParts:
 
 
 def _cards(result: Result) -> Cards:
-    """Return the three main numbers: stiffness, misfit, and misfit of the forward simulation."""
+    """Return the three main numbers: the most important stiffness (or else the first estimate), the
+    misfit of the markers, and that of the forward simulation.
+    """
     values = result.values
     fit = result.fit
     simulated = result.rollout
@@ -688,8 +705,8 @@ def _remedy_lines(concerns: Iterable[Concern]) -> Iterator[Line]:
 
 
 def _error_bars(result: Result) -> Iterator[Shown]:
-    """Yield the number of residuals behind the error bars, their noise level, and the variance
-    table.
+    """Yield a sentence on the model of the errors, their noise level and the reduced χ², if there
+    are error bars, and the table of variances, if there is a budget.
     """
     if (known := result.uncertainty) is not None:
         yield (
@@ -828,10 +845,10 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
 
 
 def _captioned_pictures(run: Path) -> list[Picture]:
-    """Return every PNG picture of the folder with its caption.
+    """Return every PNG picture that this program wrote into the folder, with its caption.
 
     A picture that compares measurement and fit is first; then follow the pictures known to
-    `PICTURE_CAPTIONS` in that order, and unknown ones.
+    `PICTURE_CAPTIONS` in that order, and unknown ones, with their name as caption.
     """
     order = [*PICTURE_CAPTIONS, ""]
     pictures: list[Picture] = []
@@ -884,7 +901,9 @@ def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:
 
 
 def _size_text(value: float | None, unit: str) -> str:
-    """Return a value in a suitable unit, such as millimetres for `unit` "m"; "–" for None."""
+    """Return a value, given in `unit`, in a readable unit, such as millimetres for "m"; "–" for
+    None.
+    """
     factor, shown = in_readable_unit(1.0, unit)
     # No powers of ten for the sizes of bodies.
     digits = 2 if value is None or abs(factor * value) < 99.5 else 4

@@ -29,7 +29,7 @@ from ..fem.elements import Element
 from .element_fields import ElementFields
 
 VTK_CELL_TYPES = ("tetra", "tetra10")  # by meshio's names
-# More frames take disk space and add little to an animation.
+# Largest number of frames; more take disk space and add little to an animation.
 MAX_PARAVIEW_FRAMES = 200
 FRAMES_FILE = "trajectory.pvd"
 
@@ -50,13 +50,17 @@ def write_vtu(
     Parameters
     ----------
     path : str or Path
+        File to write; an existing one is replaced.
     points_m : (n, 3)
         Positions of the points.
     cells : (E, nodes per cell)
         Point indices of each cell.
     meshio_type : {"tetra", "tetra10"}
+        Kind of the cells.
     point_data : mapping of name to (n,) or (n, k), optional
+        Data at the points.
     cell_data : mapping of name to (E,) or (E, k), optional
+        Data of the cells.
 
     Raises
     ------
@@ -123,7 +127,7 @@ def _checked_arrays(
 def write_pvd(
     path: str | Path, frames: Sequence[tuple[float, str | Path]]
 ) -> None:
-    """Write the list of frames that ParaView opens as one animation.
+    """Write the list of frames that ParaView opens as one animation; an existing file is replaced.
 
     Parameters
     ----------
@@ -174,11 +178,13 @@ def write_frames(
     cells : (E, nodes per element)
         Node indices of each element.
     element : Element
+        Kind of the elements.
     undeformed_m : (n, 3)
         Nodes of the undeformed body.
     point_series : mapping of name to (T, n) or (T, n, k), optional
         Further data at the points.
     max_frames : int
+        Largest number of frames.
     fields : ElementFields, optional
         Stress, energy density and det F of each element.
     cell_data : mapping of name to (E,), optional
@@ -238,15 +244,17 @@ def replaced_folder(
     marker_file: str = RESULT_FILE,
     content_word: str = "run",
 ) -> Iterator[Path]:
-    """Yield a temporary folder to write into, and rename it to `path` at the end.
+    """Context with a temporary folder to write into, which is renamed to `path` at the end.
 
     An earlier run at `path` is replaced completely, at the end, if this program wrote every file in
-    it and none was changed since. After an exception the temporary folder is removed and `path` is
-    unchanged. The folder gets a list of its files, see `written_files`.
+    it and none was changed since; an empty folder is replaced, too. After an exception the
+    temporary folder is removed and `path` is unchanged. The folder gets a list of its files, see
+    `written_files`.
 
     Parameters
     ----------
     path : str or Path
+        Folder to write; missing parents are made.
     overwrite : bool
         Whether an earlier run may be replaced.
     marker_file : str
@@ -258,7 +266,8 @@ def replaced_folder(
     ------
     InputError
         If there is anything else at `path`, or a link; this is checked before the temporary folder
-        is given, so that no work is lost, and again at the end.
+        is given, so that no work is lost, and again at the end. If the folder cannot be moved at
+        the end, the message names the place where the finished one is kept.
     """
     target = _resolved_parent(Path(path))
     require_replaceable(
@@ -339,9 +348,15 @@ def require_replaceable(
     marker_file: str = RESULT_FILE,
     content_word: str = "run",
 ) -> None:
-    """Refuse a place for a run folder that holds anything but an earlier run.
+    """Raise an `InputError` if a place for a run folder holds anything but an earlier run; a
+    missing or empty folder passes.
 
-    Parameters are those of `replaced_folder`.
+    Parameters
+    ----------
+    target : Path
+        Place of the folder.
+    overwrite, marker_file, content_word
+        See `replaced_folder`.
 
     Raises
     ------
@@ -378,13 +393,7 @@ def require_replaceable(
 
 
 def require_no_link(folder: Path) -> None:
-    """Refuse a link where a folder is to be written.
-
-    Raises
-    ------
-    InputError
-        Naming the link.
-    """
+    """Raise an `InputError`, naming the link, if `folder` is a link; a missing folder passes."""
     if folder.is_symlink():
         raise InputError(
             f"is a link to {os.readlink(folder)}, and nothing is written through links; use the "
@@ -394,8 +403,8 @@ def require_no_link(folder: Path) -> None:
 
 
 def require_only_written(folder: Path) -> None:
-    """Refuse a folder with a link, with a file that this program did not write, or with a changed
-    file.
+    """Raise an `InputError` if a folder contains a link, a file that this program did not write, or
+    a file that was changed since.
 
     Raises
     ------

@@ -25,7 +25,7 @@ from ..problem import Problem
 
 # Number of latest iterations on the terminal: half of its 24 lines.
 SHOWN_ITERATIONS = 12
-# Time until the first line.
+# Time until the first line [s].
 FIRST_LINE_S = 10.0
 # Growth of the elapsed time until each further line.
 ELAPSED_GROWTH = 0.5
@@ -70,7 +70,7 @@ class Heartbeat:
         )
 
     def start(self) -> None:
-        """Start the thread and its clock."""
+        """Start the thread and its clock; call it once."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -164,7 +164,8 @@ class SolveProgress(Watched):
         self._update_activity(what, what)
 
     def share(self, done: float | None) -> None:
-        """Show the completed share of the current phase, with the remaining time.
+        """Show the completed share of the current phase, with the remaining time, at most every
+        `SHARE_INTERVAL_S`.
 
         Parameters
         ----------
@@ -200,7 +201,9 @@ class SolveProgress(Watched):
         self._state = describe
 
     def _update_activity(self, activity: str, line: str = "") -> None:
-        """Update the display with the current activity, and print `line` if verbose."""
+        """Update the display with the current activity, and print `line` if verbose and not empty;
+        a new activity restarts its elapsed time.
+        """
         if activity != self._doing:
             self._activity_began_s = time.monotonic()
         self._doing = activity

@@ -54,7 +54,7 @@ from .run_writers import (
     write_frames,
 )
 
-# The key of the file of markers, see `_table_names`.
+# Key of the file of markers, see `_table_names`.
 _MARKERS_KEY = "markers"
 # Key of the table of a specimen.
 _SPECIMEN_KEY = "specimen"
@@ -115,6 +115,7 @@ def write_data(
     Parameters
     ----------
     problem : Problem
+        Problem with a guess of every parameter.
     folder : str or Path
         Created if missing; gets ``<experiment>_markers.csv`` if there are markers,
         ``<experiment>_poses.csv`` (``_poses_2`` … by the number of the grasp) for grasps whose
@@ -366,6 +367,7 @@ def _refuse_foreign(
     Parameters
     ----------
     problem : Problem
+        Problem whose files are protected.
     place : Path
         The folder.
     files : iterable of Path
@@ -406,7 +408,9 @@ def _refuse_foreign(
 def _experiment_sections(
     problem: Problem,
 ) -> dict[str, ExperimentSection | SpecimenSection]:
-    """Return the table of each experiment in the problem file, by name; empty without a file."""
+    """Return the table of each experiment in the problem file, by name of the experiment; empty for
+    a problem without a file.
+    """
     if (origin := problem.origin) is None:
         return {}
     file = ProblemFile.model_validate(parse_toml(origin.text, origin.path))
@@ -416,9 +420,17 @@ def _experiment_sections(
 def _table_names(
     experiment: Experiment, section: ExperimentSection | SpecimenSection | None
 ) -> dict[str, str]:
-    """Return the names of the files of an experiment, by their content: markers, poses_2, …
+    """Return the names of the files of an experiment, by their content: "markers", "poses",
+    "poses_2", …
 
-    On a test bench and of specimens the names are those of the problem file.
+    Poses are listed for grasps that read them from a file. On a test bench and of specimens the
+    names are those of the problem file, and on a test bench also the keys.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    section : ExperimentSection, SpecimenSection or None
+        Its table in the problem file; None without a file.
     """
     if experiment.specimen is not None or isinstance(section, SpecimenSection):
         if isinstance(section, SpecimenSection):
@@ -453,7 +465,7 @@ def _table_names(
 
 
 def _numbered_key(kind: str, index: int) -> str:
-    """Return the key of a file by its index, counted from 0: poses, poses_2, …"""
+    """Return the key of a file of the grasp with this index, counted from 0: poses, poses_2, …"""
     return f"{kind}_{index + 1}" if index else kind
 
 

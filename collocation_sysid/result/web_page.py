@@ -25,7 +25,7 @@ from ..common.files import write_text_file
 from .pictures.projection import ParallelCamera
 from .replay import MotionRecord
 
-# More samples than this are thinned, to keep the page a few megabytes.
+# Largest number of samples on the page, which keeps it a few megabytes.
 MAX_PAGE_FRAMES = 300
 # Quantile of the strain at which the colour scale ends: strains in single corners are far larger.
 STRAIN_QUANTILE = 0.995
@@ -55,7 +55,11 @@ class Colouring:
 
     @classmethod
     def by_strain(cls, replay: MotionRecord) -> Colouring:
-        """Return the colouring of all trajectories by the largest principal strain."""
+        """Return the colouring of all trajectories, at least one, by the largest principal strain.
+
+        The scale reaches from 0 to the quantile `STRAIN_QUANTILE` of the strain of the first
+        trajectory.
+        """
         values = {
             name: surface_strain(replay, x)
             for name, x in _trajectories(replay).items()
@@ -65,14 +69,16 @@ class Colouring:
         return cls(
             "strain",
             values,
-            0.0,
-            largest,
-            ("0", f"{100 * largest:.2g} % strain"),
+            low=0.0,
+            high=largest,
+            end_labels=("0", f"{100 * largest:.2g} % strain"),
         )
 
     @classmethod
-    def by_field(cls, name: str, values: Array) -> Colouring:
-        """Return the colouring of the fitted body by given values.
+    def by_field(
+        cls, name: str, values: Array, trajectory: str = "fitted"
+    ) -> Colouring:
+        """Return the colouring of one trajectory, the only one that is shown, by given values.
 
         Parameters
         ----------
@@ -80,15 +86,17 @@ class Colouring:
             Name of the quantity, which the label of the upper end contains.
         values : (T, F)
             Value at each sample on each boundary triangle; NaN is ignored for the limits.
+        trajectory : {"fitted", "simulated"}
+            Trajectory to show, which the experiment must have.
         """
         low = float(np.nanmin(values))
         high = float(np.nanmax(values))
         return cls(
             name,
-            {"fitted": values},
-            low,
-            high,
-            (f"{low:.3g}", f"{high:.3g} {name}"),
+            {trajectory: values},
+            low=low,
+            high=high,
+            end_labels=(f"{low:.3g}", f"{high:.3g} {name}"),
         )
 
 
@@ -152,7 +160,9 @@ def _trajectories(replay: MotionRecord) -> dict[str, Array]:
 
 
 def _page_data(replay: MotionRecord, colouring: Colouring) -> dict[str, Any]:
-    """Return the data of the page, ready for JSON; arrays are in base64, see `_base64`."""
+    """Return the data of the page for an experiment and its colouring, ready for JSON; arrays are
+    in base64, see `_base64`, and samples are thinned to at most `MAX_PAGE_FRAMES`.
+    """
     samples = np.arange(
         0, len(replay.t_s), -(-len(replay.t_s) // MAX_PAGE_FRAMES)
     )
@@ -214,6 +224,7 @@ def surface_strain(replay: MotionRecord, positions_m: Array) -> Array:
     Parameters
     ----------
     replay : MotionRecord
+        Experiment, for mesh and surface.
     positions_m : (T, n, 3)
         Node positions of one of its trajectories.
     """
@@ -260,8 +271,8 @@ def cells_below_faces(
 
 
 def _base64(array: NDArray[Any], data_type: str) -> str:
-    """Return an array as base64 text of its bytes in the NumPy data type `data_type`, such as
-    "<f4".
+    """Return an array, converted to the NumPy data type `data_type` such as "<f4", as base64 text
+    of its bytes in row-major order.
     """
     return base64.b64encode(
         np.ascontiguousarray(array, dtype=data_type).tobytes()

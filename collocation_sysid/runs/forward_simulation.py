@@ -53,16 +53,16 @@ class ForwardSimulation:
     Attributes
     ----------
     rms_m, max_m : float
-        RMS and largest distance of the markers from the measurements; zero without markers.
+        RMS and largest distance of the markers from the measurements [m]; zero without markers.
     trajectory : Trajectory
         Its markers are predicted with the experiment's nuisance parameters.
     nuisance : mapping of name to value
         Nuisance parameters of an experiment for validation, fitted to it at the estimated material;
         those of places are displacements from their start. Empty for fitted experiments.
     places_m : mapping of marker to place [x, y, z]
-        Marker places, for validation likewise.
-    wrenches : tuple of (S, 6)
-        Predicted wrenches of the sensors of its grasps; NaN where unknown.
+        Marker places on the undeformed body, fitted likewise; empty for fitted experiments.
+    wrenches : sequence of (S, 6)
+        Predicted forces [N] and torques [N m] of the sensors of grasps; NaN where unknown.
     wrench_rms : (force, torque)
         RMS difference of force [N] and torque [N m]; None where there is none.
     readings : mapping of name to (S, m)
@@ -108,8 +108,11 @@ class ForwardSimulation:
 def simulate_experiments(
     problem: Problem, solution: Solution
 ) -> dict[str, ForwardSimulation | str]:
-    """Simulate all experiments in parallel threads; results by experiment name, see
-    `simulate_experiment`.
+    """Simulate all experiments of a problem, also those for validation, in parallel threads with
+    the estimates of a solution.
+
+    Return the results by experiment name, see `simulate_experiment`. The progress is reported to
+    the counters of `counted_phase`.
     """
     threads = solution.collocation.threads
 
@@ -118,6 +121,7 @@ def simulate_experiments(
         completed = 0.0
 
         def report(share: float) -> None:
+            """Add the increase of the completed share, from 0 to 1, to the counter of the phase."""
             nonlocal completed
             complete_steps(StepUnit.SIMULATION, share - completed)
             completed = share
@@ -128,7 +132,7 @@ def simulate_experiments(
 
     with counted_phase(StepUnit.SIMULATION, len(problem.experiments)):
         rollouts = map_experiments(
-            simulate_counted, problem.experiments, threads
+            simulate_counted, problem.experiments, threads=threads
         )
     return {
         e.name: each
@@ -142,12 +146,27 @@ def simulate_experiment(
     solution: Solution,
     report: Callable[[float], None] | None = None,
 ) -> ForwardSimulation | str:
-    """Simulate an experiment with the parameters of a solution; return the reason as text if that
-    fails.
+    """Simulate an experiment with the parameters of a solution, and compare it with the
+    measurements; return the reason as text if that fails.
 
-    The result of a validation experiment has also its nuisance parameters, and the errors of a
-    blind prediction and of a copy of the nearest recording. `report` is called with the completed
-    share of the simulation, from 0 to 1.
+    For a validation experiment the nuisance parameters are fitted to it first, and the result has
+    these, and the errors of a blind prediction and of a copy of the nearest recording.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem with the options of forward simulations.
+    experiment : Experiment
+        Fitted experiment or one for validation.
+    solution : Solution
+        Solution of the problem.
+    report : callable, optional
+        Called with the completed share of the simulation, from 0 to 1.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If the fit of the nuisance parameters is interrupted.
     """
     try:
         segment, phi = transcription_and_nuisance(experiment, solution)
@@ -160,7 +179,7 @@ def simulate_experiment(
             report=report,
         )
     except (InputError, SimulationError) as error:
-        # A density that leaves a node without mass is input of who simulates, but found here.
+        # An InputError here is, for example, an estimated density that leaves a node without mass.
         return str(error)
     if not experiment.validation:
         return rollout
@@ -273,7 +292,9 @@ def _predict_instruments(
     Parameters
     ----------
     segment : Transcription
+        Recording with its instruments.
     trajectory : Trajectory
+        Simulated motion at its samples.
     phi : (k,) array
         Nuisance parameters of the recording.
 
@@ -292,7 +313,7 @@ def _predict_instruments(
     )
     surfaces = {
         reading.correspondences.camera.depth.name: SurfaceComparison.from_motion(
-            reading, trajectory.t_s, positions_m, phi
+            reading, trajectory.t_s, positions_m=positions_m, phi=phi
         )
         for reading in segment.depths
     }
@@ -316,10 +337,21 @@ def _blind_error(
 ) -> PredictionErrors | None:
     """Return the errors of a prediction of a recording with the nuisance parameters of the fitted
     recordings; None if the simulation fails.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its integrator and step are used.
+    segment : Transcription
+        Recording to be predicted, with its measurements.
+    solution : Solution
+        Solution of the fitted recordings.
     """
     phi = nuisance_of_fitted_recordings(segment, solution)
     try:
-        trajectory = _simulate(problem, segment, phi, solution.parameters)
+        trajectory = _simulate(
+            problem, segment, phi=phi, parameters=solution.parameters
+        )
     except (InputError, SimulationError):
         return None
     predicted, _ = _predict_instruments(segment, trajectory, phi=phi)
@@ -331,8 +363,8 @@ def transcription_and_nuisance(
 ) -> tuple[Transcription, Array]:
     """Return an experiment's transcription and its nuisance parameters φ (k,).
 
-    For a fitted experiment φ is the estimate; for validation φ is fitted to its measurements, with
-    the material at its estimate, which takes a solve.
+    For a fitted experiment φ is the estimate; for validation φ is fitted to its measurements in
+    reduced space, with the material at its estimate. Whether that solve converged is not checked.
 
     Raises
     ------
@@ -374,10 +406,13 @@ def step_error(
     ----------
     problem : Problem
     solution : Solution
+        Converged solution.
     fit : LinearisedFit
         The measurements linearised at the solution.
     rollouts : mapping of experiment name to ForwardSimulation or str
+        Forward simulations, or why there is none.
     estimates : mapping of name to Estimate
+        Estimates at the solution, with their statistical intervals.
 
     Returns
     -------
@@ -435,7 +470,16 @@ def _sensor_differences(
     part: ExperimentIterate, trajectory: Trajectory, share: float
 ) -> list[Array]:
     """Return `share` times the difference (simulated − fitted) of each custom sensor, (S, G, 3),
-    over σ; zero where a value is NaN.
+    over σ; zero where a value is NaN. Empty without custom sensors.
+
+    Parameters
+    ----------
+    part : ExperimentIterate
+        Fitted experiment at the solution.
+    trajectory : Trajectory
+        Its forward simulation.
+    share : float
+        Factor on all differences.
     """
     if not (segment := part.segment).custom_sensors:
         return []
@@ -463,8 +507,9 @@ def _sensor_differences(
 def _depth_differences(
     part: ExperimentIterate, trajectory: Trajectory, share: float
 ) -> list[Array]:
-    """Return the change of each depth camera's residuals, (S, M, 3), for `share` times the
-    difference between simulated and fitted positions, at the correspondences of the fit.
+    """Return the change of each depth camera's residuals, (S, M, 3) in σ, for `share` times the
+    difference between simulated and fitted positions, at the correspondences of the fit; empty
+    without depth cameras.
     """
     if not (sights := part.surface_residuals):
         return []
@@ -480,7 +525,7 @@ def _depth_differences(
         reading.residual_changes(
             observation,
             displacements_m[:, reading.correspondences.surface.nodes],
-            part.phi,
+            phi=part.phi,
         )[..., 0]
         for reading, observation in sights
     ]
@@ -522,9 +567,10 @@ def _predict_sensors(
 
 def _step_error_share(problem: Problem, segment: Transcription) -> float | None:
     """Return the share of the difference between forward simulation and fit that half the time step
-    would remove.
+    would remove, from the orders of both schemes.
 
-    None if the simulation is not Newmark's or no finer than the fit; 1 for static experiments.
+    None if the simulation is not Newmark's or its step is not at most half as large; 1 for static
+    experiments.
     """
     experiment = segment.experiment
     options = problem.rollout
@@ -540,11 +586,11 @@ def _step_error_share(problem: Problem, segment: Transcription) -> float | None:
 
 
 def _step_s(problem: Problem, segment: Transcription) -> float:
-    """Return the step of the forward simulation [s]: the stated one, by default finer than the grid
-    of the fit.
+    """Return the step of the forward simulation of a recording [s]: the stated one, by default
+    finer than the grid of the fit.
 
-    The default is at most a quarter of the sample interval and at most half the grid step, unless
-    that makes too many steps.
+    The default is the sample interval over four, or over twice the substeps of the fit if these are
+    more, unless that makes more than the largest number of steps.
     """
     count = min(max(4, 2 * segment.substeps), MOST_STEPS - 1)
     return problem.rollout.timestep_s or segment.experiment.timestep_s / count

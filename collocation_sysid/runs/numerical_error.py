@@ -24,9 +24,10 @@ from .solving import solve
 from .warm_start import WarmStart
 
 A = TypeVar("A", bound=SolvedProblem)
-# Most discretisations of each kind: three show the order of convergence, and a fourth is too large.
+# Largest number of discretisations of each kind, the coarsest included: three show the order of
+# convergence, a fourth is too large.
 MOST_LEVELS = 3
-# Last step of the parameters' logarithms at convergence: far below any error bar.
+# Step of the parameters' logarithms at which a solve has converged: far below any error bar.
 TOLERANCE = 1e-6
 
 
@@ -37,7 +38,10 @@ def finer_step(problem: Problem) -> Problem:
 
 def finer_mesh(problem: Problem) -> Problem:
     """Return the problem with every tetrahedron of its bodies split into eight, and experiments,
-    grasps included, that refer to the new meshes; the cells of specimens are exact and stay.
+    grasps included, that refer to the new meshes.
+
+    Bodies that experiments share stay shared; specimens without a mesh stay as they are. The
+    problem itself is not modified.
     """
     meshed = [
         each.body for each in problem.experiments if each.specimen is None
@@ -63,7 +67,16 @@ def refine(
     levels: int = 2,
     report_progress: Callable[[str], None] | None = None,
 ) -> A:
-    """Return a converged run with its numerical error, see `solve_refined`."""
+    """Return a converged run with its numerical error; nothing else of the run is changed or
+    computed again.
+
+    Parameters
+    ----------
+    run : SolvedProblem
+        Run that has converged.
+    levels, report_progress
+        See `solve_refined`, which also lists the errors that are raised.
+    """
     answer = WarmStart.of(run.solution)
     problem = replace(run.problem, substeps=run.solution.collocation.substeps)
     estimates = run.optimum
@@ -93,15 +106,19 @@ def solve_refined(
     The step and the mesh are refined separately: their errors add up to first order. Finer problems
     are solved by the reduced space, whatever method found the answer.
 
+    Equilibria have no step: if all fitted experiments are static, only the mesh is refined.
+
     Parameters
     ----------
     problem : Problem
+        Problem that was solved; its experiments for validation are left out.
     solution : WarmStart
         The solution of the problem.
     estimates : mapping of name to Estimate
         Estimates of that solution, with their statistical intervals.
     levels : int
-        2 discretisations of each kind, or 3 to observe the orders of convergence.
+        Number of discretisations of each kind, that of `solution` included: 2, or 3 to observe the
+        orders of convergence.
     report_progress : callable, optional
         Called with a progress message.
     solved_levels : sequence of RefinementLevel

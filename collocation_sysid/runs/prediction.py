@@ -34,6 +34,7 @@ class PredictionErrors:
     reading_rms : mapping of name to float, or None
         RMS difference of custom sensors, in their units.
     depth : mapping of the camera's name to DepthError, or None
+        Distances of the points of depth cameras from the predicted surface.
     """
 
     rms_m: float | None = None
@@ -53,6 +54,7 @@ class CopyError:
     copied : str
         The name of the fitted recording that is nearest.
     error : PredictionErrors
+        Errors of its measurements as a prediction.
     """
 
     copied: str
@@ -89,16 +91,18 @@ class InstrumentMisfit:
 
 @dataclass(frozen=True)
 class InstrumentPrediction:
-    """Predictions of a recording's instruments by a simulation.
+    """Predictions of a recording's instruments by a simulation, or by another recording.
 
     Attributes
     ----------
     markers_m : (T, M, 3)
-        NaN where nothing is predicted.
+        Marker positions; NaN where nothing is predicted.
     wrenches : sequence of (S, 6)
+        Force [N] and torque [N m] of each sensor, at its own times.
     readings : mapping of name to (S, m)
         Values of custom sensors.
     depth : mapping of the camera's name to DepthError
+        Distances of the points of depth cameras from the predicted surface.
     """
 
     markers_m: Array
@@ -113,7 +117,15 @@ def prediction_error(
     """Return RMS and maximum differences between a prediction and the measurements of its
     recording, for each kind of instrument.
 
-    Values that are not measured, or not predicted, are left out; a kind without values has None.
+    Values that are not measured, or not predicted (NaN), are left out; a kind without values has
+    None.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Recording with the measurements.
+    predicted : InstrumentPrediction
+        Prediction at the same samples and for the same instruments, in the same order.
     """
     distance_m = np.linalg.norm(
         predicted.markers_m - experiment.markers.positions_m, axis=2
@@ -137,7 +149,8 @@ def instrument_misfits(
 ) -> list[InstrumentMisfit]:
     """Return the RMS of (prediction − measurement) / σ of each instrument, with the stated σ.
 
-    Markers and depth cameras without measurements are left out.
+    The order is markers, wrenches, custom sensors, depth cameras. Markers and depth cameras without
+    measurements are left out. The prediction must be at the samples of the experiment.
     """
     results = []
     markers = experiment.markers
@@ -152,19 +165,22 @@ def instrument_misfits(
         ratio = difference_m / sigma_m[:, None]
         results.append(
             _misfit(
-                "the markers", "sigma_m", ratio, f"{1e3 * rms_m:.3g} mm RMS"
+                "the markers",
+                "sigma_m",
+                ratio=ratio,
+                size=f"{1e3 * rms_m:.3g} mm RMS",
             )
         )
     for read, sensor in zip(
         predicted.wrenches, experiment.wrenches, strict=True
     ):
         ratio = (read - sensor.values) / sensor.sigmas
-        results.append(_misfit("the wrench", "sigma_n", ratio))
+        results.append(_misfit("the wrench", "sigma_n", ratio=ratio))
     for gauge in experiment.readings:
         ratio = (
             predicted.readings[gauge.name] - gauge.measured_values
         ) / gauge.sigma
-        results.append(_misfit(gauge.name, "its sigma", ratio))
+        results.append(_misfit(gauge.name, "its sigma", ratio=ratio))
     for name, error in predicted.depth.items():
         if error.rms_m is not None:
             size = f"{1e3 * error.rms_m:.3g} mm RMS"
@@ -185,7 +201,7 @@ def instrument_misfits(
 def _misfit(
     what: str, declared_size: str, ratio: Array, size: str = ""
 ) -> InstrumentMisfit:
-    """Return the misfit of one instrument.
+    """Return the misfit of one instrument; its RMS is that of the values that are finite.
 
     Parameters
     ----------
@@ -266,7 +282,15 @@ def nearest_recording_error(
 ) -> CopyError | str:
     """Return how well the nearest fitted recording's measurements predict a recording.
 
-    Measurements are compared sample by sample, at equal times after the start.
+    Measurements are compared sample by sample, at equal times after the start. The nearest one has
+    the smallest RMS of the markers, or of the forces if no markers are compared.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Recording to predict.
+    fitted : iterable of Experiment
+        Fitted recordings.
 
     Returns
     -------

@@ -131,8 +131,8 @@ def _provenance(problem: Problem) -> Provenance:
 
 
 def _reference_sentences(problem: Problem) -> Iterator[str]:
-    """Yield what the values refer to: the damping law of γ_r, and how moduli are scaled without a
-    force.
+    """Yield up to two sentences on what the values refer to: the damping law of γ_r if a body has
+    it, and how moduli are scaled if no force is measured.
     """
     parts = [part for body in problem.bodies for part in body.parts]
     laws = dict.fromkeys(
@@ -317,8 +317,9 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
 
 
 def _forward_results(answer: SolvedProblem) -> ForwardResult:
-    """Return the errors of the forward simulations of all experiments, and RMS and maximum over the
-    markers of fitted ones (None without markers).
+    """Return the errors of the forward simulations of all experiments, with the RMS over all marker
+    samples and the maximum over the fitted ones; both None if none of these has markers and a
+    simulation.
     """
     experiments = {}
     squares = []
@@ -387,7 +388,9 @@ def _forward_result(
 
 
 def _nuisance(answer: SolvedProblem) -> dict[str, dict[str, NuisanceResult]]:
-    """Return the nuisance parameters, without the places of markers, by experiment and label."""
+    """Return the nuisance parameters with priors and standard errors (None without error bars),
+    without the places of markers, by experiment and label.
+    """
     deviations = (
         answer.uncertainty.nuisance if answer.uncertainty is not None else {}
     )
@@ -407,8 +410,8 @@ def _nuisance(answer: SolvedProblem) -> dict[str, dict[str, NuisanceResult]]:
 
 
 def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
-    """Yield sentences on how far places differ from the given ones, and on the accuracy of unknown
-    ones.
+    """Yield up to two sentences on the places of markers: how far stated ones with a prior moved,
+    and how accurately unknown ones are estimated. `places` are by name of the marker.
     """
     moved = {
         n: place.displacement_m or 0.0
@@ -440,11 +443,12 @@ def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
 def _nuisance_sentences(
     part: ExperimentIterate, answer: SolvedProblem
 ) -> Iterator[str]:
-    """Yield sentences on the nuisance parameters of an experiment but the places, with estimate and
-    prior.
+    """Yield sentences on the nuisance parameters of an experiment except the places, with estimate
+    and prior.
 
-    By `NuisanceRow.by`, a kind has a sentence on its longest vector, on the value farthest from its
-    prior, or on each of its values.
+    `NuisanceRow.by` decides for each kind: "length" gives one sentence on the longest of its
+    vectors, "worst" one on the value farthest from its prior, in standard deviations, anything else
+    one on each value.
     """
     nuisance = part.segment.nuisance
     values = part.phi * nuisance.scales

@@ -33,7 +33,8 @@ from .prediction import CopyError, PredictionErrors
 class ReportedEstimate(Estimate):
     """A parameter or derived modulus as it is reported; derived moduli have no `guess`.
 
-    `value` is corrected for the known discretisation error, and `statistical95` is centred on it.
+    `value` is corrected for the known discretisation error and for known effects, and
+    `statistical95` is centred on it.
 
     Attributes
     ----------
@@ -72,11 +73,13 @@ class ReportedEstimate(Estimate):
     tied: bool | None = optional()
 
     def at_optimum(self, name: str, *, linear: bool) -> Estimate:
-        """Return the estimate before the correction of the discretisation error.
+        """Return the estimate before the correction of the discretisation error: with the value
+        `optimum`, and the statistical interval and standard error moved with it.
 
         Parameters
         ----------
         name : str
+            Name of the estimate, which decides its coordinate.
         linear : bool
             Whether the parameter is its own coordinate, see `IntervalCoordinate`.
         """
@@ -88,7 +91,7 @@ class ReportedEstimate(Estimate):
             optimum = self.value if self.optimum is None else self.optimum
             return replace(self._statistical, value=optimum)
         at = IntervalCoordinate.for_estimate(
-            name, (self.value, self.optimum, *self.statistical95), linear
+            name, (self.value, self.optimum, *self.statistical95), linear=linear
         )
         correction = at.from_value(self.value) - at.from_value(self.optimum)
         low, high = (
@@ -127,7 +130,9 @@ class ReportedEstimate(Estimate):
 
     @property
     def systematic_std_error(self) -> float | None:
-        """Part of the combined standard uncertainty that is not statistical; None if unknown."""
+        """Part of the combined standard uncertainty that is not statistical, √(combined² −
+        statistical²), at least 0; None if one of the two is unknown.
+        """
         if (
             self.combined_std_error is None
             or self.statistical_std_error is None
@@ -144,9 +149,9 @@ class NuisanceResult:
     Attributes
     ----------
     value : float
-        In its unit.
+        Estimate, in the unit that its label states.
     prior : float
-        Standard deviation of its prior.
+        Standard deviation of its prior, in the same unit.
     std_error : float or None
         Statistical standard error; None without error bars.
     """
@@ -163,6 +168,7 @@ class FieldResult:
     Attributes
     ----------
     shapes : FieldResolution
+        Number of shapes, and how much of the prior variance they represent.
     range : (least, most)
         Range of its values in the elements.
     determined_share : float or None
@@ -230,6 +236,7 @@ class RecordingsAgreement:
     chi_squared : float
         χ² of their differences.
     degrees_of_freedom : int
+        Number of recordings that determine the parameter, less one, at least 0.
     disagree : bool
         Whether the differences are significant.
     """
@@ -256,6 +263,7 @@ class ProfileResult:
     threshold : float
         Rise of the loss at the ends of the interval.
     sentence : str
+        Result in words.
     """
 
     interval: tuple[float | None, float | None]
@@ -269,7 +277,33 @@ class ProfileResult:
 class UncertaintyResult:
     """Statistics behind the error bars.
 
-    Matrices refer to the logarithms (or other coordinates) of the parameters in `names`.
+    Matrices refer to the logarithms (or other coordinates) of the k parameters in `names`;
+    coefficients of fields are left out.
+
+    Attributes
+    ----------
+    noise : {"given", "estimated", "by-marker"}
+        Source of the variance: stated σ, one common factor, or one factor for each marker.
+    errors : {"independent", "autocorrelated"}
+        Correlation of the errors.
+    reduced_chi_squared : float
+        χ² over the degrees of freedom.
+    noise_factors : mapping of str to float
+        Standard deviation of the errors of each marker or other observable over σ, by name.
+    autocorrelation : float
+        Autocorrelation of the residuals between consecutive samples.
+    names : tuple of str
+        Estimated parameters.
+    correlation, covariance : (k, k) arrays
+        Statistical correlation and covariance.
+    quantiles : (k,) array
+        Half width of a 95 % interval over the standard error.
+    verdicts : tuple of str
+        Sentences on what the data determine.
+    recordings : mapping of str to RecordingsAgreement, or None
+        Agreement of the recordings, by parameter; None if it was not evaluated.
+    profiles : mapping of str to ProfileResult
+        Requested profile likelihoods, by parameter.
     """
 
     noise: str
@@ -301,7 +335,9 @@ class ScanResult:
     samples : int
         Number of samples that were simulated.
     time_s : float
+        Duration of the scan.
     sentence : str
+        Result in words.
     """
 
     reason: str
@@ -324,6 +360,7 @@ class FittedExperiment:
     samples, missing : int
         Numbers of marker samples that are present, and that are missing.
     static : bool
+        Whether it is a series of equilibria.
     notes : tuple of str
         Sentences on the nuisance parameters of this recording.
     wrench_rms_n, wrench_rms_nm, reading_rms
@@ -369,6 +406,7 @@ class FitResult:
     rms_m, noise_rms_m : float
         RMS distance of all markers, and that expected from the stated noise.
     experiments : mapping of name to FittedExperiment
+        Residuals of each fitted experiment.
     wrench_rms_n, wrench_rms_nm : float or None
         RMS differences of all forces and torques.
     symmetry : mapping of experiment to int, optional
@@ -396,7 +434,12 @@ class SimulatedExperiment:
     failed : str, optional
         Why there is no simulation.
     rms_m, max_m : float, optional
-        RMS and largest distance of the markers.
+        RMS and largest distance of the markers [m]; 0 without markers.
+    wrench_rms_n, wrench_rms_nm, reading_rms
+        RMS differences of forces [N], torques [N m] and custom sensors, by name; None if not
+        measured.
+    reading_unit : mapping of name to str, optional
+        Units of the custom sensors that state one.
     nuisance, places_m : mapping, optional
         Nuisance parameters and marker places that were fitted to a recording for validation.
     depth : mapping of depth camera to DepthError
@@ -429,8 +472,14 @@ class SimulatedExperiment:
 
 @dataclass(frozen=True)
 class ForwardResult:
-    """Forward simulations with the estimates; RMS and largest distance of the fitted experiments'
-    markers.
+    """Forward simulations with the estimates.
+
+    Attributes
+    ----------
+    rms_m, max_m : float or None
+        RMS and largest distance of the markers of all fitted experiments; None without any.
+    experiments : mapping of name to SimulatedExperiment
+        Results of each experiment, also of those for validation.
     """
 
     rms_m: float | None
@@ -440,8 +489,16 @@ class ForwardResult:
 
 @dataclass(frozen=True)
 class DynamicsResult:
-    """Residuals of the equations of motion: largest force [N], relative to other forces, and
-    where.
+    """Residuals of the equations of motion.
+
+    Attributes
+    ----------
+    max_violation_n : float
+        Largest residual [N].
+    max_violation_relative : float
+        Largest residual relative to the largest other force.
+    largest : tuple of str
+        Sentences on where the residual is largest.
     """
 
     max_violation_n: float
@@ -451,7 +508,21 @@ class DynamicsResult:
 
 @dataclass(frozen=True)
 class ProgramSize:
-    """Size of the discretised problem and its scheme."""
+    """Size of the discretised problem and its scheme.
+
+    Attributes
+    ----------
+    nodes, elements : int
+        Numbers of nodes and elements of all bodies.
+    substeps : int
+        Time steps per sample.
+    timesteps : int
+        Time steps of all fitted experiments.
+    variables, constraints : int
+        Size of the nonlinear program.
+    scheme : str
+        Name of the time scheme.
+    """
 
     nodes: int
     elements: int
@@ -464,7 +535,18 @@ class ProgramSize:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Software, platform and problem files from which the result was made."""
+    """Software, platform and problem files from which the result was made.
+
+    Attributes
+    ----------
+    version, casadi, numpy, python, platform : str
+        Versions of this package, CasADi, NumPy and Python, and the platform.
+    problem_file, problem_sha256 : str or None
+        Path of the problem file and hash of its text as it was run; None for a problem without a
+        file.
+    mesh_sha256 : tuple of str
+        Hash of the mesh of each body.
+    """
 
     version: str
     casadi: str
@@ -500,10 +582,59 @@ class Elapsed:
 class Result:
     """The content of ``result.json``; the attributes are its keys.
 
-    `timing_s` is about the iterations of the method alone, `elapsed_s` about the whole run. `basis`
-    names what the values refer to: the damping law, and what sets the scale; `budget` has each
-    source's share of an estimate's variance; `deep_probes` are refits with an assumption relaxed
-    and, where requested, of parts of the data.
+    Attributes
+    ----------
+    schema : int
+        Version of the format.
+    status, message : str
+        How the search ended, as a keyword and as a sentence.
+    converged : bool
+        Whether an optimum was found.
+    missing : str
+        Checks that were left out after Ctrl-C; empty if all were done.
+    trust : Assessment
+        Verdict with its concerns.
+    method, title : str
+        Name of the method, and title of the problem.
+    parameters, derived : mapping of name to ReportedEstimate
+        All parameters, coefficients of fields included, and moduli that follow from them.
+    basis : tuple of str
+        Sentences on what the values refer to: the damping law, and what sets the scale.
+    budget : mapping of name to mapping of source to float
+        Share of each source in the variance of each estimate, largest first; empty without error
+        bars.
+    probes : tuple of Probe
+        Refits with an assumption relaxed and, where requested, of parts of the data.
+    places : mapping of experiment to mapping of marker to MarkerPlace
+        Estimated places of the markers on the undeformed body.
+    nuisance : mapping of experiment to mapping of label to NuisanceResult
+        Other nuisance parameters.
+    fields : mapping of name to FieldResult
+        Constants that vary in space.
+    uncertainty : UncertaintyResult or None
+        Statistics behind the error bars; None without error bars.
+    scan : ScanResult or None
+        Scan of the stiffness; None if there was none.
+    fit, rollout : FitResult, ForwardResult
+        Errors of the fit and of the forward simulations.
+    residuals : tuple of MarkerDiagnosis
+        Findings in the residuals.
+    dynamics : DynamicsResult
+        Residuals of the equations of motion.
+    iterations, evaluations : int
+        Numbers of iterations and of evaluations of the search.
+    timing_s : Timing
+        Time of the method's iterations alone.
+    elapsed_s : Elapsed
+        Time of the complete run.
+    problem : ProgramSize
+        Size of the discretised problem.
+    notes : tuple of str
+        Notes on the problem, the solve and its uncertainty.
+    history : tuple of Iteration
+        Iterations of the search.
+    provenance : Provenance
+        Software and files.
     """
 
     schema: int
@@ -544,6 +675,7 @@ class Result:
         Parameters
         ----------
         run : str or Path
+            The run folder.
         expected : str
             What is expected, for the message if the folder has no result.
 
@@ -583,7 +715,8 @@ class Result:
         return {name: error for name, error in errors if error is not None}
 
     def problem_folder(self, run: str | Path, purpose: str) -> Path:
-        """Return the folder of the problem file.
+        """Return the folder of the problem file that the run was made from; whether it still exists
+        is not checked.
 
         Parameters
         ----------

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from ..methods.initial_trajectories import associated_at_guess
 from ..methods.reduced_space import ReducedSpace
-from ..methods.solution import Method, Solution, Status, Watch
+from ..methods.solution import Method, Solution, Status
 from ..methods.stiffness_scan import Scan
 from ..program.collocation import Collocation
 
@@ -46,7 +46,9 @@ class CompletedStart:
 
 
 def has_local_minima(collocation: Collocation) -> bool:
-    """Return whether correspondences of measurements change during the search."""
+    """Return whether a fitted experiment has a depth camera, whose correspondences change during
+    the search and can make local minima.
+    """
     return any(segment.depths for segment in collocation.transcriptions)
 
 
@@ -75,10 +77,9 @@ def follow_starts(
     solver: Method,
     collocation: Collocation,
     scan: Scan,
-    watch: Watch | None,
     solve: Solve,
 ) -> CompletedStart:
-    """Follow the starts of a scan to convergence and return the one with the lowest loss.
+    """Follow the starts of a scan to convergence and return the one with the lowest `robust_loss`.
 
     The best start of the scan is returned without a solution if the scan found only one start, if
     the problem has no local minima, if no start converges, or after an interrupt; an interrupted
@@ -92,8 +93,7 @@ def follow_starts(
     collocation : Collocation
         With the guesses of the scan's best stiffness.
     scan : Scan
-    watch : callable, optional
-        Called with every iteration.
+        Scan with its starts; not modified.
     solve : callable
         ``solve(method, collocation)``, with renewed correspondences.
     """

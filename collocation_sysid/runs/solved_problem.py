@@ -59,7 +59,9 @@ class SolvedProblem:
     Attributes
     ----------
     problem : Problem
+        The problem that was solved.
     solution : Solution
+        Its solution, converged or not.
     rollouts : mapping of experiment name to ForwardSimulation or str
         Forward simulations, or the reason why there is none.
     uncertainty : Uncertainty or None
@@ -73,7 +75,7 @@ class SolvedProblem:
     causes : tuple of Hypothesis
         Likely errors in the description of the problem, likeliest first.
     refinement : Refinement or None
-        Discretisation errors: from solves at finer discretisations if requested, else the
+        Discretisation errors of the estimates: from solves at finer discretisations if requested, else the
         first-order effect of the step from finer forward simulations; None where these are missing.
     omitted_checks : str
         Checks that were left out after Ctrl-C; empty if all were done.
@@ -122,7 +124,7 @@ class SolvedProblem:
 
     @property
     def start_parameters(self) -> Parameters:
-        """The parameters with the guesses that the search started from."""
+        """Parameters with the guesses from which the search that led to the solution started."""
         return self.solution.collocation.parameters
 
     @cached_property
@@ -138,7 +140,9 @@ class SolvedProblem:
 
     @cached_property
     def estimates(self) -> dict[str, ReportedEstimate]:
-        """Parameters and derived moduli with their combined and statistical intervals, by name."""
+        """Parameters, also fixed ones, coefficients of fields and derived moduli with their
+        combined and statistical intervals, by name.
+        """
         return {
             name: self._report_estimate(name, each)
             for name, each in self.optimum.items()
@@ -149,6 +153,13 @@ class SolvedProblem:
     ) -> ReportedEstimate:
         """Return the estimate to report: corrected for the known discretisation error and known
         effects, with combined and statistical uncertainties.
+
+        Parameters
+        ----------
+        name : str
+            Name of a parameter or derived modulus.
+        optimum : Estimate
+            Its estimate at the optimum of the discretised problem.
         """
         item = next(
             (each for each in self.start_parameters.items if each.name == name),
@@ -166,8 +177,8 @@ class SolvedProblem:
         combined = combine(
             name,
             optimum,
-            error,
-            systematic,
+            error=error,
+            systematic=systematic,
             known_effect=known_effect,
             linear=linear,
             bounds=bounds,
@@ -197,8 +208,8 @@ class SolvedProblem:
         return budget(
             self.systematic_effects,
             self.uncertainty,
-            self.discretisation_errors,
-            self.start_parameters,
+            numerical=self.discretisation_errors,
+            parameters=self.start_parameters,
         )
 
     @property
@@ -208,7 +219,8 @@ class SolvedProblem:
 
     @cached_property
     def optimum(self) -> dict[str, Estimate]:
-        """Parameters and derived moduli at the optimum of the discretised problem, by name.
+        """Parameters, also fixed ones, and derived moduli at the optimum of the discretised
+        problem, by name.
 
         They have statistical intervals where `uncertainty` has; the others have a value alone.
         """
@@ -222,8 +234,8 @@ class SolvedProblem:
 
     @cached_property
     def places(self) -> dict[str, dict[str, MarkerPlace]]:
-        """Estimated places of the markers on the undeformed body, by fitted experiment and by
-        marker.
+        """Estimated places of the markers on the undeformed body, by name of the fitted experiment
+        and of the marker; see `marker_places`.
         """
         named = (
             (part.segment.experiment.name, part) for part in self.solution.parts
@@ -234,7 +246,11 @@ class SolvedProblem:
 
     @cached_property
     def trust(self) -> Assessment:
-        """Verdict (good, check or doubtful) with its concerns."""
+        """Verdict (good, check or doubtful) with its concerns.
+
+        After an interruption it is doubtful, and contains concerns about the solution only if the
+        error bars were computed.
+        """
         of_fit = solution_concerns(
             self.solution,
             self.rollouts,
@@ -277,7 +293,9 @@ class SolvedProblem:
 
     @property
     def _discretisation_corrections(self) -> dict[str, float]:
-        """Factors from optimum to reported value of the estimated parameters, without fields."""
+        """Ratio of the reported value to the optimum of each estimated parameter, without fields,
+        by name; 1 if the optimum is zero.
+        """
         return {
             item.name: each.value / each.optimum if each.optimum else 1.0
             for item in self.start_parameters.free
@@ -287,8 +305,8 @@ class SolvedProblem:
 
     @cached_property
     def modes_by_experiment(self) -> dict[str, ModesCheck]:
-        """Natural modes of the body at the estimates, by experiment; only motions, empty if not
-        converged.
+        """Natural modes of the body at the estimates, by name of the experiment; without static
+        experiments and those without an equilibrium. Empty if the solve did not converge.
         """
         return modes_by_experiment(self.problem, self.solution)
 
@@ -310,8 +328,8 @@ class SolvedProblem:
 
     @property
     def noise_rms_m(self) -> float:
-        """RMS distance of the fitted markers that is expected from noise with the stated
-        sigma_m.
+        """RMS distance [m] of the fitted markers that is expected from noise with the stated
+        `sigma_m`, less what the fitted parameters absorb.
         """
         return expected_rms_m(self.solution, self.uncertainty)
 
@@ -389,7 +407,13 @@ class SolvedProblem:
         }
 
     def _estimate(self, name: str) -> ReportedEstimate:
-        """Return an estimate by name; an `InputError` for an unknown name."""
+        """Return the estimate with a name.
+
+        Raises
+        ------
+        InputError
+            For an unknown name, with the known ones.
+        """
         if name not in self.estimates:
             known = list(self.estimates)
             expected = (
@@ -400,8 +424,8 @@ class SolvedProblem:
 
     @property
     def all_notes(self) -> tuple[str, ...]:
-        """Notes on the solve and its uncertainty, sentences on what the data determine, and the
-        messages of profiles; each note once.
+        """Notes on the solve, and with error bars also those on the uncertainty, sentences on what
+        the data determine, and the messages of profiles. Notes that are equal appear once.
         """
         if self.uncertainty is None:
             return self.notes

@@ -56,6 +56,7 @@ def solve(
     Parameters
     ----------
     problem : Problem
+        Problem to solve; not modified.
     method : str or Method, optional
         A name, or a callable that solves a `Collocation`, such as a method with other options; the
         problem's own by default.
@@ -155,8 +156,29 @@ def _solve_once(
     watch: Watch | None,
     workers: ExperimentExecutor | None,
 ) -> Solution:
-    """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier
-    solution.
+    """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier solution.
+
+    If the search from guesses fails, a scan follows; if it converges near ν = ½ in reduced space
+    and without an earlier solution, a second start is tried.
+
+    Parameters
+    ----------
+    problem : Problem
+    start : str, Path, WarmStart or None
+        Earlier solution or its run folder; None for the guesses of the problem, or a scan if it
+        lacks some.
+    solver : Method
+        Method to use.
+    watch : callable or None
+        Called with every iteration.
+    workers : ExperimentExecutor or None
+        Workers for reduced space; None for this process.
+
+    Raises
+    ------
+    InputError
+        If the start is unsuitable or none is found, if the machine lacks memory, or if the method
+        refuses the problem.
     """
     warm_start = (
         WarmStart.read(start) if isinstance(start, (str, Path)) else start
@@ -190,7 +212,6 @@ def _solve_once(
                 solver,
                 collocation,
                 scan=scan,
-                watch=watch,
                 solve=lambda by, of: solve_with_renewed_correspondences(
                     by, of, watch=watch
                 ),
@@ -281,6 +302,7 @@ def _solve_from_scan(
     Parameters
     ----------
     solver : Method
+        Method to use.
     failed : Solution
         The failed search.
     watch : callable or None
@@ -314,6 +336,15 @@ def _best_of_second_start(
 
     Without a second start the first solution is returned; after an interrupt it is returned as
     interrupted.
+
+    Parameters
+    ----------
+    solver : Method
+        Method to use.
+    first : Solution
+        Converged solution.
+    watch : callable or None
+        Called with every iteration of the second search.
     """
     other = second_start_parameters(first)
     if other is None:
@@ -347,7 +378,9 @@ def solve_with_renewed_correspondences(
     Parameters
     ----------
     solver : Method
+        Method to use.
     collocation : Collocation
+        Program with guesses; not modified.
     watch : callable or None
         Called with every iteration.
     start : (variables,) array, optional
@@ -378,10 +411,12 @@ LAME = ("young_pa", "poisson", "lambda_pa", "mu_pa")
 
 
 def second_start_parameters(solution: Solution) -> Parameters | None:
-    """Return the parameters at a solution with high Poisson's ratios replaced by the usual one.
+    """Return the parameters at a solution, as guesses, with high Poisson's ratios replaced by the
+    usual one at the same Young's modulus.
 
-    Only estimated ratios count, of regions in which both moduli are estimated. None if no ratio is
-    high or a parameter with one is at a bound.
+    A ratio is high above `NEARLY_INCOMPRESSIBLE`. Only ratios of regions count in which both
+    moduli, or the ratio alone, are estimated. None if no ratio is high, or if a replaced value is
+    not within its bounds.
     """
     collocation = solution.collocation
     values = parameter_values(solution.collocation, solution.q)
@@ -406,8 +441,9 @@ def second_start_parameters(solution: Solution) -> Parameters | None:
 
 
 def _usual_modulus(name: str, young_pa: float) -> float:
-    """Return the starting value of one of the `LAME` constants: `USUAL_POISSON` for a Poisson's
-    ratio, or the modulus [Pa] that follows from it and from Young's modulus.
+    """Return the starting value of the constant `name`, one of the `LAME` constants with its
+    region: `USUAL_POISSON` for a Poisson's ratio, or the modulus [Pa] that follows from it and from
+    Young's modulus `young_pa`.
     """
     value = (
         USUAL_POISSON

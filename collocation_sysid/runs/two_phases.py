@@ -62,7 +62,7 @@ FEWEST_ELEMENTS = 2
 
 @dataclass(frozen=True, eq=False)
 class _PhaseSearch:
-    """The two-phase field of a problem, and the names of its parameters.
+    """Two-phase field of a problem, and the names of its parameters.
 
     Attributes
     ----------
@@ -71,6 +71,7 @@ class _PhaseSearch:
     contrast : str
         Name of the contrast.
     modes : TwoPhaseModes
+        Shapes of the field.
     number : int
         Index of the part in the body.
     elements : tuple of str
@@ -91,6 +92,7 @@ class _SmoothFitQuality:
     Attributes
     ----------
     chi_squared : float
+        χ² of the measurements.
     misfit : float
         χ² per measurement.
     determined : float
@@ -128,6 +130,10 @@ def solve_two_phases(
     """Solve a problem with a two-phase field; the body of the solution has the phases and their
     samples.
 
+    If the smooth field or the first solve with phases does not converge, that solution is returned,
+    without samples. A later round that does not converge or does not decrease χ² ends the rounds,
+    and the best solution counts.
+
     Parameters
     ----------
     problem : Problem
@@ -135,7 +141,8 @@ def solve_two_phases(
     start : str, Path or WarmStart, optional
         Start of the solve with the smooth field.
     solve_once : callable
-        ``solved(problem, start)``, the solution of a problem with given phases or a smooth field.
+        ``solve_once(problem, start)``, the solution of a problem with given phases or a smooth
+        field.
 
     Raises
     ------
@@ -236,7 +243,20 @@ def _solve_with_phases(
     warm_start: WarmStart,
     solve_once: SolveOnce,
 ) -> Solution:
-    """Solve with given phases, from the parameters of an earlier answer."""
+    """Return the solution of a problem with given phases, from the parameters of an earlier answer.
+
+    Parameters
+    ----------
+    problem : Problem
+    search : _PhaseSearch
+        Its two-phase field.
+    phase : (E,) array
+        Phases of the elements: 1 in inclusions, 0 elsewhere.
+    warm_start : WarmStart
+        Estimates to start from.
+    solve_once : callable
+        See `solve_two_phases`.
+    """
     own = replace(search.modes, phase=phase)
     return solve_once(problem.with_fields({search.name: own}), warm_start)
 
@@ -280,8 +300,11 @@ def _two_phase_search(problem: Problem) -> _PhaseSearch:
 
 
 def _likelier_phases(probability: Array) -> Array:
-    """Return the likelier phase (E,) of every element, from the probability (E,) of an inclusion;
-    each phase has at least `FEWEST_ELEMENTS` elements.
+    """Return the likelier phase (E,) of every element, 1 for an inclusion and 0 otherwise, from the
+    probability (E,) of an inclusion.
+
+    Each phase has at least `FEWEST_ELEMENTS` elements: if necessary, those that are nearest to it
+    in probability are added.
     """
     phase = is_inclusion(probability).astype(float)
     order = np.argsort(probability)
@@ -299,11 +322,13 @@ class _LinearisedMeasurements:
     Attributes
     ----------
     fit : LinearisedFit
+        Fit with the elements' logarithms as further parameters.
     columns : (E,) int array
         Columns of the elements' logarithms in the fit.
     base : (E,) array
         Logarithms relative to the mean at which the measurements are linearised.
     faces : InternalFaces
+        Faces between elements of the part.
     deviation : float
         Prior standard deviation of the logarithm of the contrast.
     """
@@ -332,6 +357,14 @@ def _linearise_in_elements(
 ) -> _LinearisedMeasurements:
     """Return the measurements linearised at a solution with the logarithm of the constant in every
     element as a parameter, instead of the shapes of the field.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem with the two-phase field `search`.
+    search : _PhaseSearch
+    solution : Solution
+        Solution with a smooth field or with phases.
     """
     body = _two_phase_body(solution, search)
     part = body.parts[search.number]
@@ -368,9 +401,11 @@ def _samples(
     Parameters
     ----------
     draws : PosteriorDraws
+        Draws of phases and contrasts.
     fit : LinearisedFit
         Fit with the elements' logarithms as further parameters.
     search : _PhaseSearch
+        The two-phase field.
     solution : Solution
         Its estimates are the mean of the other parameters.
 
@@ -407,9 +442,17 @@ def _samples(
 def _fit_with_elements(
     problem: Problem, solution: Solution, search: _PhaseSearch
 ) -> LinearisedFit:
-    """Return the linearised fit at a solution, with the elements' logarithms as further parameters.
+    """Return the linearised fit at a solution, with the elements' logarithms as further parameters,
+    whose values are zero.
 
-    The values of these parameters are zero.
+    Parameters
+    ----------
+    problem : Problem
+        Problem whose field is an `ElementLogarithms`.
+    solution : Solution
+        Solution that gives positions and all other parameters.
+    search : _PhaseSearch
+        Names of the elements' logarithms.
     """
     solved = solution.collocation
     elements = set(search.elements)

@@ -66,12 +66,15 @@ def solution_concerns(
     Parameters
     ----------
     solution : Solution
+        Solution, converged or not.
     rollouts : mapping of experiment name to ForwardSimulation or str
         Forward simulations, or the reason why there is none.
     motions : iterable of ModesCheck
         Natural modes at the estimates.
     uncertainty : Uncertainty or None
+        Statistical uncertainty; None without error bars.
     diagnoses : sequence of MarkerDiagnosis
+        Findings in the residuals.
     """
     status = solution.status
     yield from body_concerns(solution)
@@ -90,7 +93,7 @@ def solution_concerns(
     for part in solution.parts:
         nuisance = part.segment.nuisance
         low, high = nuisance.bounds(part.segment.association.clock_samples)
-        # A lag and a tool may well be none.
+        # Zero is a plausible value of a lag or a tool's mass, although it is a bound.
         low = np.where(low == 0, -np.inf, low)
         yield from nuisance_concerns(
             nuisance.names, part.phi, low=low, high=high
@@ -152,17 +155,20 @@ def combined_concerns(
     estimates: Mapping[str, ReportedEstimate],
     shares: Mapping[str, Mapping[str, float]],
 ) -> list[Concern]:
-    """Return a concern for each estimated parameter whose combined interval is wider than its
-    value, or that has a budget but no interval.
+    """Return a concern for each estimated parameter that has a budget and whose combined interval
+    is wider than its value or missing.
 
     Derived moduli give none: λ of a nearly incompressible material is rarely determined.
 
     Parameters
     ----------
     parameters : Parameters
+        Parameters, of which the estimated ones count.
     estimates : mapping of name to ReportedEstimate
+        Estimates of all of them.
     shares : mapping of name to mapping of source to float
-        Shares of the variance in the budget, largest first.
+        Shares of the variance in the budget, largest first; parameters without an entry are left
+        out.
     """
     return [
         _undetermined_concern(
@@ -176,7 +182,9 @@ def combined_concerns(
 def _undetermined_concern(
     name: str, estimate: ReportedEstimate, shares: Mapping[str, float]
 ) -> Concern:
-    """Return the concern about an undetermined estimate, with the largest share of its budget."""
+    """Return the concern about the undetermined estimate `name`, with the first, largest share of
+    its budget `shares`, which must not be empty.
+    """
     source, share = next(iter(shares.items()))
     low, high = estimate.combined95 or (np.nan, np.nan)
     data = {
@@ -194,8 +202,8 @@ def _undetermined_concern(
 
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:
-    """Yield concerns about implausible sizes and densities, implausible stiffness, and unknown
-    scale.
+    """Yield concerns about implausible sizes and densities, or else about an implausible stiffness
+    at the estimates, of each fitted body, and about an unknown scale of the moduli.
     """
     for body in dict.fromkeys(
         segment.body for segment in solution.collocation.transcriptions
@@ -252,8 +260,8 @@ def _prediction_concerns(
 def _unseen_depth_concerns(
     name: str, rollout: ForwardSimulation | str
 ) -> Iterator[Concern]:
-    """Yield a concern for each depth camera without a point within its gate of the simulated
-    surface; none if the simulation failed.
+    """Yield a concern for each depth camera of the experiment `name` without a point within its
+    gate of the simulated surface; none if the simulation failed (`rollout` is its reason).
     """
     for camera, error in (
         rollout.depth.items() if isinstance(rollout, ForwardSimulation) else ()
@@ -276,14 +284,19 @@ def _forward_concerns(
     """Return concerns about the forward simulation of an experiment: that it failed, or that its
     errors are larger than the noise and the residuals of the fit.
 
+    Forces and depth are compared only for experiments that were not fitted, and only if their
+    markers give no concern.
+
     Parameters
     ----------
     name : str
         Name of the experiment.
     rollout : ForwardSimulation or str
+        Forward simulation, or why there is none.
     solution : Solution
+        Solution with the residuals of the fit.
     noise_m : float
-        Expected RMS distance of the markers by their noise.
+        Expected RMS distance of the markers by their noise [m].
     """
     fit_rms_m = solution.rms_by_experiment_m
     if not isinstance(rollout, ForwardSimulation):
@@ -321,8 +334,8 @@ def _forward_concerns(
 def _depth_concerns(
     name: str, rollout: ForwardSimulation, solution: Solution
 ) -> Iterator[Concern]:
-    """Yield concerns about predicted depth, against the larger of the fitted residuals and the
-    noise.
+    """Yield concerns about the predicted depth of the experiment `name`, in stated σ without
+    outliers, against the larger of the fitted residuals of all cameras and the noise.
     """
     fitted = [error.tame_sigmas for error in depth_errors(solution).values()]
     yardstick = max(1.0, root_mean(np.square(fitted)) if fitted else 0.0)
@@ -337,8 +350,8 @@ def _depth_concerns(
 
 
 def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
-    """Return the distances of depth cameras' points from the fitted surface, by (experiment,
-    camera).
+    """Return the distances of depth cameras' points from the fitted surface, by names of experiment
+    and camera; empty without depth cameras.
     """
     return {
         (
@@ -346,7 +359,7 @@ def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
             reading.correspondences.camera.depth.name,
         ): (
             SurfaceComparison.from_fit(
-                reading, part.x, observation, part.phi
+                reading, part.x, values=observation, phi=part.phi
             ).error
         )
         for part in solution.parts
@@ -358,7 +371,13 @@ def expected_rms_m(
     solution: Solution, uncertainty: Uncertainty | None
 ) -> float:
     """Return the RMS distance [m] of the fitted markers that is expected from noise with the stated
-    σ, less what the fitted parameters absorb; without `uncertainty` they absorb nothing.
+    σ, less what the fitted parameters absorb.
+
+    Parameters
+    ----------
+    solution : Solution
+    uncertainty : Uncertainty or None
+        Its degrees of freedom say how much the parameters absorb; for None they absorb nothing.
     """
     markers = [
         segment.experiment.markers
@@ -385,7 +404,8 @@ def modes_by_experiment(
     """Return the natural modes of each body at the estimates, by experiment; empty if the search
     failed.
 
-    Static experiments, and those without an equilibrium, are left out.
+    All moving experiments of the problem count, also those for validation; those without an
+    equilibrium of the body are left out.
     """
     motions = {}
     substeps = solution.collocation.substeps

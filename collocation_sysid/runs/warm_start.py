@@ -59,12 +59,13 @@ class WarmStart:
 
     @classmethod
     def from_result(cls, result: Result, folder: Path) -> WarmStart:
-        """Return the estimates of a result.
+        """Return the estimates of a result at its optimum, that is without the correction for
+        discretisation errors.
 
         Raises
         ------
         InputError
-            If a value is not finite.
+            If a value is not finite; `folder` is named in the message.
         """
         both = {**result.parameters, **result.derived}
         # The optimum solves the equations of the trajectory in the folder, not the corrected value.
@@ -98,11 +99,19 @@ class WarmStart:
             )
             if not np.isfinite(all_values).all():
                 raise ValueError("a value that is not finite")
-        return cls(folder, values, nuisance, places_m, result.problem.substeps)
+        return cls(
+            folder,
+            values,
+            nuisance=nuisance,
+            places_m=places_m,
+            substeps=result.problem.substeps,
+        )
 
     @classmethod
     def of(cls, solution: Solution) -> WarmStart:
-        """Return the estimates of a solution."""
+        """Return the estimates of a solution in memory, without the correction for discretisation
+        errors, also of one that has not converged.
+        """
         collocation = solution.collocation
         nuisance = {}
         places_m = {}
@@ -119,7 +128,13 @@ class WarmStart:
                 zip(markers, places, strict=True)
             )
         values = parameter_values(collocation, solution.q)
-        return cls(Path(), values, nuisance, places_m, collocation.substeps)
+        return cls(
+            Path(),
+            values,
+            nuisance=nuisance,
+            places_m=places_m,
+            substeps=collocation.substeps,
+        )
 
     def apply_to_problem(self, problem: Problem) -> Problem:
         """Return the problem with these estimates as its guesses, clipped to its bounds.
@@ -146,7 +161,9 @@ class WarmStart:
         )
 
     def apply_to_places(self, collocation: Collocation) -> Collocation:
-        """Return the discretised problem with estimated markers starting at the earlier places."""
+        """Return the discretised problem in which markers whose place is estimated start at the
+        earlier places; markers without an earlier place keep theirs.
+        """
         places_m = []
         for segment in collocation.transcriptions:
             here = segment.marker_places_m(segment.guess_phi)
@@ -167,9 +184,11 @@ class WarmStart:
         }
 
     def apply_to_nuisance(self, collocation: Collocation) -> tuple[Array, int]:
-        """Return p at the guess with the earlier nuisance parameters, and the number of these.
+        """Return p, the guesses of parameters and nuisance parameters in the solver's coordinates,
+        with the earlier nuisance parameters, and the number of these.
 
-        Places of markers are those of the discretised problem.
+        Only nuisance parameters with the same experiment and label are replaced, and not limited to
+        their bounds. Places of markers are those of the discretised problem.
         """
         p = collocation.guess_p
         matches = 0

@@ -108,7 +108,7 @@ def test_a_motion_begins_and_ends_at_rest_where_it_began(waves):
         position, velocity, acceleration = motion.derivatives(
             [0.0, motion.duration_s]
         )
-        fastest = np.abs(motion.derivatives(motion.grid_s)[2]).max()
+        fastest = np.abs(motion.derivatives(motion.grid_s).second).max()
         assert np.abs(position).max() < 1e-12
         assert np.abs(velocity).max() < 1e-10
         assert np.abs(acceleration).max() < 1e-9 * fastest
@@ -133,7 +133,7 @@ def test_angular_velocity_and_acceleration_are_those_of_the_rotation():
 
     def velocity(t):
         before, after = (
-            Rotation.from_rotvec(motion.derivatives(t + s)[0][:, 3:])
+            Rotation.from_rotvec(motion.derivatives(t + s).value[:, 3:])
             for s in (-h, h)
         )
         return (after * before.inv()).as_rotvec() / (2 * h)

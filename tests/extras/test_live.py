@@ -659,8 +659,10 @@ def test_rows_between_frames_take_poses_from_a_cubic():
     for k, t in enumerate(t_s):
         if k != 5:
             rows += intake.add_frame(
-                t, (place(t), np.array([[0, 0, 0, 1.0]])), np.zeros((1, 3))
-            )[0]
+                t,
+                (place(t), np.array([[0, 0, 0, 1.0]])),
+                tracks_m=np.zeros((1, 3)),
+            ).rows
     found = np.array([row.poses[0][1][0] for row in rows])
     assert len(found) == 15
     expected = [place(0.005 * k)[0, 0] for k in range(15)]

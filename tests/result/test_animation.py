@@ -31,7 +31,11 @@ from collocation_sysid.result.animation import (
     film_samples,
 )
 from collocation_sysid.result.figure_style import GREEN
-from collocation_sysid.result.interactive_view import frame_files, view_run
+from collocation_sysid.result.interactive_view import (
+    export_page,
+    frame_files,
+    view_run,
+)
 from collocation_sysid.result.replay import read_run, run_headline
 from collocation_sysid.result.web_page import (
     Colouring,
@@ -118,7 +122,7 @@ def test_a_film_is_a_gif_in_the_run_folder_by_default(run, tmp_path):
 def test_the_simulation_is_drawn_as_edges_over_the_fit(run):
     _, (swing, nod) = read_run(run)
     film = FilmFigure(swing)
-    assert [name for name, *_ in film.drawings] == ["fitted", "simulated"]
+    assert [each.name for each in film.drawings] == ["fitted", "simulated"]
     film.show_sample(3)
     (*_, fitted, _), (*_, simulated, title) = film.drawings
     assert len(fitted.faces.get_facecolor()) > 1
@@ -159,7 +163,7 @@ def test_the_body_fills_a_large_part_of_the_frame(run):
     film = FilmFigure(swing)
     film.show_sample(3)
     corners = np.concatenate(
-        [path.vertices for path in film.drawings[0][3].faces.get_paths()]
+        [path.vertices for path in film.drawings[0].body.faces.get_paths()]
     )
     width, height = np.ptp(corners, axis=0)
     room = film.figure.axes[0].get_ylim()[1] - HEAD_HEIGHT_MM - FOOT_HEIGHT_MM
@@ -170,7 +174,7 @@ def test_the_film_says_how_far_the_markers_are_off(run):
     _, (swing, _) = read_run(run)
     film = FilmFigure(swing)
     film.show_sample(8)
-    *_, title = film.drawings[0]
+    title = film.drawings[0].title
     assert title.get_text() == "fitted: 0.00 mm"
     assert film.time_label.get_text() == "0.08 s"
 
@@ -378,6 +382,23 @@ def test_the_view_finds_the_frames(run):
     frames = frame_files(run, "swing")
     assert len(frames) == 9
     assert all(file.is_file() for _, file in frames)
+
+
+def test_an_experiment_for_validation_has_no_frames_of_another(run, tmp_path):
+    page = tmp_path / "page.html"
+    with pytest.raises(InputError, match="'nod' of this run has no"):
+        export_page(run, page, "nod", field="det_f")
+    assert not page.exists()
+    assert export_page(run, page, "nod").exists()
+
+
+def test_a_field_can_colour_the_simulated_body(run, tmp_path):
+    _, replays = read_run(run)
+    nod = next(each for each in replays if each.name == "nod")
+    values = np.ones((len(nod.t_s), len(nod.surface)))
+    colouring = Colouring.by_field("ones", values, trajectory="simulated")
+    file = write_page(nod, tmp_path / "page.html", colouring=colouring)
+    assert "1 ones" in file.read_text(encoding="utf-8")
 
 
 @pytest.mark.slow  # starting VTK takes longer than everything else here

@@ -43,8 +43,9 @@ NAME = "designed"
 SCHEMA = 1
 # Frame rate of the film [1/s], as of cinema.
 FRAMES_PER_SECOND = 25.0
-# What says how the files of a recording are read; those of a design are in the package's own form.
+# Keys of a grasp that describe the file of its poses: files of a design have the package's format.
 OF_POSES = MovedSection.model_fields.keys() - {"gripper_to_body"}
+# Keys of markers that describe their file.
 OF_MARKERS = (
     "names",
     "labels",
@@ -54,7 +55,7 @@ OF_MARKERS = (
     "template_window_s",
     "max_template_residual_m",
 )
-# Whose texts are files, wherever they stand.
+# Keys whose texts are names of files, in any table.
 OF_FILES = (
     "mesh",
     "surface",
@@ -64,7 +65,9 @@ OF_FILES = (
     "tension",
     "pressure",
 )
+# Keys of a wrench that describe its file.
 OF_TABLE = ("columns", "axis", "sign", "area_m2", "symmetry")
+# Keys of an experiment that select samples, or exclude it from the fit.
 OF_TIME = ("window_s", "resample_hz", "every", "validation")
 HEAD = """\
 # A designed motion, poses.csv, and the marker tracks that are predicted at the parameters' guesses.
@@ -81,10 +84,13 @@ def write_design(
 ) -> Path:
     """Write the folder of a design atomically, and return its path.
 
+    It contains the poses, the predicted markers and, with a sensor, the predicted wrench, pictures,
+    design.json, and, if the problem was read from a file, a problem file for the recording.
+
     Parameters
     ----------
     design : Design
-        Design.
+        Design to write.
     folder : str or Path
         Folder, which may contain an earlier design; that is replaced.
     with_film : bool
@@ -181,7 +187,9 @@ def design_json(design: Design) -> dict[str, Any]:
 
 
 def _error_bars_json(bars: ErrorBars) -> dict[str, Any]:
-    """Return value, error bars and their range over the draws, by parameter, for JSON."""
+    """Return value, standard error (in the unit of the value), relative error, and its range
+    (lowest, highest) over the draws, by parameter, for JSON.
+    """
     return {
         name: {
             "value": value,
@@ -216,8 +224,11 @@ def _gripper_poses(design: Design) -> PoseSequence:
 
 
 def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
-    """Return the content of a problem file in `folder` for the designed recording, with guesses at
-    the middle draw; existing recordings are kept only if they are used.
+    """Return the content of a problem file in `folder` for the designed recording.
+
+    Estimated parameters get guesses at the middle draw, coefficients of fields none. Existing
+    recordings are kept only if they are used (`Design.added`); the new one is named "designed", or
+    "designed_2" and so on if that name is used. The problem must have been read from a file.
     """
     origin = design.recording.problem.origin
     recording = design.recording

@@ -27,7 +27,9 @@ from .motion_design import Design
 
 
 def design_summary(design: Design, folder: Path) -> list[Shown]:
-    """Return a design on one screen, as lines and tables."""
+    """Return a design on one screen, as lines and tables: whether the search was interrupted, the
+    error bars, the limits that are reached, and the `folder` to which it was written.
+    """
     tried = len(design.best.history)
     interrupted = Line(
         f"interrupted: the best of the {tried} motions so far", "check"
@@ -72,7 +74,7 @@ def _error_table(design: Design) -> Table:
 
 
 def _percent(share: float) -> str:
-    """Return a relative error as text; empty for NaN."""
+    """Return a relative error as text in percent; empty for NaN, "not determined" from 1000 % on."""
     if np.isnan(share):
         return ""
     return f"{100 * share:.3g} %" if share < 10 else "not determined"
@@ -91,7 +93,7 @@ def _column_note(design: Design) -> str:
 
 
 def design_figures(design: Design) -> dict[str, Figure]:
-    """Return the figures of a design by file name."""
+    """Return the figures of a design by file name without suffix."""
     return {
         "motion": motion_picture(design),
         "error_bars": error_bars_picture(design),
@@ -99,7 +101,9 @@ def design_figures(design: Design) -> dict[str, Figure]:
 
 
 def motion_picture(design: Design) -> Figure:
-    """Draw shift and rotation vector over time, and how much of each limit they use."""
+    """Return a figure of translation and rotation vector over time, and of speeds and
+    accelerations as shares of their limits.
+    """
     figure = new_figure(PAGE_MM, 100)
     shift, turn, speed, growth = figure.subplots(2, 2, sharex=True).ravel()
     t_s = design.motion.grid_s
@@ -146,8 +150,8 @@ def motion_picture(design: Design) -> Figure:
 
 
 def error_bars_picture(design: Design) -> Figure:
-    """Draw the relative error bars before, if known, and after; lines show their range over the
-    draws of θ.
+    """Return a figure of the relative error bars before, if known, and after; lines show their
+    range over the draws of θ.
     """
     names = list(design.after.relative)
     figure = new_figure(PAGE_MM / 2, 14 + 9 * len(names))

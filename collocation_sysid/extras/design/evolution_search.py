@@ -14,16 +14,17 @@ import numpy as np
 
 from ...common.array_types import Array
 
-# Share of the evaluations that are drawn at random, and the first deviation about the best.
+# Share of the evaluations that are random samples, without a start.
 EXPLORED = 0.2
-# First standard deviation of the other coefficients about the best: each is of order one.
+# Initial standard deviation about the best random sample: coefficients are of order one.
 FIRST_DEVIATION = 0.5
-# The deviation about a start that is known to be good.
+# Initial standard deviation about a start, which is known to be good.
 SMALLEST_DISTANCE = 0.15
 
-# The value at coefficients; beyond the second number it need not be exact.
+# Function that returns the value at coefficients (d,); beyond the bound, the second argument, it
+# need not be exact.
 Value = Callable[[Array, float], float]
-# Called with the evaluations done and the smallest value.
+# Function that is called with the number of evaluations so far and the smallest value.
 Watch = Callable[[int, float], None]
 
 
@@ -69,11 +70,12 @@ def minimise(
     dimension : int
         Number of coefficients d.
     evaluations : int
-        Largest number of evaluations.
+        Number of evaluations, all of which are made; at least 1.
     seed : int
         Seed of the random numbers.
     watch : callable, optional
-        Function that is called with the number of evaluations and the smallest value.
+        Function that is called after each evaluation with the number of evaluations so far and the
+        smallest value.
     start : (d,) array, optional
         Initial coefficients; by default the best of random samples.
 
@@ -86,7 +88,9 @@ def minimise(
     rng = np.random.default_rng(seed)
 
     def evaluate(at: Array, bar: float) -> float:
-        """Evaluate coefficients, and update the best point."""
+        """Return the value at coefficients `at` (d,), and update the best point and its history;
+        `bar` is the bound beyond which the value need not be exact.
+        """
         size = value(at, bar)
         if best.coefficients is None or size < best.value:
             best.coefficients = at
@@ -130,9 +134,14 @@ class EvolutionStrategy:
     Parameters
     ----------
     mean : (d,) array
-        Initial mean.
+        Initial mean; it is copied.
     deviation : float
-        Initial standard deviation.
+        Initial standard deviation, equal for all coefficients.
+
+    Attributes
+    ----------
+    offspring : int
+        Number of samples per update.
     """
 
     def __init__(self, mean: Array, deviation: float) -> None:
@@ -164,12 +173,14 @@ class EvolutionStrategy:
         self.drift = np.zeros(n)
 
     def point(self, step: Array) -> Array:
-        """Return the coefficients (d,) of a sample (d,) of the unit normal distribution."""
+        """Return the coefficients (d,) for a sample `step` (d,) of the standard normal
+        distribution.
+        """
         return self.mean + self.deviation * np.sqrt(self.variances) * step
 
     def update(self, steps: Array) -> None:
-        """Update mean, deviation and variances from samples (offspring, d), sorted from
-        best to worst.
+        """Update mean, deviation, variances and paths, in place, from the standard normal samples
+        (`offspring`, d) whose points were evaluated, sorted from best to worst.
         """
         best = steps[: len(self.weights)]
         scale = np.sqrt(self.variances)

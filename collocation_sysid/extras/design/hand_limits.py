@@ -16,13 +16,13 @@ from ...common.validated_types import AtLeastOne, Positive
 from ...errors import InputError
 from ...problem.problem_reading import parse_toml, read_text
 from ...problem.validation_messages import explain_validation_error
-from .hand_motion import HandMotion, angular_motion
+from .hand_motion import HandMotion, TimeDerivatives, angular_motion
 
-# Peaks are sought on a grid; between its points they may be this much larger.
+# Largest share of a limit on the grid of a motion: between grid points peaks may be larger.
 WITHIN = 1 - 6e-3
 # Factor that keeps a motion within its limits in spite of rounding.
 TIGHTER = 1 - 1e-4
-# A peak beyond this share of its limit is at it.
+# Share of a limit beyond which a motion counts as reaching the limit.
 REACHED = 0.98
 
 
@@ -42,7 +42,7 @@ class CameraSection(Section):
 
     @model_validator(mode="after")
     def _require_direction(self) -> CameraSection:
-        """Raise `ValueError` if the camera has no direction."""
+        """Raise `ValueError` if the camera is at the point that it looks at."""
         if self.position_m == self.looks_at_m:
             raise ValueError("looks_at_m is position_m; expected another point")
         return self
@@ -106,12 +106,13 @@ class Limits(Section):
 
     @classmethod
     def read(cls, path: str | Path) -> Limits:
-        """Read limits.toml.
+        """Read limits.toml from a file.
 
         Raises
         ------
         InputError
-            Naming the file, the key or line, what was found and what was expected.
+            If the file is missing, is no TOML, or has a key or value that is not allowed; the
+            message names the file, the key or line, what was found and what was expected.
         """
         file = Path(path)
         content = parse_toml(read_text(file, "a file of limits (TOML)"), file)
@@ -123,12 +124,13 @@ class Limits(Section):
             ) from error
 
     def bounds_from(self, hand_m: Array) -> HandBounds:
-        """Return the limits of a hand that starts at a position (3,) in the poses' world [m].
+        """Return the limits of a hand that starts at the position `hand_m` (3,) in the world frame
+        of the poses [m].
 
         Raises
         ------
         InputError
-            If it starts outside the workspace.
+            If it starts outside the workspace or on its boundary.
         """
         low, high = (np.array(corner) - hand_m for corner in self.workspace_m)
         if not ((low < 0) & (high > 0)).all():
@@ -145,10 +147,12 @@ class Limits(Section):
         return HandBounds(self, low, high_m=high)
 
     def out_of_view(self, markers_m: Array) -> float:
-        """Return how far markers (T, M, 3) [m] leave the views; zero if all are in view.
+        """Return how far markers (T, M, 3) [m] leave the box or the views; zero if all are within,
+        or if there is neither a box nor a camera.
 
-        Distances beyond the box are relative to its diagonal; those beyond a camera's cone are
-        angles [rad]. The largest is returned.
+        Distances beyond the box, along one axis, are relative to its diagonal; those beyond a
+        camera's cone are angles [rad], of which for each marker that of the camera number
+        `cameras_per_marker` in ascending order counts. The largest is returned.
         """
         worst = 0.0
         if self.markers_box_m is not None:
@@ -191,9 +195,10 @@ class HandBounds:
     Attributes
     ----------
     limits : Limits
-        Limits.
+        Limits of the robot.
     low_m, high_m : (3,) array
-        Corners of the workspace relative to the initial position [m].
+        Corners of the workspace relative to the initial position [m]: all below zero and all above
+        zero.
     """
 
     limits: Limits
@@ -201,35 +206,35 @@ class HandBounds:
     high_m: Array
 
     @property
-    def reach(self) -> tuple[Array, Array, Array]:
-        """Largest translation [m] and rotation [rad], (2,), and the same of their first and second
-        derivatives by time.
+    def reach(self) -> TimeDerivatives:
+        """Largest translation [m] and rotation [rad], (2,), along the farthest axis of the
+        workspace, and the limits of their first and second derivatives.
         """
         limits = self.limits
         farthest = np.maximum(-self.low_m, self.high_m).max()
         angular_rate = limits.angular_speed_deg_s
         growth = limits.angular_acceleration_deg_s2
-        return (
+        return TimeDerivatives(
             np.array([farthest, np.radians(limits.rotation_deg)]),
             np.array([limits.speed_m_s, np.radians(angular_rate)]),
-            np.array([limits.acceleration_m_s2, np.radians(growth)]),
+            second=np.array([limits.acceleration_m_s2, np.radians(growth)]),
         )
 
     def shares(self, motion: HandMotion) -> dict[str, float]:
-        """Return the largest values of a motion as shares of the limits, by name of the limit."""
+        """Return the largest values of a motion on its grid as shares of the limits, by name of the
+        limit; the limit is exceeded above 1.
+        """
         course = motion.derivatives(motion.grid_s)
-        return self._translation_shares(*course) | self._rotation_shares(
-            *course
-        )
+        return self._translation_shares(course) | self._rotation_shares(course)
 
-    def _translation_shares(self, *course: Array) -> dict[str, float]:
+    def _translation_shares(self, course: TimeDerivatives) -> dict[str, float]:
         """Return the largest translation, speed and acceleration as shares of their limits, by name
         of the limit.
 
         Parameters
         ----------
-        course : three (T, 6) arrays
-            Coordinates of a motion, their first and their second derivatives, in SI units.
+        course : TimeDerivatives of (T, 6) arrays
+            Coordinates of a motion, in SI units.
         """
         shift, rate, curvature = (each[:, :3] for each in course)
         limits = self.limits
@@ -242,54 +247,46 @@ class HandBounds:
             / limits.acceleration_m_s2,
         }
 
-    def _rotation_shares(self, *course: Array) -> dict[str, float]:
+    def _rotation_shares(self, course: TimeDerivatives) -> dict[str, float]:
         """Return the largest rotation, angular speed and angular acceleration as shares of their
         limits, by name of the limit.
 
         Parameters
         ----------
-        course : three (T, 6) arrays
-            Coordinates of a motion, their first and their second derivatives, in SI units.
+        course : TimeDerivatives of (T, 6) arrays
+            Coordinates of a motion, in SI units.
         """
-        turn = course[0][:, 3:]
-        limits = self.limits
-        largest = map(
-            _largest_norm,
-            (turn, *angular_motion(*(each[:, 3:] for each in course))),
-        )
-        names = (
-            "rotation_deg",
-            "angular_speed_deg_s",
-            "angular_acceleration_deg_s2",
-        )
-        pairs = zip(names, largest, strict=True)
+        turn, rate, curvature = (each[:, 3:] for each in course)
+        velocity, acceleration = angular_motion(turn, rate, curvature=curvature)
+        quantities = {
+            "rotation_deg": turn,
+            "angular_speed_deg_s": velocity,
+            "angular_acceleration_deg_s2": acceleration,
+        }
         return {
-            name: np.degrees(peak) / getattr(limits, name)
-            for name, peak in pairs
+            name: np.degrees(_largest_norm(vectors))
+            / getattr(self.limits, name)
+            for name, vectors in quantities.items()
         }
 
     def scale_to_limits(self, motion: HandMotion) -> HandMotion:
         """Return the motion with translations and rotations reduced so that every limit is
         satisfied.
 
-        A motion that satisfies all limits is unchanged. Peaks of translations are proportional to
-        their scale, those of rotations nearly.
+        A motion whose shares of the limits are at most `WITHIN` keeps its amplitudes. Peaks of
+        translations are proportional to their scale, those of rotations nearly.
         """
         course = motion.derivatives(motion.grid_s)
-        shift = WITHIN / max(
-            WITHIN, *self._translation_shares(*course).values()
-        )
+        shift = WITHIN / max(WITHIN, *self._translation_shares(course).values())
         return motion.scaled(shift, self._rotation_scale(course))
 
-    def _rotation_scale(self, course: tuple[Array, Array, Array]) -> float:
+    def _rotation_scale(self, course: TimeDerivatives) -> float:
         """Return the factor, at most 1, of the rotation vectors with which all limits of the
-        rotation are satisfied; `course` has coordinates and derivatives (T, 6).
+        rotation are satisfied; `course` has the coordinates (T, 6) of the motion.
         """
         scale = 1.0
         while (
-            largest := max(
-                self._rotation_shares(*(scale * c for c in course)).values()
-            )
+            largest := max(self._rotation_shares(course.scaled(scale)).values())
         ) > WITHIN:
             scale *= TIGHTER * WITHIN / largest
         return scale

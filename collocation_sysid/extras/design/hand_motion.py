@@ -18,26 +18,69 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...common.array_types import Array
 
-# Smallest and largest share of the window in which it rises.
+# Smallest and largest duration of the window's rise, over that of the window.
 RISE = 0.15, 0.5
-# Smallest and largest share of the motion for which the window is open.
+# Smallest and largest duration of the window, over that of the motion.
 ACTIVE = 0.6, 1.0
-# Periods in the whole motion of the slowest wave.
+# Number of periods of the slowest wave during the motion.
 FEWEST_PERIODS = 0.4
-# Points of the grid in a period of the fastest wave on which peaks are sought.
+# Grid points per period of the fastest wave, for the search for peaks.
 POINTS_PER_PERIOD = 60
-# Points of the grid besides these, for a window that opens and closes.
+# Grid points in addition to these, which resolve the window.
 FEWEST_POINTS = 200
-# Coefficients of the window: its rise and its share of the motion.
+# Number of coefficients of the window: its rise and its share of the motion.
 OWN = 2
-# Coefficients of a wave in each of six directions: amplitude, two frequencies and phase.
+# Number of coefficients of a wave in each of six directions: amplitude, two frequencies and phase.
 PER_WAVE = 4
+
+
+class TimeDerivatives(NamedTuple):
+    """A quantity, or a limit of it, with its first two derivatives with respect to time.
+
+    Attributes
+    ----------
+    value : array
+        The quantity; for the coordinates of a motion (T, 6): translation x, y, z [m] and rotation
+        vector x, y, z [rad].
+    first, second : array
+        Its first and second derivatives, of the same shape [per s, per s²].
+    """
+
+    value: Array
+    first: Array
+    second: Array
+
+    def scaled(self, factor: float) -> TimeDerivatives:
+        """Return value and derivatives multiplied by a factor."""
+        return TimeDerivatives(
+            factor * self.value,
+            factor * self.first,
+            second=factor * self.second,
+        )
+
+
+class JacobianFactors(NamedTuple):
+    """Factors of the left Jacobian of the exponential map at rotation angles θ.
+
+    Attributes
+    ----------
+    a, b : array
+        (1 − cos θ)/θ² and (θ − sin θ)/θ³.
+    a_slope, b_slope : array
+        (da/dθ)/θ and (db/dθ)/θ.
+    """
+
+    a: Array
+    b: Array
+    a_slope: Array
+    b_slope: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,21 +115,24 @@ class HandMotion:
         coefficients: Array,
         duration_s: float,
         highest_hz: float,
-        reach: tuple[Array, Array, Array],
+        reach: TimeDerivatives,
     ) -> HandMotion:
         """Return the motion for unbounded coefficients whose expected magnitude is one.
+
+        The sum of the waves may exceed `reach`; `HandBounds.scale_to_limits` reduces it.
 
         Parameters
         ----------
         coefficients : (2 + 24 k,) array
-            Coefficients.
+            Rise and share of the window, then amplitudes, first and last frequencies, and phases of
+            the k waves of each of six coordinates.
         duration_s : float
             Duration of the motion [s].
         highest_hz : float
             Highest frequency of a wave.
-        reach : tuple of three (2,) arrays
+        reach : TimeDerivatives of (2,) arrays
             Largest value, first and second derivative of translation [m] and rotation [rad]; each
-            wave alone satisfies them.
+            wave alone, without the window, satisfies them.
         """
         rise, active = (
             low + (high - low) * _to_unit_interval(u)
@@ -113,11 +159,11 @@ class HandMotion:
         return cls(
             duration_s,
             active_s,
-            float(rise * active_s),
-            largest_amplitude * np.tanh(share),
-            first_hz,
-            last_hz,
-            np.pi * phase,
+            rise_s=float(rise * active_s),
+            amplitude=largest_amplitude * np.tanh(share),
+            first_hz=first_hz,
+            last_hz=last_hz,
+            phase_rad=np.pi * phase,
         )
 
     @staticmethod
@@ -136,15 +182,25 @@ class HandMotion:
 
     @cached_property
     def grid_s(self) -> Array:
-        """Times [s] that resolve all peaks of the motion."""
+        """Times (T,) from 0 to the duration [s], evenly spaced, that resolve all peaks of the
+        motion.
+        """
         fastest = max(
             self.first_hz.max(), self.last_hz.max(), 0.5 / self.rise_s
         )
         points = FEWEST_POINTS + POINTS_PER_PERIOD * fastest * self.duration_s
         return np.linspace(0.0, self.duration_s, int(points))
 
-    def derivatives(self, t_s: ArrayLike) -> tuple[Array, Array, Array]:
-        """Return coordinates (T, 6) and their first and second derivatives at times from 0 [s]."""
+    def derivatives(self, t_s: ArrayLike) -> TimeDerivatives:
+        """Return the coordinates (T, 6) and their first and second derivatives.
+
+        They are zero at the start, and from the end of the window on.
+
+        Parameters
+        ----------
+        t_s : (T,) array
+            Times since the start of the motion [s].
+        """
         t = np.asarray(t_s, dtype=float)
         window, rate, curvature = self._window(t)
         t = t[:, None, None]
@@ -162,17 +218,20 @@ class HandMotion:
             (self.amplitude * each).sum(axis=-1)
             for each in (sine, first, second)
         )
-        return (
+        return TimeDerivatives(
             window * wave,
             rate * wave + window * wave_rate,
-            curvature * wave + 2 * rate * wave_rate + window * wave_curvature,
+            second=curvature * wave
+            + 2 * rate * wave_rate
+            + window * wave_curvature,
         )
 
-    def _window(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return the factor (T, 1) of the waves at times t (T,) [s], and its first two derivatives,
-        so that the motion begins and ends at rest.
+    def _window(self, t: Array) -> TimeDerivatives:
+        """Return the window w (T, 1) at times t (T,) [s] since the start, and its first two
+        derivatives.
 
-        With u from 0 to 1 it rises as 10 u³ − 15 u⁴ + 6 u⁵, and falls likewise.
+        With u from 0 to 1 it rises as 10 u³ − 15 u⁴ + 6 u⁵ within `rise_s`, and falls likewise; in
+        between it is one, and after `active_s` zero.
         """
         rising = t <= self.active_s / 2
         u = np.clip(
@@ -182,19 +241,20 @@ class HandMotion:
         value = u**3 * (10 - 15 * u + 6 * u**2)
         first = 30 * u**2 * (1 - u) ** 2 * slope
         second = 60 * u * (1 - u) * (1 - 2 * u) * slope**2
-        return value[:, None], first[:, None], second[:, None]
+        return TimeDerivatives(
+            value[:, None], first[:, None], second=second[:, None]
+        )
 
 
 def angular_motion(
     r: Array, rate: Array, curvature: Array
 ) -> tuple[Array, Array]:
     """Return angular velocity [rad/s] and acceleration [rad/s²] (T, 3), in the fixed frame, of the
-    rotation exp(r), from the rotation vector r (T, 3) and its first two derivatives.
+    rotation exp(r), from the rotation vector r (T, 3) [rad] and its first two derivatives `rate`
+    and `curvature` with respect to time.
     """
     angle = np.linalg.norm(r, axis=1)
-    a, b, a_slope, b_slope = (
-        each[:, None] for each in _jacobian_factors(angle)
-    )
+    a, b, a_slope, b_slope = _jacobian_factors(angle[:, None])
     projection = np.einsum("ti,ti->t", r, rate)[:, None]
     across = np.cross(r, rate)
     double_cross = np.cross(r, across)
@@ -210,11 +270,9 @@ def angular_motion(
     )
 
 
-def _jacobian_factors(angle: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the factors a = (1 − cos θ)/θ² and b = (θ − sin θ)/θ³ of the left Jacobian, and
-    (da/dθ)/θ and (db/dθ)/θ, (T,) each, at angles θ (T,) [rad].
-
-    Series are used near zero.
+def _jacobian_factors(angle: Array) -> JacobianFactors:
+    """Return the factors of the left Jacobian, each of the shape of the angles θ ≥ 0 [rad]; below
+    0.01 rad from their series.
     """
     small = angle < 1e-2
     x = np.where(small, 1.0, angle)
@@ -233,9 +291,9 @@ def _jacobian_factors(angle: Array) -> tuple[Array, Array, Array, Array]:
         -1 / 12 + square / 180,
         -1 / 60 + square / 1260,
     )
-    return tuple(
-        np.where(small, s, e) for s, e in zip(series, exact, strict=True)
-    )  # type: ignore[return-value]
+    return JacobianFactors(
+        *(np.where(small, s, e) for s, e in zip(series, exact, strict=True))
+    )
 
 
 def _to_unit_interval(u: Array | float) -> Array:

@@ -36,10 +36,10 @@ from .predicted_information import (
 
 Say = Callable[[str], None]
 
-# Beyond any logarithm of an error bar: of motions that break a rule, those come first that break
-# it least.
+# Value of motions that are not feasible, larger than the logarithm of any error bar. It is
+# multiplied by up to 3, and the less a motion violates a condition, the smaller it is.
 FORBIDDEN = 1e3
-# Motions that are tried to first order, which takes milliseconds each, for each simulated one.
+# Number of first-order evaluations, which take milliseconds each, for each simulated motion.
 TO_FIRST_ORDER = 10
 # Motions evaluated to first order between two reports of the progress.
 NEWS = 500
@@ -72,20 +72,22 @@ class DesignOptions(Options):
     seed: Count = 0
 
 
+# Default criterion: the largest error bar of the estimated parameters.
 WORST = DesignCriterion()
+# Default options.
 USUAL = DesignOptions()
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorBars:
-    """Relative error bars, by name.
+    """Predicted relative standard errors (error bars), by name of the parameter or modulus.
 
     Attributes
     ----------
     values : mapping of str to float
         Parameters and moduli at the middle of the prior.
     relative : mapping of str to float
-        Their standard errors over these.
+        Their standard errors, divided by these values.
     lowest, highest : mapping of str to float
         Smallest and largest relative errors over the draws of θ.
     """
@@ -97,15 +99,15 @@ class ErrorBars:
 
     @classmethod
     def from_draws(cls, errors: list[PredictedErrors]) -> ErrorBars:
-        """Return the error bars at the first draw, the middle, with the lowest and the highest over
-        all draws.
+        """Return the error bars at the first of at least one draw, the middle, with the lowest and
+        the highest over all draws.
         """
         each = [error.relative for error in errors]
         lowest, highest = (
             {n: pick(e[n] for e in each) for n in each[0]}
             for pick in (min, max)
         )
-        return cls(errors[0].values, each[0], lowest, highest)
+        return cls(errors[0].values, each[0], lowest=lowest, highest=highest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +121,7 @@ class Design:
     motion : HandMotion
         Motion of the hand.
     experiment : Experiment
-        Experiment to be recorded, with simulated markers instead of measured ones.
+        Experiment to be recorded, with simulated markers, without noise, instead of measured ones.
     predicted : Trajectory
         Simulation at the middle of the prior.
     criterion : DesignCriterion
@@ -161,7 +163,7 @@ class Design:
 
     @property
     def active_limits(self) -> list[str]:
-        """Names of the limits that the motion reaches."""
+        """Names of the limits of which the motion uses more than the share `REACHED`."""
         return [name for name, share in self.shares.items() if share > REACHED]
 
     @property
@@ -181,11 +183,11 @@ class MotionObjective:
     limits : Limits
         Limits of the robot.
     criterion : DesignCriterion
-        Criterion.
+        Criterion to minimise.
     draws : list of (nq,) array
         Draws of q, the middle of the prior first.
     known_information : (nq, nq) array
-        Information of the existing recordings.
+        Information of the existing recordings, without priors; zero if they are not used.
     """
 
     recording: FutureRecording
@@ -211,8 +213,8 @@ class MotionObjective:
         free = HandMotion.from_coefficients(
             coefficients,
             float(recording.since_start_s[-1]),
-            recording.highest_hz(self.limits),
-            self.bounds.reach,
+            highest_hz=recording.highest_hz(self.limits),
+            reach=self.bounds.reach,
         )
         return self.bounds.scale_to_limits(free)
 
@@ -222,15 +224,19 @@ class MotionObjective:
         """
         parameters = self.recording.problem.parameters
         return PredictedErrors.from_information(
-            self.known_information + information, parameters, self.constants, q
+            self.known_information + information,
+            parameters,
+            constants=self.constants,
+            q=q,
         )
 
     def first_guess(self, options: DesignOptions, say: Say) -> SearchResult:
-        """Return the motion with the smallest error bars to first order in the motion, as a start
-        of the search.
+        """Return the motion with the smallest error bars at the first draw, to first order in the
+        motion, as a start of the search.
 
-        The result has no coefficients if a wrench is measured too, the memory would be too large,
-        or the simulation fails. `say` is called with the progress.
+        Views of cameras are not considered. The result has no coefficients if a wrench is measured
+        too, the memory would be too large, or the simulation fails. `say` is called with the
+        progress.
         """
         sensed = self.recording.template.grasps[0].wrench is not None
         if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:
@@ -243,7 +249,7 @@ class MotionObjective:
             return SearchResult()
 
         def report(number: int, size: float) -> None:
-            """Report the progress now and then."""
+            """Report every `NEWS` evaluations the smallest error bar, `size` as a logarithm."""
             if number % NEWS == 0:
                 size = 100 * np.exp(size)
                 say(
@@ -252,7 +258,9 @@ class MotionObjective:
                 )
 
         def value(coefficients: Array, _: float) -> float:
-            """Return the logarithm of the error bar to first order."""
+            """Return the logarithm of the error bar at the first draw, to first order; the bound is not
+            used.
+            """
             information = linear.information(self.motion(coefficients))
             return self.criterion.log_size(self.errors(information, middle))
 
@@ -262,8 +270,9 @@ class MotionObjective:
         )
 
     def value(self, coefficients: Array, bound: float) -> float:
-        """Return the logarithm of the error bar of a motion; `FORBIDDEN` or more if a simulation
-        fails or a marker leaves the views.
+        """Return the logarithm of the error bar of a motion, combined over the draws; between one
+        and two times `FORBIDDEN` if a marker leaves the views, between two and three times if a
+        simulation fails.
 
         If the value at the middle of the prior exceeds `bound`, it is returned, and the other draws
         are not simulated.
@@ -309,7 +318,10 @@ def design_motion(
     watch: Watch | None = None,
     say: Say = lambda _: None,
 ) -> Design:
-    """Find the motion of the grasp that minimises the error bars.
+    """Return the motion of the grasp that minimises the error bars, with its prediction.
+
+    Ctrl-C ends the search, and the best motion so far is returned; before the first simulated
+    motion, and while existing recordings are fitted, it raises `KeyboardInterrupt`.
 
     Parameters
     ----------
@@ -399,8 +411,21 @@ def design_motion(
 def _evaluate_design(
     judge: MotionObjective, best: SearchResult, add: bool
 ) -> Design:
-    """Return the design with the best motion, its error bars and its simulation; `best` must have
-    coefficients.
+    """Return the design with the best motion, its error bars and its simulation.
+
+    Parameters
+    ----------
+    judge : MotionObjective
+        Objective that was minimised.
+    best : SearchResult
+        Result of the search, which must have coefficients.
+    add : bool
+        Whether the new recording complements the existing ones.
+
+    Raises
+    ------
+    SimulationError
+        If the motion cannot be simulated at some draw.
     """
     assert best.coefficients is not None
     recording = judge.recording
@@ -430,9 +455,10 @@ def _evaluate_design(
 
 
 def _before(judge: MotionObjective, add: bool) -> ErrorBars | None:
-    """Return the error bars to compare with: those of the existing recordings if the new one is
-    added, else those of the motion in the problem; None if that has no motion or cannot be
-    simulated.
+    """Return the error bars to compare with, from the draws of `judge`.
+
+    If the new recording is added (`add`) they are those of the existing recordings, else those of
+    the motion in the problem; None if that has no motion or cannot be simulated.
     """
     if add:
         return ErrorBars.from_draws([judge.errors(0.0, q) for q in judge.draws])
@@ -490,9 +516,9 @@ def _draws_from_recordings(
     known = shared_information(linearise_fit(solution.collocation, solution.z))
     constants = ThetaMap(problem.parameters, problem.experiments[0].body)
     errors = PredictedErrors.from_information(
-        known, problem.parameters, constants, solution.q
+        known, problem.parameters, constants=constants, q=solution.q
     )
-    # Where they tell next to nothing of a parameter, as far about the answer as about a guess.
+    # A poorly determined parameter is drawn as far around the estimate as around a guess.
     largest_deviation = np.log(options.spread)
     deviations = np.sqrt(np.diag(errors.covariance))
     factors = np.minimum(1.0, largest_deviation / deviations)
@@ -507,7 +533,13 @@ def _draws_from_recordings(
 
 
 def _select_experiment(problem: Problem, name: str | None) -> Experiment:
-    """Return the experiment with a name, or the first that is not static for None."""
+    """Return the experiment with a name, or the first that is not static if `name` is None.
+
+    Raises
+    ------
+    InputError
+        If every experiment is static, or none that moves has this name.
+    """
     moving = [each for each in problem.experiments if not each.is_static]
     if not moving:
         raise InputError(
@@ -533,7 +565,9 @@ def _require_guesses(problem: Problem) -> None:
 
 
 def _no_motion_message(best: SearchResult) -> str:
-    """Return why no motion was found."""
+    """Return a message that says why no motion was found: no simulation reached its end, or
+    markers left the views.
+    """
     tried = f"none of the {len(best.history)} motions that were tried"
     if best.value >= 2 * FORBIDDEN:
         return (

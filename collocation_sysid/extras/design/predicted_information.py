@@ -63,10 +63,15 @@ class DesignCriterion:
         The largest error bar, their root mean square, or the size of their joint ellipsoid: the
         geometric mean of its half axes.
     names : tuple of str
-        Parameters and derived moduli that count; every estimated parameter by default. For one
+        Parameters and derived moduli that count; every estimated parameter if empty. For one
         alone all kinds are the same.
     over : {"mean", "worst"}
         Over draws of θ: the geometric mean, or the largest.
+
+    Raises
+    ------
+    InputError
+        For another kind, or another value of `over`.
     """
 
     kind: Kind = "worst"
@@ -96,8 +101,8 @@ class DesignCriterion:
         )
 
     def combine_draws(self, sizes: Sequence[float]) -> float:
-        """Return the mean, or the largest value if `over` is "worst", of those at several draws of
-        θ.
+        """Return the mean of the logarithms `sizes` at one or more draws of θ, or the largest if
+        `over` is "worst".
         """
         return float(np.max(sizes) if self.over == "worst" else np.mean(sizes))
 
@@ -128,7 +133,7 @@ class PredictedErrors:
     values : dict of str to float
         Estimated parameters, followed by derived moduli, by name.
     slopes : dict of str to (nq,) array
-        Relative change of each with q.
+        Derivatives of each with respect to q, divided by its value.
     estimated_count : int
         Number of estimated parameters, the first of the names.
     """
@@ -148,8 +153,9 @@ class PredictedErrors:
     ) -> PredictedErrors:
         """Return the errors from the information (nq, nq) of all recordings and the priors of q.
 
-        No error bar exceeds `UNDETERMINED` times the parameter, so that motions without information
-        can be compared.
+        No error bar of a parameter exceeds `UNDETERMINED` times the parameter, so that motions
+        without information can be compared. Coefficients of fields are part of the covariance, but
+        not of `values`; neither are derived moduli that do not depend on q.
 
         Parameters
         ----------
@@ -188,11 +194,18 @@ class PredictedErrors:
         slopes |= {
             name: by_q / derived.values[name] for name, by_q in varying.items()
         }
-        return cls(covariance, values, slopes, estimated_count)
+        return cls(
+            covariance, values, slopes=slopes, estimated_count=estimated_count
+        )
 
     def slopes_of(self, names: Sequence[str]) -> Array:
-        """Return the relative change (k, nq) with q of the parameters with these names; of all
-        estimated parameters if `names` is empty.
+        """Return the rows (k, nq) of `slopes` for these names; for all estimated parameters if
+        `names` is empty.
+
+        Raises
+        ------
+        KeyError
+            For an unknown name.
         """
         chosen = names or list(self.slopes)[: self.estimated_count]
         return np.array([self.slopes[name] for name in chosen])
@@ -211,8 +224,9 @@ def prior_draws(
 ) -> list[Array]:
     """Return draws (nq,) of q: the middle, followed by pairs on either side of it.
 
-    A parameter with a prior is drawn from it. Others are drawn around their guess: logarithms with
-    a standard deviation of ln `spread`, linear ones with `spread` − 1 times their typical size.
+    A parameter with a prior is drawn from it. Others are drawn around their guess, which they must
+    have: logarithms with a standard deviation of ln `spread`, linear ones with `spread` − 1 times
+    their typical size. See `symmetric_draws` for `pairs` and `seed`.
     """
     middle = parameters.guess_q.copy()
     deviation = np.array(
@@ -235,8 +249,8 @@ def prior_draws(
 def symmetric_draws(
     parameters: Parameters, middle: Array, root: Array, pairs: int, seed: int
 ) -> list[Array]:
-    """Return the middle of a normal distribution of q and pairs of draws on either side, within
-    bounds.
+    """Return the middle of a normal distribution of q and pairs of draws on either side of it,
+    1 + 2 · `pairs` arrays (nq,), all moved inside the bounds by a small margin.
 
     Parameters
     ----------
@@ -262,11 +276,12 @@ def symmetric_draws(
     return [np.clip(q, lower + margin, upper - margin) for q in draws]
 
 
-# Newton's last step over the body's size: what is left of it is ten thousand times less.
+# Largest step of Newton's method at convergence, over the body's size. The method converges
+# quadratically, so that the remaining error is orders of magnitude smaller.
 TOLERANCE = 1e-5
-# Logged poses between two samples.
+# Number of poses per sample of the markers.
 POSES_PER_SAMPLE = 4
-# A motion of more is not meant: each candidate is simulated.
+# Largest number of samples: each candidate motion is simulated.
 MOST_SAMPLES = 100_000
 
 
@@ -309,7 +324,13 @@ class FutureRecording:
     template : Experiment
         Experiment with the same body, grasp, markers, loads and nuisance parameters.
     duration_s : float
-        Duration, rounded to whole samples [s].
+        Stated duration [s]; the recording lasts the nearest whole number of timesteps.
+
+    Raises
+    ------
+    InputError
+        If a motion cannot be designed for the experiment: it is static, has not exactly one grasp
+        that holds all axes throughout, or would have too few or too many samples.
     """
 
     problem: Problem
@@ -383,7 +404,13 @@ class FutureRecording:
         )
 
     def bounds(self, limits: Limits) -> HandBounds:
-        """Return the limits of the hand relative to its initial position."""
+        """Return the limits of the hand relative to its initial position.
+
+        Raises
+        ------
+        InputError
+            If the hand starts outside the workspace.
+        """
         rotation, translation = self.start_pose
         return limits.bounds_from(rotation @ self.hand_m + translation)
 
@@ -413,14 +440,14 @@ class FutureRecording:
         return np.linspace(0.0, self.since_start_s[-1], count)
 
     def poses(self, motion: HandMotion) -> PoseSequence:
-        """Return the poses of a motion."""
+        """Return the poses of a motion at `pose_times_s`."""
         return self.poses_from_coordinates(
-            motion.derivatives(self.pose_times_s)[0]
+            motion.derivatives(self.pose_times_s).value
         )
 
     def poses_from_coordinates(self, coordinates: Array) -> PoseSequence:
-        """Return the poses at `pose_times_s` from translation and rotation vector (P, 6) of
-        the hand.
+        """Return the poses at `pose_times_s` from the translation [m] and the rotation vector [rad]
+        (P, 6) of the hand, relative to its initial position and orientation, in world axes.
         """
         rotation, translation = self.start_pose
         turned = Rotation.from_rotvec(
@@ -429,11 +456,15 @@ class FutureRecording:
         hand = rotation @ self.hand_m + translation + coordinates[:, :3]
         placed = hand - turned.apply(self.hand_m)
         return PoseSequence(
-            self.pose_times_s + self.template.t_s[0], placed, turned.as_quat()
+            self.pose_times_s + self.template.t_s[0],
+            placed,
+            quaternions_xyzw=turned.as_quat(),
         )
 
     def experiment(self, poses: PoseSequence) -> Experiment:
-        """Return the future experiment with given poses; markers are placeholders at the origin."""
+        """Return the future experiment with given poses; all markers are at the origin, wrenches
+        zero, as placeholders for measurements.
+        """
         template = self.template
         (grasp,) = self.template.grasps
         t_s = self.since_start_s + template.t_s[0]
@@ -470,7 +501,9 @@ class FutureRecording:
         )
 
     def program(self, experiment: Experiment) -> Collocation:
-        """Return the nonlinear program of one experiment."""
+        """Return the nonlinear program of one experiment, which is fitted even if it is declared as
+        held out.
+        """
         problem = self.problem
         fitted = (
             replace(experiment, validation=False)
@@ -487,8 +520,10 @@ class FutureRecording:
     def linearise(
         self, experiment: Experiment, q: Array
     ) -> tuple[LinearisedFit, Array]:
-        """Return the linearised fit of an experiment simulated at the parameters q (nq,), and its
-        positions (N, 3n) [m] at the time steps.
+        """Return the linearised fit of an experiment simulated at the parameters q (nq,), with
+        nuisance parameters at their guesses, and its positions (N, 3n) [m] at the time steps.
+
+        The initial equilibrium at q is stored for later calls, since every motion starts from it.
 
         Raises
         ------
@@ -497,9 +532,7 @@ class FutureRecording:
         """
         alone = self.program(experiment)
         (segment,) = alone.transcriptions
-        known = self._starts.get(
-            q.tobytes()
-        )  # every motion starts from the same rest
+        known = self._starts.get(q.tobytes())
         x, failure = continue_simulation(
             experiment,
             segment.dynamics.with_theta(segment.constants.theta(q)),
@@ -529,11 +562,12 @@ def _resampled(wrench: Wrench | None, t_s: Array) -> Wrench | None:
     return replace(wrench, t_s=times, values=values)
 
 
-# The pulses' heights, as small as the answers are linear, of shifts [m] and of turns [rad].
+# Heights of the pulses in translation [m] and rotation vector [rad]: small, for a linear response.
 HEIGHTS = np.repeat([1e-4, 1e-3], 3)
-# The cubic B-spline on even knots: of its shifted copies, values at the samples make a course.
+# Pulse: the cubic B-spline on uniform knots. A sum of its shifted copies, weighted with the values
+# of a coordinate at the samples, approximates that coordinate.
 PULSE = BSpline.basis_element(np.arange(-2.0, 3.0), extrapolate=False)
-# The sample at which those that are simulated are highest.
+# Index of the sample at which the simulated pulses are highest.
 CENTRE = 2
 
 
@@ -548,9 +582,10 @@ class LinearRecording:
     rest : LinearisedFit
         Linearised fit without any motion.
     responses : (6, frequencies, 3M, p) array
-        Fourier transforms of the change of the slopes, for a pulse of height one.
+        Fourier transforms of the change of the slopes, for a pulse of height one: 3M marker
+        coordinates, p parameters (shared and nuisance).
     length : int
-        Length of the transforms.
+        Length of the transforms, at least twice the number of samples.
     """
 
     recording: FutureRecording
@@ -560,7 +595,9 @@ class LinearRecording:
 
     @staticmethod
     def gigabytes(recording: FutureRecording) -> float:
-        """Return the memory of the responses [GB]."""
+        """Return the approximate memory of the responses of a recording [GB], without computing
+        them.
+        """
         (segment,) = recording.program(recording.template).transcriptions
         markers = 3 * len(recording.template.markers.names)
         return (
@@ -575,7 +612,8 @@ class LinearRecording:
     def from_simulations(
         cls, recording: FutureRecording, q: Array
     ) -> LinearRecording:
-        """Return the response at q (nq,), from seven simulations.
+        """Return the response at q (nq,), from seven simulations: one at rest, and one for each
+        coordinate.
 
         Raises
         ------
@@ -596,11 +634,15 @@ class LinearRecording:
             (block,) = recording.linearise(pulsed, q)[0].blocks
             change = (block.channels[1] - at_rest.channels[1]) / height
             answers.append(np.fft.rfft(change, length, axis=0))
-        return cls(recording, still, np.array(answers), length)
+        return cls(recording, still, responses=np.array(answers), length=length)
 
     def information(self, motion: HandMotion) -> Array:
-        """Return the information (nq, nq) of a motion about the shared parameters, see
-        `shared_information`.
+        """Return the information (nq, nq) of a motion about the shared parameters, to first order
+        in the motion, see `shared_information`. s         course =
+        motion.derivatives(recording.since_start_s)[0] ==>         course =
+        motion.derivatives(recording.since_start_s).value s         # What was simulated is highest
+        at a sample before which a motion from rest is nothing yet. ==>         # The pulses are
+        highest at sample CENTRE; before it a motion from rest is negligible.
         """
         recording = self.recording
         course = motion.derivatives(recording.since_start_s)[0]

@@ -101,18 +101,26 @@ def verify_export(
 ) -> Sequence[PredictionComparison]:
     """Run an export in the target itself, and compare its predictions with those of this package.
 
+    Nothing is written to `folder`.
+
     Parameters
     ----------
     body : IdentifiedBody
+        The body that was exported.
     target_name : str
         Name of a target in `TARGETS`.
     folder : str or Path
         Folder of `write_export`; the target runs in a temporary copy.
 
+    Returns
+    -------
+    sequence of PredictionComparison
+        One for each compared quantity; how close they are is not judged.
+
     Raises
     ------
     InputError
-        If the target cannot be run from here, or is not installed.
+        For an unknown target, or if the target cannot be run from here, is not installed or fails.
     """
     target = target_named(target_name)
     if target.verify is None:
@@ -131,7 +139,9 @@ def verify_export(
 def comparison_table(
     name: str, comparisons: Sequence[PredictionComparison]
 ) -> Table:
-    """Return the table of predictions of the simulator `name` and of this package."""
+    """Return the table of predictions of the simulator `name` and of this package, a row for each
+    quantity, with the relative difference ("+nan%" if this package predicts zero) and a remark.
+    """
     rows = []
     for each in comparisons:
         values = (

@@ -54,7 +54,7 @@ FOAM_LIMITATION = (
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the input deck, with what CalculiX cannot express."""
+    """Return the input deck with what CalculiX cannot express; damping is not exported."""
     static = body.experiment.is_static
     limits = replace(
         CAPABILITIES, has_moving_grasps=static, has_moving_obstacles=static
@@ -121,12 +121,12 @@ def _obstacle_cards(
     """
     deck = ""
     tetrahedra = body.body.mesh.tetrahedra
-    cell_numbers = np.arange(len(body.body.cells)) + 1
+    element_numbers = np.arange(len(body.body.cells)) + 1
     faces = {
         tuple(sorted(corners)): f"{number},S{side}"
         for side, places in enumerate(TETRAHEDRON_SIDES, start=1)
         for corners, number in zip(
-            tetrahedra[:, places].tolist(), cell_numbers, strict=True
+            tetrahedra[:, places].tolist(), element_numbers, strict=True
         )
     }
     for k, wall in enumerate(obstacles):
@@ -214,9 +214,8 @@ def _step_card(
 
 
 def _format_values(*values: float) -> str:
-    """Return numbers for a line of the deck, separated by commas.
-
-    CalculiX cuts off a number after 20 characters, even within its exponent.
+    """Return numbers for a line of the deck, separated by commas, with 12 digits: CalculiX cuts off
+    a number after 20 characters, even within its exponent.
     """
     return ",".join(f"{float(value):.12g}" for value in values)
 

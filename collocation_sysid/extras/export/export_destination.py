@@ -27,6 +27,7 @@ class ExportDestination:
     Attributes
     ----------
     format_name : str
+        Name of the format, such as "mujoco".
     folder : Path
         Folder of the files.
     main_file : Path
@@ -57,7 +58,10 @@ class ExportDestination:
 
     @contextmanager
     def export_folder(self) -> Iterator[Path]:
-        """Yield the folder to export into: a temporary one if the destination is a file."""
+        """Context with the folder to export into: the destination itself, or, if that is a file, a
+        path in a temporary folder, which does not exist yet and is removed at the end of the
+        context.
+        """
         if self.is_folder:
             yield self.folder
             return
@@ -189,12 +193,8 @@ def parse_destination(
 
 
 def _require_replaceable(file: Path) -> None:
-    """Refuse a file to write that exists, unless this program wrote it and nobody changed it.
-
-    Raises
-    ------
-    InputError
-        Naming the file.
+    """Raise `InputError`, naming the file, if it exists and this program did not write it or it was
+    changed since, or if it is a folder. A file that does not exist is accepted.
     """
     if file.is_dir() and not file.is_symlink():
         raise InputError(

@@ -47,6 +47,7 @@ class ExportedFiles:
     Attributes
     ----------
     files : mapping of file name to text
+        Content of each file; `write_export` adds ``identified.json`` and the poses.
     limitations : tuple of str
         What the target cannot express, and what was done instead.
     """
@@ -57,9 +58,18 @@ class ExportedFiles:
 
 @dataclass(frozen=True)
 class PredictionComparison:
-    """One quantity as predicted by the target (`theirs`) and by this package (`ours`), in `unit`.
+    """One quantity as predicted by the target and by this package.
 
-    `what` names the quantity, `remark` adds a sentence.
+    Attributes
+    ----------
+    what : str
+        Name of the quantity.
+    theirs, ours : float
+        Prediction of the target, and of this package, in `unit`.
+    unit : str
+        Unit of both.
+    remark : str
+        Further sentence; empty if there is none.
     """
 
     what: str
@@ -154,6 +164,10 @@ class TargetCapabilities:
     def limitations(self, body: IdentifiedBody) -> list[str]:
         """Return sentences on what the simulator cannot express of a body, and what was done
         instead.
+
+        The order is: what no target expresses, obstacles, regions, motion, elements, node forces,
+        and whether the target was tested. Sentences may end with a period or not; the list is a new
+        one.
         """
         sentences = [*_common_limitations(body)]
         sentences += self._obstacle_limitations(body)
@@ -186,7 +200,10 @@ class TargetCapabilities:
         return sentences if self.is_tested else [*sentences, UNTESTED]
 
     def _obstacle_limitations(self, body: IdentifiedBody) -> Iterator[str]:
-        """Yield sentences on what the simulator cannot express of the obstacles."""
+        """Yield sentences on what the simulator cannot express of the obstacles.
+
+        Of an obstacle whose shape is not exported nothing else is said.
+        """
         for each in body.obstacles:
             if (
                 kind := Primitive.from_solid(each.shape).kind
@@ -210,7 +227,9 @@ class TargetCapabilities:
 
 
 def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
-    """Yield sentences on what none of the targets can express."""
+    """Yield sentences on what none of the targets can express of a body: actuators, air, custom
+    forces, and loads or grasps that change in time.
+    """
     e = body.experiment
     times = body.experiment.t_s
     if e.actuators:
@@ -237,6 +256,7 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
     Parameters
     ----------
     body : IdentifiedBody
+        Body with its recording.
     samples : int
         Number of samples; more than one for static recordings only.
 
@@ -267,10 +287,10 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
         )
     else:
         states = equilibrium(experiment, body.theta)[None]
-    # In statics what slides is the way since the sample before.
+    # In statics friction follows the displacement since the previous sample.
     ways = np.diff(states, axis=0, prepend=states[:1])
     forces = Forces.from_experiment(
-        experiment, experiment.t_s[:samples], body.theta
+        experiment, experiment.t_s[:samples], theta=body.theta
     ).total(states, ways)
     on_nodes = forces.reshape(samples, -1, 3)
     on_body = [-on_nodes[:, each.nodes].sum(axis=1) for each in body.obstacles]
@@ -283,13 +303,13 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
 
 
 def longest_displacement_m(displacements_m: Array) -> float:
-    """Return the largest length of displacements (n, 3)."""
+    """Return the largest length of displacements (n, 3) [m]; NaN if one is NaN."""
     return float(np.linalg.norm(displacements_m, axis=1).max())
 
 
 def linear_tetrahedra(body: IdentifiedBody) -> list[Index]:
-    """Return the linear tetrahedra (k, 4) of each region; quadratic ones are split on the same
-    nodes.
+    """Return the node indices of the linear tetrahedra (k, 4) of each region, in the order of
+    `IdentifiedBody.regions`; each quadratic one is split into eight on the same nodes.
     """
     if not body.is_quadratic:
         return [body.body.cells[region.cells] for region in body.regions]
@@ -300,7 +320,9 @@ def linear_tetrahedra(body: IdentifiedBody) -> list[Index]:
 def values_as_text(
     values: Iterable[float] | Array, separator: str = " "
 ) -> str:
-    """Return numbers as text from which they are read back exactly."""
+    """Return numbers, of an array in row-major order, as text from which they are read back
+    exactly, with `separator` between them.
+    """
     return separator.join(
         repr(float(value)) for value in np.ravel(np.asarray(values))
     )
@@ -311,7 +333,9 @@ def comment_lines(
 ) -> str:
     """Return comment lines on the body: title, warnings, limitations, and constants of each region.
 
-    Each line begins with `start` and ends with `end`, the marks of a comment in the format.
+    Each line begins with `start` and ends with `end`, the marks of a comment in the format, and a
+    line break. Within a line white space is joined, control characters are replaced, and two
+    hyphens are separated, so that no line can end the comment.
     """
     lines = [
         f"{body.title}: identified body; SI units",

@@ -5,6 +5,7 @@ obstacles.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,8 +43,29 @@ CAPABILITIES = TargetCapabilities(
 )
 
 
+class ElasticLaw(NamedTuple):
+    """Elastic law of a region in FEBio.
+
+    Attributes
+    ----------
+    kind : str
+        Type of the material in the file.
+    constants : dict of str to float
+        Constants by the name of their element.
+    is_uncoupled : bool
+        Whether the energy is a sum of a part for the shape and one for the volume, which then needs
+        the bulk modulus.
+    """
+
+    kind: str
+    constants: dict[str, float]
+    is_uncoupled: bool
+
+
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the model of a static step with growing loads, and what FEBio cannot express."""
+    """Return the model of a static step with growing loads at the first sample, and what FEBio
+    cannot express.
+    """
     limits = CAPABILITIES.limitations(body)
     materials = "".join(
         _material_xml(k, region, limits=limits)
@@ -110,20 +132,18 @@ def _material_xml(
     )
 
 
-def _elastic_law(
-    region: IdentifiedRegion, limits: list[str]
-) -> tuple[str, dict[str, float], bool]:
-    """Return the type of a material, its constants, and whether it is uncoupled into shape and
-    volume.
+def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> ElasticLaw:
+    """Return the elastic law of a region in FEBio. One that FEBio does not have becomes the
+    neo-Hookean law of the same E and ν at small strain.
 
-    Limitations are appended to `limits`.
+    A sentence on what the law does not express is appended to `limits`, in place.
     """
     c = region.constants
     if region.material == "mooney-rivlin":
-        return (
+        return ElasticLaw(
             CAPABILITIES.materials[region.material],
             {"c1": c["c10_pa"], "c2": c["c01_pa"]},
-            True,
+            is_uncoupled=True,
         )
     if region.material in CAPABILITIES.materials and region.terms:
         # The energy of a term is c/m² (Σ λ̄^m − 3).
@@ -133,24 +153,28 @@ def _elastic_law(
                 f"c{number}": term.mu_pa * term.alpha,
                 f"m{number}": term.alpha,
             }
-        return CAPABILITIES.materials[region.material], values, True
+        return ElasticLaw(
+            CAPABILITIES.materials[region.material], values, is_uncoupled=True
+        )
     moduli = {"E": region.young_pa, "v": region.poisson}
     if region.material == "linear":
         limits.append(
             f"{region.name}: the linear material of FEBio rotates with the body, that "
             "of this program does not"
         )
-    return (
+    return ElasticLaw(
         CAPABILITIES.materials.get(region.material, "neo-Hookean"),
         moduli,
-        False,
+        is_uncoupled=False,
     )
 
 
 def _mesh_xml(
     body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]
 ) -> str:
-    """Return the XML of nodes, elements, sets and prescribed displacements, also of obstacles."""
+    """Return the XML of nodes, elements, node sets of prescribed axes, domains and prescribed
+    displacements, also of obstacles; indices in the file count from 1.
+    """
     solids, facets = _obstacle_mesh_xml(body, obstacles)
     xml = '<Mesh>\n<Nodes name="nodes">\n'
     for k, point in enumerate(body.nodes_m, 1):
@@ -192,8 +216,8 @@ def _mesh_xml(
 
 
 def _prescribed_displacement_xml(body: IdentifiedBody) -> str:
-    """Return the XML of the prescribed displacements: zero, or the way to where a second grasp
-    holds the nodes.
+    """Return the XML of the prescribed displacements along each axis, which grow with the load
+    curve: zero, or the displacement to where a second grasp holds the nodes.
     """
     conditions = ""
     for axis, is_prescribed, displacement in zip(

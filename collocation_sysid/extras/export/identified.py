@@ -30,7 +30,17 @@ from ...runs.warm_start import WarmStart
 
 @dataclass(frozen=True)
 class IdentifiedBranch:
-    """Viscoelastic branch: share of the long-term stiffness, and relaxation time [s]."""
+    """Viscoelastic branch.
+
+    Attributes
+    ----------
+    name : str
+        Name of the branch.
+    share : float
+        Its stiffness over the long-term stiffness.
+    tau_s : float
+        Relaxation time [s].
+    """
 
     name: str
     share: float
@@ -39,7 +49,17 @@ class IdentifiedBranch:
 
 @dataclass(frozen=True)
 class PowerTerm:
-    """Term of Ogden's law or of a compressible foam: μ_p [Pa], α_p, and β_p of a foam."""
+    """Term p of Ogden's law or of a compressible foam.
+
+    Attributes
+    ----------
+    mu_pa : float
+        Constant μ_p.
+    alpha : float
+        Exponent α_p.
+    beta : float
+        Constant β_p of a foam; 0 for Ogden's law.
+    """
 
     mu_pa: float
     alpha: float
@@ -63,11 +83,13 @@ class IdentifiedRegion:
     lambda_pa, mu_pa, young_pa, poisson : float
         Elastic constants at rest and small strain, of the long-term energy.
     density_kg_m3 : float
+        Density.
     damping : str
         Name of the damping law.
     gamma_r_s, gamma_m_1_s : float
         Stiffness-proportional and mass-proportional damping, see the glossary.
-    branches : tuple of BranchIndices
+    branches : tuple of IdentifiedBranch
+        Viscoelastic branches; empty without memory.
     """
 
     name: str
@@ -86,7 +108,7 @@ class IdentifiedRegion:
 
     @property
     def kappa_pa(self) -> float:
-        """Bulk modulus κ = λ + ⅔ μ."""
+        """Bulk modulus κ = λ + ⅔ μ [Pa]."""
         return self.lambda_pa + 2 / 3 * self.mu_pa
 
     @property
@@ -104,9 +126,12 @@ class IdentifiedRegion:
 
 
 def without_obstacles(experiment: Experiment) -> Experiment:
-    """Return an experiment without its obstacles, which simulators have as separate objects.
+    """Return a copy of an experiment without its obstacles, which simulators have as separate
+    objects.
 
-    Measurements are replaced by one placeholder marker, because there may be none on the body.
+    Measurements are replaced by one marker at the first node with zeros as positions, because an
+    experiment must have some and all of them may be of the obstacles. Initial positions and
+    velocities are those of the body's nodes alone.
 
     Raises
     ------
@@ -122,7 +147,7 @@ def without_obstacles(experiment: Experiment) -> Experiment:
         else positions_m[:own]
         for name in ("start_positions_m", "start_velocities_m_s")
     }
-    # Exports need no measurements, and all of them may be of the obstacles.
+    # Placeholder: see the docstring.
     some = Markers(
         t_s,
         np.zeros((len(t_s), 1, 3)),
@@ -155,13 +180,15 @@ class IdentifiedBody:
     warnings : tuple of str
         Reasons not to use the numbers without care.
     parameters : mapping of name to ReportedEstimate
+        Estimates of the run.
     body : Body
+        The body, without obstacles.
     theta : (k,)
-        Constants of the body.
+        Constants of the body at the estimates.
     experiment : Experiment
         The recording with corrected gravity and grasps, and without obstacles.
     simulated_m : (T, n, 3) or None
-        Forward simulation of this package at the samples.
+        Forward simulation of this package at the samples; None if the run has none.
     experiment_with_obstacles : Experiment or None
         The recording with its obstacles, whose friction coefficients are numbers; None without
         obstacles.
@@ -272,22 +299,22 @@ class IdentifiedBody:
         return cls(
             problem.title,
             result.trust.verdict,
-            warnings,
-            {
+            warnings=warnings,
+            parameters={
                 n: each
                 for n, each in result.parameters.items()
                 if n in result.values
             },
-            body,
-            body.theta_from_values(values),
-            corrected,
-            rolled_out_m,
-            touching,
+            body=body,
+            theta=body.theta_from_values(values),
+            experiment=corrected,
+            simulated_m=rolled_out_m,
+            experiment_with_obstacles=touching,
         )
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """Obstacles with which the body may come into contact."""
+        """Obstacles with which the body may come into contact; empty without any."""
         return (
             ()
             if self.experiment_with_obstacles is None
@@ -301,7 +328,9 @@ class IdentifiedBody:
 
     @cached_property
     def nodes_m(self) -> Array:
-        """Undeformed nodes (n, 3), placed as the grasp holds the body at the first sample."""
+        """Undeformed nodes (n, 3) [m] in the world, placed rigidly as the grasp holds the body at
+        the first sample.
+        """
         return self.experiment.rigid_positions([self.start_s])[0]
 
     @cached_property
@@ -321,7 +350,7 @@ class IdentifiedBody:
 
     @cached_property
     def prescribed_displacements_m(self) -> Array:
-        """Prescribed coordinates minus `nodes_m` (n, 3), and 0 where a coordinate is free.
+        """Prescribed coordinates minus `nodes_m` (n, 3) [m], and 0 where a coordinate is free.
 
         It is not zero where a second grasp holds nodes elsewhere than the rigidly placed body has
         them.
@@ -360,7 +389,7 @@ class IdentifiedBody:
 
     @cached_property
     def regions(self) -> tuple[IdentifiedRegion, ...]:
-        """Parts of the body with their constants."""
+        """Parts of the body with their constants at the estimates, in the order of `Body.parts`."""
         body = self.body
         regions = []
         lame = body.lame(self.theta)
@@ -400,7 +429,12 @@ class IdentifiedBody:
         return tuple(regions)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return everything as a dictionary for a JSON file."""
+        """Return the content of identified.json as a dictionary, with arrays and dataclasses that
+        `as_json` converts: estimates, mesh, masses, regions, loads, grasps and obstacles of the
+        recording.
+
+        Positions are those at the first sample; element and node indices count from 0.
+        """
         e = self.experiment
         body = self.body
         names = (

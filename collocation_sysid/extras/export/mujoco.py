@@ -148,8 +148,9 @@ def _geom_attributes(solid: Solid) -> str:
 
 
 def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
-    """Return the XML of the constraints between the mocap bodies and the bodies that carry grasped
-    nodes.
+    """Return the XML of the constraints between the mocap bodies of the grasps and the bodies that
+    carry grasped nodes; empty without grasps. They are as stiff as the timestep `step_s` [s]
+    allows.
     """
     return "".join(
         f'<weld body1="hand{k}" body2="grasp{k}" relpose="0 0 0 1 0 0 0" '
@@ -167,7 +168,9 @@ def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
 
 
 def _node_xml(body: IdentifiedBody) -> str:
-    """Return the XML of the free nodes, each a body on three slides."""
+    """Return the XML of the free nodes (not held along all axes), each a body on three slides named
+    "node" and its index.
+    """
     lines = ""
     mass = body.total_node_mass_kg
     for n in np.flatnonzero(~body.is_node_prescribed):
@@ -175,9 +178,8 @@ def _node_xml(body: IdentifiedBody) -> str:
             f'<joint type="slide" axis="{axis}"/>'
             for axis in ("1 0 0", "0 1 0", "0 0 1")
         )
-        inertia = max(
-            1e-6 * float(mass[n]), 1e-12
-        )  # a node does not turn, but must have some
+        # Nodes do not rotate, but MuJoCo requires a moment of inertia.
+        inertia = max(1e-6 * float(mass[n]), 1e-12)
         lines += (
             f'<body name="node{n}" pos="{values_as_text(body.nodes_m[n])}">'
             f'<inertial pos="0 0 0" mass="{float(mass[n])!r}" '
@@ -224,7 +226,9 @@ def _mean_edge_m(body: IdentifiedBody) -> float:
 
 
 def _keyframe_xml(body: IdentifiedBody) -> str:
-    """Return the XML of the state at the first sample: simulated displacements and velocities."""
+    """Return the XML of the state at the first sample: simulated displacements, or zero if the run
+    has no forward simulation, and the declared initial velocities, or zero.
+    """
     free = ~body.is_node_prescribed
     shape = body.nodes_m if body.simulated_m is None else body.simulated_m[0]
     started = body.experiment.start_velocities_m_s
@@ -243,7 +247,12 @@ def _keyframe_xml(body: IdentifiedBody) -> str:
 
 
 def _stable_step_s(body: IdentifiedBody) -> float:
-    """Return a timestep that divides the sampling interval and keeps the integration stable."""
+    """Return a timestep [s] that divides the sampling interval and keeps the explicit integration
+    stable.
+
+    It is at most `STEP_SAFETY_FACTOR` times the stability limit at the largest natural frequency of
+    the undeformed body without grasps, with the largest γ_r of all regions.
+    """
     state = body.body.nodes_m.reshape(1, -1)
     at = body.body.linearise(state, np.zeros_like(state), body.theta)
     stiffness = body.body.pattern.matrix(-at.by_position[0])
@@ -259,13 +268,14 @@ def _stable_step_s(body: IdentifiedBody) -> float:
 
 
 def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
-    """Run MuJoCo, and compare the first natural frequency and, if there is a motion, the
-    deformation.
+    """Run MuJoCo on the exported model, and compare the first natural frequency and, if the
+    recording is a motion with a forward simulation, the deformation.
 
     Raises
     ------
     InputError
-        If MuJoCo is missing, too old, or refuses the model.
+        If MuJoCo is missing, too old, or refuses the model, or if the motion needs more than
+        `MAX_STEPS` steps.
     """
     mujoco = _import_mujoco()
     try:
@@ -306,9 +316,18 @@ def _import_mujoco() -> ModuleType:
 def _compare_first_frequency(
     body: IdentifiedBody, mujoco: ModuleType, model: Any
 ) -> PredictionComparison:
-    """Return the first natural frequency of the undeformed body in MuJoCo and here [Hz].
+    """Return the comparison of the first natural frequency of the undeformed body in MuJoCo and
+    here [Hz], in vacuum and without rigid modes.
 
-    MuJoCo's stiffness is found by central differences of its forces.
+    The stiffness in MuJoCo follows from central differences of its forces.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+    mujoco : module
+        Module of MuJoCo.
+    model : MjModel
+        Exported model.
     """
     data = mujoco.MjData(model)
     free = ~body.is_node_prescribed
@@ -333,7 +352,7 @@ def _compare_first_frequency(
     theirs = float(np.sqrt(oscillating[0])) / (2 * np.pi)
     dofs = np.flatnonzero(np.repeat(free, 3))
     in_vacuum = replace(body.experiment, air_density_kg_m3="none")
-    forces = Forces.from_experiment(in_vacuum, body.start_s, body.theta)
+    forces = Forces.from_experiment(in_vacuum, body.start_s, theta=body.theta)
     ours = natural_modes(
         forces, body.nodes_m, free_dofs=dofs, count=1
     ).frequencies_hz
@@ -348,9 +367,10 @@ def _compare_first_frequency(
 def _compare_motion(
     body: IdentifiedBody, mujoco: ModuleType, model: Any
 ) -> PredictionComparison:
-    """Return the RMS deformation over the recording in MuJoCo and here [m].
+    """Return the comparison of the RMS deformation over the recording in MuJoCo and here [m].
 
-    Deformation is the distance from the rigidly moved body.
+    Deformation is the distance of free nodes from the rigidly moved body. The equality constraints
+    of `model` are switched off, in place, and grasped bodies are moved directly.
 
     Raises
     ------
@@ -416,8 +436,11 @@ def _set_grasp_state(
     Parameters
     ----------
     body : IdentifiedBody
+        Body with the poses.
     mujoco : module
+        Module of MuJoCo.
     data : MjData
+        Modified in place.
     time_and_step_s : (float, float)
         Time and timestep [s]; velocities lead to the pose one step later.
     """

@@ -96,9 +96,10 @@ def model(device=None):
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the module ``body.py`` and its numbers ``body.json``.
+    """Return the module ``body.py`` and its numbers ``body.json``, with what Newton cannot express.
 
-    The module reads the JSON file with its own name, so that both can be renamed together.
+    The module reads the JSON file with its own name, so that both can be renamed together. Grasped
+    nodes have no mass and are fixed at their positions of the first sample.
 
     The elastic constants are those of Newton's `SolverVBD`, whose energy is the stable neo-Hookean
     one of λ and μ (Smith, de Goes & Kim 2018).
@@ -107,7 +108,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     constants = []
     for region, own in zip(body.regions, linear_tetrahedra(body), strict=True):
         cells.append(own)
-        # Its damping stress is 4 k Ė, ours γ_r (2 μ Ė + λ tr Ė): alike where the volume stays.
+        # Damping stress of Newton: 4 k Ė; of this package: γ_r (2 μ Ė + λ tr(Ė) I).
         damping = region.gamma_r_s * region.mu_pa / 2
         constants.append(
             np.tile([region.mu_pa, region.lambda_pa, damping], (len(own), 1))

@@ -57,34 +57,44 @@ class Primitive:
 
     @classmethod
     def from_solid(cls, solid: Solid) -> Primitive:
-        """Return the primitive of a solid; rounded edges are left out."""
+        """Return the primitive of a solid in the frame of its obstacle; rounded edges are left out."""
         kind = solid_key(solid).removesuffix("_m")
         turn = Rotation.identity()
         if isinstance(solid, Plane):
             return cls(
                 kind,
                 np.zeros(0),
-                solid.point_m,
-                _rotation_of_z_to(solid.normal),
+                centre_m=solid.point_m,
+                rotation=_rotation_of_z_to(solid.normal),
             )
         if isinstance(solid, Sphere):
-            return cls(kind, np.array([solid.radius_m]), solid.centre_m, turn)
+            return cls(
+                kind,
+                np.array([solid.radius_m]),
+                centre_m=solid.centre_m,
+                rotation=turn,
+            )
         if isinstance(solid, Cuboid):
             return cls(
                 kind,
                 np.diff(solid.corners_m, axis=0)[0] / 2,
-                solid.tilt_centre_m,
-                turn,
+                centre_m=solid.tilt_centre_m,
+                rotation=turn,
             )
         assert isinstance(solid, (Cylinder, Capsule))
         way = np.diff(solid.ends_m, axis=0)[0]
         size = np.array([solid.radius_m, np.linalg.norm(way) / 2])
         return cls(
-            kind, size, solid.ends_m.mean(axis=0), _rotation_of_z_to(way)
+            kind,
+            size,
+            centre_m=solid.ends_m.mean(axis=0),
+            rotation=_rotation_of_z_to(way),
         )
 
     def pose_at(self, obstacle: Obstacle, t_s: float) -> tuple[Array, Rotation]:
-        """Return position (3,) [m] and rotation in the world at a time."""
+        """Return position (3,) [m] and rotation of the shape in the world at a time [s]; `obstacle`
+        is the one that has the shape.
+        """
         (rotation,), (place,) = obstacle.poses.at([t_s])
         return place + rotation @ self.centre_m, Rotation.from_matrix(
             rotation
@@ -92,14 +102,17 @@ class Primitive:
 
 
 def _rotation_of_z_to(axis: Array) -> Rotation:
-    """Return a rotation of the z axis to a vector (3,)."""
+    """Return a rotation of the z axis to a vector (3,) of any length above zero; the angle about
+    the vector is arbitrary.
+    """
     return Rotation.align_vectors(axis[None], np.array([[0.0, 0.0, 1.0]]))[0]
 
 
 def offset_solid(solid: Solid, distance_m: float) -> Solid:
     """Return a solid whose surface is further out by `distance_m`; negative inwards.
 
-    Inwards the surface moves at most by half of the solid's smallest half width.
+    Inwards the surface moves at most by half of the solid's smallest half width (a plane by any
+    distance). The radius of rounded edges stays.
     """
     if isinstance(solid, Plane):
         return replace(solid, point_m=solid.point_m + distance_m * solid.normal)
@@ -147,6 +160,7 @@ class Facets:
         Parameters
         ----------
         solid : Solid
+            Solid in the frame of its obstacle.
         centre_m : (3,)
             Centre of the square for a plane.
         size_m : float
@@ -174,13 +188,17 @@ class Facets:
         )._oriented_outwards()
 
     def max_penetration_m(self, points_m: Array) -> float:
-        """Return the penetration [m] of the deepest of points (n, 3); 0 if all are outside."""
+        """Return the penetration [m] of the deepest of points (n, 3), the distance to the nearest
+        facet's plane; 0 if all are outside. The facets must enclose a convex solid.
+        """
         return max(
             0.0, -float(self._signed_distances_m(points_m).max(axis=0).min())
         )
 
     def facing(self, points_m: Array) -> Facets:
-        """Return the facets that have at least one of the points (n, 3) in front of them."""
+        """Return the facets that have at least one of the points (n, 3) in front of them, with only
+        their points and the one behind; itself is not changed.
+        """
         is_facing = (self._signed_distances_m(points_m) > 0).any(axis=1)
         used, triangles = np.unique(
             self.triangles[is_facing], return_inverse=True
@@ -225,13 +243,14 @@ def _unit_normals(corners: Array) -> Array:
 
 def _hull_points(shape: Primitive, rounding_m: float, depth_m: float) -> Array:
     """Return points (p, 3) of a solid that are the furthest along some direction; their hull is the
-    solid.
+    solid, with round surfaces replaced by facets.
 
     Parameters
     ----------
     shape : Primitive
+        Any shape but a plane.
     rounding_m : float
-        Radius of rounded edges.
+        Radius of rounded edges of a box or cylinder; 0 for sharp ones.
     depth_m : float
         Allowed distance between the hull and the surface.
     """
@@ -329,7 +348,13 @@ class FacetedObstacle:
 
 
 def faceted_obstacles(body: IdentifiedBody) -> tuple[FacetedObstacle, ...]:
-    """Return the obstacles of a body as walls; facets that never face the body are left out."""
+    """Return the obstacles of a body as facets, in the order of `IdentifiedBody.obstacles`; empty
+    without obstacles.
+
+    Facets that face the body at no sample are left out. Nodes and cells are numbered after those of
+    the body. The stiffness and the width of the pressure law are means over the area of the surface
+    that may touch.
+    """
     if body.experiment_with_obstacles is None:
         return ()
     times = body.experiment_with_obstacles.t_s
@@ -360,13 +385,13 @@ def faceted_obstacles(body: IdentifiedBody) -> tuple[FacetedObstacle, ...]:
         width_m = float(np.average(law.widths_m, weights=area_m2))
         solid = offset_solid(obstacle.shape, width_m / 2)
         facets = Facets.from_solid(
-            solid, box_m.mean(axis=0), size_m, width_m / 2
+            solid, box_m.mean(axis=0), size_m=size_m, depth_m=width_m / 2
         )
         faces = law.surface.faces
         touching = np.unique(
             body.body.nodes.nodes_of_faces(body.body.mesh.surface[faces])
         )
-        # Nodes may be deeper than the points at which ours are pushed.
+        # Nodes may be deeper than the contact points of this package.
         back_m = -max(depth_m, 0.0) * normal
         nearest = (rigid_m[0, touching] - places[0] - back_m) @ rotations[0]
         back_m -= facets.max_penetration_m(nearest) * normal
@@ -403,6 +428,7 @@ class SharedContact:
     Attributes
     ----------
     friction : float
+        Friction coefficient.
     node_stiffness_n_m : float
         Contact stiffness of a node.
     particle_radius_m : float
@@ -420,8 +446,8 @@ class SharedContact:
     def from_obstacles(
         cls, obstacles: Sequence[FacetedObstacle]
     ) -> SharedContact:
-        """Return the friction of the first wall, and the largest stiffness and width; zeros without
-        walls.
+        """Return the friction of the first obstacle, and the largest stiffness and width of all;
+        zeros without obstacles.
         """
         constants = {
             "friction": [float(wall.obstacle.friction) for wall in obstacles],
@@ -445,6 +471,6 @@ class SharedContact:
         return cls(
             friction[0],
             max(stiffness),
-            max(width) / 2,
-            (sentence,) * bool(unlike),
+            particle_radius_m=max(width) / 2,
+            limitations=(sentence,) * bool(unlike),
         )

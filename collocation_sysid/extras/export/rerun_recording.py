@@ -87,7 +87,7 @@ def write_rerun(
         recording = _Recording(place / RECORDING_FILE, result, replays=replays)
         limits = _limits(stresses)
         for replay, stress in zip(replays, stresses, strict=True):
-            recording.write_experiment(replay, stress, limits)
+            recording.write_experiment(replay, stress, limits=limits)
         recording.close()
     return [
         f"experiment '{replay.name}' has no frames, so that its surface has no stress"
@@ -97,7 +97,9 @@ def write_rerun(
 
 
 def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
-    """Return the von Mises stress (T, F) on the surface; None if the run has no frames of it."""
+    """Return the von Mises stress (T, F) on the surface [Pa]; None if the run has no frames of it,
+    or the experiment was not fitted.
+    """
     if replay.positions_m is None:  # only fitted experiments have frames
         return None
     try:
@@ -107,7 +109,9 @@ def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
 
 
 def _limits(stresses: Sequence[Array | None]) -> tuple[float, float]:
-    """Return the ends of the colour scale, the same for all experiments."""
+    """Return the smallest and largest value as ends of the colour scale, the same for all
+    experiments; 0 and 1 if nothing is known.
+    """
     known = [
         each
         for each in stresses
@@ -127,6 +131,9 @@ def vertex_colours(
     count: int,
 ) -> NDArray[np.uint8]:
     """Return the colours of vertices from values on the triangles around them.
+
+    The value of a vertex is the mean over the triangles around it; values beyond the limits have
+    the colour of the nearest limit, and so have vertices without a triangle at the value 0.
 
     Parameters
     ----------
@@ -218,7 +225,9 @@ class _Recording:
         return self.rr.new_entity_path(list(parts))
 
     def _write_parameters(self, result: Result, span_s: Array) -> None:
-        """Write each parameter with its combined interval as constant curves."""
+        """Write each parameter of a result with its combined interval, if known, as constant curves
+        between the two times `span_s` [s].
+        """
         for name, each in result.values.items():
             curves = {"value": each.value}
             if each.combined95 is not None:
@@ -298,7 +307,9 @@ class _Recording:
         self._write_wrenches(replay)
 
     def _up_axis(self, up: Array) -> Any:
-        """Return the viewer's axis that is nearest to a direction (3,)."""
+        """Return the viewer's coordinate system whose axis is nearest to a direction (3,), upwards
+        or downwards.
+        """
         axis = int(np.abs(up).argmax())
         end = "UP" if up[axis] > 0 else "DOWN"
         return getattr(
@@ -311,7 +322,18 @@ class _Recording:
         stress: Array | None,
         limits: tuple[float, float],
     ) -> None:
-        """Write the deforming surface; samples that are not finite are left out."""
+        """Write the deforming surface and the largest stress at each sample; samples that are not
+        finite are left out.
+
+        Parameters
+        ----------
+        replay : MotionRecord
+            It has shapes.
+        stress : (T, F) array or None
+            Von Mises stress on the surface [Pa], which colours it; None for grey.
+        limits : (low, high)
+            Ends of the colour scale [Pa].
+        """
         rr = self.rr
         shapes_m = replay.shapes_m
         assert shapes_m is not None
@@ -353,7 +375,22 @@ class _Recording:
         colour: tuple[int, int, int],
         radius_m: float,
     ) -> None:
-        """Write points (k, 3) at each time; points that are not finite are left out."""
+        """Write points at each time; points that are not finite are left out. Nothing is written if
+        none remains.
+
+        Parameters
+        ----------
+        path : str
+            Path of the entity.
+        t_s : (T,) array
+            Times [s].
+        points_m : sequence of T (k, 3) arrays
+            Points at each time [m]; their number may change.
+        colour : tuple of int
+            Red, green and blue, from 0 to 255.
+        radius_m : float
+            Radius of a point [m].
+        """
         rr = self.rr
         there = [each[np.isfinite(each).all(axis=1)] for each in points_m]
         if not any(map(len, there)):
@@ -366,7 +403,7 @@ class _Recording:
         )
 
     def _write_obstacles(self, replay: MotionRecord) -> None:
-        """Write the outlines of obstacles."""
+        """Write the outlines of obstacles at each sample; without obstacles nothing."""
         if replay.obstacles_m is None:
             return
         path = self._path(replay.name, "obstacles")
@@ -379,7 +416,9 @@ class _Recording:
         self.stream.reset_time()
 
     def _write_residuals(self, replay: MotionRecord) -> None:
-        """Write the distances of the fitted (or else simulated) markers from the measured ones."""
+        """Write the distances [mm] of the fitted (or else simulated) markers from the measured
+        ones; without either nothing.
+        """
         model_m = (
             replay.rolled_out_m
             if replay.markers_m is None
@@ -395,7 +434,9 @@ class _Recording:
             self._write_curve(path, replay.t_s, values=values)
 
     def _write_wrenches(self, replay: MotionRecord) -> None:
-        """Write forces and torques as measured, fitted and simulated."""
+        """Write each component of forces and torques as measured, fitted and simulated; grasps with
+        a sensor are numbered from 1.
+        """
         for k, columns in enumerate(replay.wrenches, start=1):
             t_s = columns[:, 0]
             values = columns[:, 1:].reshape(len(t_s), 3, len(COMPONENTS))
@@ -414,7 +455,9 @@ class _Recording:
     def _write_curve(
         self, path: str, t_s: Array, values: Sequence[float] | Array
     ) -> None:
-        """Write a number over time; times at which it is not finite are left out."""
+        """Write a number `values` (T,) over the times `t_s` (T,) [s] under the entity `path`; times
+        at which it is not finite are left out.
+        """
         curve = np.asarray(values, dtype=float)
         is_finite = np.isfinite(curve)
         if is_finite.any():
@@ -424,14 +467,18 @@ class _Recording:
     def _send(
         self, path: str, t_s: Array, columns: Any, counts: Sequence[int] | None
     ) -> None:
-        """Send columns at times [s]; `counts` are the numbers of rows per time, None for one."""
+        """Send columns of the entity `path` at the times `t_s` (T,) [s]; `counts` are the numbers
+        of rows per time, None for one row each.
+        """
         times = [self.rr.TimeColumn(TIMELINE, duration=t_s)]
         data = columns if counts is None else columns.partition(counts)
         self.stream.send_columns(path, times, data)
 
 
 def _polylines(points_m: Array) -> Iterator[Array]:
-    """Yield the lines of points (o, 3) that are separated by rows of NaN."""
+    """Yield the lines of points (o, 3) that are separated by rows with a value that is not finite;
+    lines of one point are left out.
+    """
     ends = np.flatnonzero(~np.isfinite(points_m).all(axis=1))
     start = 0
     for end in (*ends, len(points_m)):

@@ -54,7 +54,7 @@ CAPABILITIES = TargetCapabilities(
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the scene.
+    """Return the scene with its limitations, one file.
 
     Raises
     ------
@@ -105,7 +105,8 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
 
 def _contact_xml(body: IdentifiedBody) -> str:
-    """Return the XML of contact penalties on the nodes, proportional to the penetration.
+    """Return the XML of contact penalties on the nodes, proportional to the penetration; empty
+    without obstacles. Shapes other than planes and spheres are left out.
 
     The surface of the obstacle is moved outwards by half the width δ of the pressure law, so that
     the force is about the same at a given gap.
@@ -128,7 +129,9 @@ def _contact_xml(body: IdentifiedBody) -> str:
 
 
 def _elastic_law_xml(region: IdentifiedRegion) -> str:
-    """Return the XML of the elastic material."""
+    """Return the XML of the elastic material; one that SOFA does not have becomes the neo-Hookean
+    material of the same λ and μ.
+    """
     if region.material == "linear":
         return (
             '<TetrahedronFEMForceField method="small" '

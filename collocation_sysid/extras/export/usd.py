@@ -143,7 +143,7 @@ def _rate_hz(t_s: Array) -> float:
 
 
 def _tilt_deg(gravity_m_s2: Array) -> float:
-    """Return the angle between gravity (3,) and −z [°]; 0 without gravity."""
+    """Return the angle between gravity (3,) and −z, from 0 to 180 [°]; 0 without gravity."""
     downwards = -gravity_m_s2[2]
     across = np.linalg.norm(gravity_m_s2[:2])
     return (
@@ -178,8 +178,19 @@ def _add_mesh(
 ) -> None:
     """Add the tetrahedra, masses, materials and simulated motion of the body to the stage.
 
-    `pxr` are the modules of `_import_usd`; `start_positions_m` (n, 3) are the initial node
-    positions.
+    The default positions, with which a simulator begins, are `start_positions_m`; the forward
+    simulation, if there is one, is stored as time samples for playback. Several regions become
+    subsets of tetrahedra; the body has the material of the region with most tetrahedra.
+
+    Parameters
+    ----------
+    pxr : namespace
+        Modules of `_import_usd`.
+    stage : Usd.Stage
+        Modified in place.
+    body : IdentifiedBody
+    start_positions_m : (n, 3)
+        Initial node positions.
     """
     body_prim = pxr.UsdGeom.Xform.Define(stage, "/World/Body").GetPrim()
     body_prim.AddAppliedSchema("PhysicsDeformableBodyAPI")
@@ -188,7 +199,7 @@ def _add_mesh(
     prim = mesh.GetPrim()
     prim.AddAppliedSchema("PhysicsVolumeDeformableSimAPI")
     pxr.UsdPhysics.CollisionAPI.Apply(prim)
-    # A simulator begins with the default; the samples are played back where nothing is simulated.
+    # Default positions for simulators; time samples for playback.
     points = mesh.CreatePointsAttr(start_positions_m.astype(np.float32))
     t_s = body.experiment.t_s
     codes = (_rate_hz(t_s) * t_s).tolist()
@@ -236,7 +247,8 @@ def _add_mesh(
 
 
 def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
-    """Return the mass of each tetrahedron [kg], region after region.
+    """Return the mass of each linear tetrahedron [kg], region after region, from its undeformed
+    volume and the density of its region.
 
     `cells` are the corner nodes of the tetrahedra (k, 4) of each region.
     """
@@ -288,7 +300,9 @@ def _bind_material(pxr: Any, prim: Any, material: Any) -> None:
 
 
 def _set_token(pxr: Any, prim: Any, name: str, text: str) -> None:
-    """Set a uniform token attribute of a prim."""
+    """Set the uniform token attribute `name` of a prim to `text`, in place; `pxr` are the modules
+    of `_import_usd`.
+    """
     kind = pxr.Sdf.ValueTypeNames.Token
     fixed = pxr.Sdf.VariabilityUniform
     prim.CreateAttribute(name, kind, False, fixed).Set(text)
@@ -302,10 +316,11 @@ def _add_gripper(
     body: IdentifiedBody,
     start_positions_m: Array,
 ) -> None:
-    """Add a kinematic rigid body that follows the poses of a grasp, and attach the grasped nodes to
-    it.
+    """Add a kinematic rigid body that follows the poses of a grasp, and attach the nodes to it that
+    the grasp holds along all axes.
 
-    `number` counts grasps from 1; `start_positions_m` (n, 3) are the initial node positions.
+    `number` counts grasps from 1; `start_positions_m` (n, 3) are the initial node positions in the
+    world. The stage is modified in place.
     """
     path = f"/World/Gripper_{number}"
     gripper = pxr.UsdGeom.Xform.Define(stage, path)
@@ -340,9 +355,11 @@ def _add_gripper(
 def _set_poses(
     pxr: Any, prim: Any, positions_m: Array, rotations: Rotation, t_s: Array
 ) -> None:
-    """Place a prim at positions (T, 3) and rotations at times (T,), by default as in the first row.
+    """Place a prim at positions (T, 3) [m] and rotations (T) at times (T,) [s]; its default pose is
+    that of the first row.
 
-    With empty `t_s`, the only row holds for all time.
+    With empty `t_s` there is one row, which holds for all time. The prim is modified in place;
+    `pxr` are the modules of `_import_usd`.
     """
     codes = (_rate_hz(t_s) * t_s).tolist()
     wxyz = rotations.as_quat(scalar_first=True)
@@ -357,7 +374,11 @@ def _set_poses(
 def _add_obstacle(
     pxr: Any, stage: Any, path: str, obstacle: Obstacle, body: IdentifiedBody
 ) -> None:
-    """Add an obstacle with its friction to the stage under `path`; it is kinematic if it moves."""
+    """Add an obstacle with its friction to the stage, in place, under `path`.
+
+    It is a kinematic rigid body if it moves; otherwise it stays at its pose of the first sample of
+    `body`. Rounded edges are left out.
+    """
     shape = Primitive.from_solid(obstacle.shape)
     t_s = body.experiment.t_s
     frame = path
@@ -428,7 +449,11 @@ def _unique_prim_names(names: Sequence[str]) -> list[str]:
 
 
 def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
-    """Run Newton on the exported stage, and compare the largest displacement at rest.
+    """Run Newton on the exported stage until the body is at rest, and compare the largest
+    displacement.
+
+    Grasped nodes and obstacles stay at their positions of the first sample; the number of steps is
+    fixed, and convergence is not checked.
 
     Raises
     ------
@@ -446,7 +471,7 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     contact = SharedContact.from_obstacles(faceted_obstacles(body))
     if body.obstacles:
         builder.default_particle_radius = contact.particle_radius_m
-    # Its rigid bodies would be simulated too; what they hold stands still instead.
+    # Grippers are left out, since Newton would simulate them too; grasped nodes get no mass.
     builder.add_usd(
         str(folder / STAGE_FILE), ignore_paths=["/World/Gripper_.*"]
     )
@@ -460,7 +485,7 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
         model.soft_contact_mu = contact.friction
         model.shape_material_ke.fill_(contact.node_stiffness_n_m)
     pipeline = newton.CollisionPipeline(model)
-    # What is touched stands still, and is nothing to solve for.
+    # Obstacles do not move, so that rigid bodies need not be solved for.
     solver = newton.solvers.SolverVBD(
         model,
         iterations=SOLVER_ITERATIONS,

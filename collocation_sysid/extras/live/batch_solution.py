@@ -24,11 +24,12 @@ FEWEST = 3
 def recording_from_log(
     model: StreamingModel, intake: FrameBuffer, log: Sequence[LoggedRow]
 ) -> Experiment | None:
-    """Return the experiment with the poses, markers and samples of all rows, from the first frame
-    on.
+    """Return the model's experiment with the poses, markers and samples of all rows.
 
-    Samples of a custom sensor or wrench replace its stated series; if fewer than three are within
-    the rows, or all are NaN, the sensor is left out. Missing markers are NaN.
+    Its times are those of the model's experiment at the same interval, whatever the times of the
+    frames. Samples of a custom sensor or wrench replace its stated series; if fewer than three are
+    within the rows, or all are NaN, the sensor is left out. Missing markers are NaN. Samples after
+    the last row are left out.
 
     None if there are fewer than three sample times or no measured marker, or if markers were
     measured between samples.
@@ -36,6 +37,7 @@ def recording_from_log(
     Parameters
     ----------
     model : StreamingModel
+        Model whose experiment gives everything but the measurements.
     intake : FrameBuffer
         Buffer with the samples that still wait for rows, which are included.
     log : sequence of LoggedRow
@@ -58,7 +60,7 @@ def recording_from_log(
         for matrix, row in zip(matrices, at_samples, strict=True):
             matrix[:3, :3], matrix[:3, 3] = row.poses[k]
         smooth = grasps[number].poses.interpolation
-        poses = PoseSequence.from_matrices(t_s, matrices, smooth)
+        poses = PoseSequence.from_matrices(t_s, matrices, interpolation=smooth)
         grasps[number] = replace(grasps[number], poses=poses)
     markers = replace(experiment.markers, t_s=t_s, positions_m=tracks_m)
     readings = []
@@ -89,6 +91,14 @@ def recording_from_log(
 def solve_recording(problem: Problem, recording: Experiment) -> Run:
     """Return the run of a recording, solved as a batch by reduced space, without profile
     likelihoods and search for causes.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem with parameters, scheme and options; its experiments are not used, and it is not
+        modified.
+    recording : Experiment
+        The only experiment to fit.
 
     Raises
     ------

@@ -187,15 +187,29 @@ class LiveEstimator:
         One experiment; of its recording only the grasps, the markers and the sampling rate are
         used.
     options : LiveOptions
+        Window and computing time.
     clock : callable
-        Time in seconds for the budget; `time.thread_time` excludes the time of other processes.
+        Function that returns a time [s] for the budget; `time.thread_time` excludes the time of
+        other processes.
 
     Attributes
     ----------
     p : (P,)
-        Current estimate of the parameters, in the solver's coordinates.
+        Current estimate of the parameters, in the solver's coordinates: material parameters, then
+        nuisance parameters.
+    lower, upper : (P,)
+        Bounds of p.
     counts : Counter
         Numbers of irregularities of frames, by kind.
+    samples : int
+        Number of marker positions measured so far, each marker of each frame counted once.
+    log : list of LoggedRow
+        Rows in the window of the first pass, with their samples.
+    first_pass, second_pass : WindowPass or None
+        Pass that receives the frames, None before the first row; and the pass that repeats the
+        window, None if there is none.
+    search : StiffnessSearch or None
+        Search for initial values that goes on; None if there is none.
     last : LiveUpdate or None
         Result after the last frame; None before the first one.
 
@@ -247,7 +261,7 @@ class LiveEstimator:
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
         self.prior = SquareRootInformation.empty(model.parameter_count)
         self.first_pass: WindowPass | None = None
-        self._combined = CombinedPasses(self.prior, [], [])
+        self._combined = CombinedPasses(self.prior, [], points=[])
         self._last_positions_m = np.full((1, 3), np.nan)
         self.second_pass: WindowPass | None = None
         self.log: list[LoggedRow] = []
@@ -321,7 +335,13 @@ class LiveEstimator:
 
     @one_blas_thread()
     def process_frame(self, frame: Frame) -> LiveUpdate:
-        """Process a validated frame and return the result."""
+        """Process a validated frame and return the result, which is also stored in `last`.
+
+        Frames that are ignored, and those before the first pose, give a result as well, with a
+        note where there is a reason. After a gap in the poses the estimator restarts from rest with
+        the information of the samples so far as a prior. Rows that cannot be simulated raise no
+        error: the verdict of the result says so.
+        """
         began = self.clock()
         frame, notes = self._checked_frame(frame)
         if self.intake.is_motion_unknown(frame.t_s):
@@ -334,10 +354,14 @@ class LiveEstimator:
                 notes.append(
                     "restarted after a gap in the poses, assuming that the body is at rest"
                 )
-        rows, readings, new_notes = self.intake.add_frame(
-            frame.t_s, frame.pose, frame.tracks_m, frame.instrument_samples
+        buffered = self.intake.add_frame(
+            frame.t_s,
+            frame.pose,
+            tracks_m=frame.tracks_m,
+            instrument_samples=frame.instrument_samples,
         )
-        notes += new_notes
+        rows = buffered.rows
+        notes += buffered.notes
         self.budget.start_frame()
         caught_up = self._catch_up(began, notes)
         squares = []
@@ -346,7 +370,7 @@ class LiveEstimator:
             done, new_notes = self._compute_rows(rows, squares)
             notes = notes + new_notes
             rows = rows[done:]
-        notes += self._add_samples(readings, squares)
+        notes += self._add_samples(buffered.late_samples, squares)
         self._update_estimate()
         if (
             self.first_pass is not None
@@ -410,9 +434,11 @@ class LiveEstimator:
 
         Returns
         -------
-        Update or None
-            The update of the last frame with new estimates and, after a batch run, the root mean
-            square distance of all markers. None if there was no frame.
+        LiveUpdate or None
+            The update of the last frame with new estimates, and after a batch run the root mean
+            square distance of all markers; its notes are those of this function. The last update
+            itself if no row could be computed since the start or a restart, and None if there was
+            no frame. `last` is not changed.
         """
         began = self.clock()
         notes = ["final estimate after the last frame"]
@@ -469,8 +495,9 @@ class LiveEstimator:
 
     def _repeat_until_settled(self, began: float, notes: list[str]) -> int:
         """Compute the rows in the window again, without a time limit, until no further pass is
-        needed or `FINAL_PASSES` passes are done; return the number of rows. `notes` are extended in
-        place.
+        needed or `FINAL_PASSES` passes are done; return the number of rows.
+
+        `began` is the time at which the work began, by `clock`; `notes` are extended in place.
         """
         rows_per_frame, self.rows = self.rows, FINAL_PASSES * len(self.log)
         try:
@@ -479,8 +506,11 @@ class LiveEstimator:
             self.rows = rows_per_frame
 
     def _checked_frame(self, frame: Frame) -> tuple[Frame, list[str]]:
-        """Return the frame with NaN for markers that are farther from every grasp than the body
-        reaches, and notes; counts are updated.
+        """Return the frame with NaN for markers that are farther than `REACH_BODY_SIZES` allows
+        from the last known position of every moving grasp, and notes; counts are updated.
+
+        Before the first pose no marker is excluded. A wrench without a sensor in the problem is
+        noted once.
         """
         notes = []
         if frame.has_wrench and not self.model.wrenches:
@@ -627,7 +657,7 @@ class LiveEstimator:
     # Beginnings -------------------------------------------------------------------------------
 
     def _set_bounds(self) -> None:
-        """Set the bounds of p from the model."""
+        """Set the bounds of p, `lower` and `upper`, from the model."""
         self.lower, self.upper = self.model.collocation.parameter_bounds
 
     def _new_search(self) -> StiffnessSearch:
@@ -635,10 +665,11 @@ class LiveEstimator:
         return StiffnessSearch(self.model, self.p[self.model.collocation.nq :])
 
     def _warm_up(self) -> tuple[Poses, Array] | None:
-        """Compile the kernels before the first frame, and measure computing times for the budget.
+        """Compile the kernels before the first frame, and measure computing times for `budget`.
 
-        Return the poses and the positions (3n,) of the start of the problem's recording; None if it
-        cannot be computed.
+        Return the poses of all grasps and the positions (3n,) at the start of the problem's
+        recording. None if it cannot be computed at the initial parameters; `budget` then stays
+        without times.
         """
         poses = self.model.first_poses
         moving_poses = tuple(poses[k] for k in self.model.moving_grasps)
@@ -661,8 +692,15 @@ class LiveEstimator:
         return poses, trial.blocks[0].stored_rows[0].x
 
     def _measure_times(self, trial: WindowPass, row: LoggedRow) -> TimeBudget:
-        """Return the measured computing times of one and of many repeated rows, each the shortest
-        of several measurements.
+        """Return the computing times of one and of many repeated rows, each the shortest of
+        `TIMING_REPETITIONS` measurements.
+
+        Parameters
+        ----------
+        trial : WindowPass
+            Pass with enough rows to be repeated; not modified.
+        row : LoggedRow
+            Input of every repeated row.
         """
         took_s: dict[int, float] = {}
         most = min(
@@ -680,11 +718,21 @@ class LiveEstimator:
             began = self.clock()
             again.repeat_rows([row] * count)
             took_s[count] = min(took_s.get(count, np.inf), self.clock() - began)
-        return TimeBudget.from_times(took_s[1], took_s[most], most)
+        return TimeBudget.from_times(took_s[1], took_s[most], many=most)
 
     def _start_pass(self, row: LoggedRow) -> None:
         """Start the first pass with the first row, and set unknown marker places from its
         markers.
+
+        The initial guess of the positions is that of the start of the problem's recording, moved
+        rigidly with the pose, if there is a single grasp. If marker places are set, `model`, the
+        bounds, the nuisance parameters in `p` and `prior` are replaced, and the row is computed
+        again.
+
+        Raises
+        ------
+        SimulationError
+            If the initial state cannot be computed.
         """
         model = self.model
         guesses = []
@@ -733,7 +781,7 @@ class LiveEstimator:
 
     def _restart(self) -> None:
         """Keep the information of all samples so far as a prior, discard passes, log and frames,
-        and wait for a new start.
+        and wait for a new start; estimate and counts stay.
         """
         if self.first_pass is not None:
             self.prior = self.first_pass.measured_information
@@ -783,8 +831,9 @@ class LiveEstimator:
         )
 
     def _update_estimate(self) -> None:
-        """Set the estimate p, in place, to the minimum of the joint quadratic loss of the first and
-        the second pass; without effect before the first pass, or if it failed.
+        """Set the estimate `p` to the minimum of the joint quadratic loss of the first and the
+        second pass, within bounds and trust region; without effect before the first pass, or if it
+        failed.
         """
         if self.first_pass is not None and not self.first_pass.has_failed:
             self._combined = CombinedPasses.from_passes(
@@ -822,7 +871,7 @@ class LiveEstimator:
             1 / (deviation * self.model.collocation.reach_p * track.sweep.rates)
         )
         information = self._combined.information.with_rows(
-            np.zeros(size), slopes, track.sweep.transformed
+            np.zeros(size), slopes, parameters=track.sweep.transformed
         )
         return self._constrained_minimum(track, information)
 
@@ -914,6 +963,9 @@ class LiveEstimator:
     ) -> int:
         """Continue or start a second pass within the rest of the budget.
 
+        Passes follow one another, the trials of a search included, until none is needed or no
+        further row is affordable. Without effect before the first pass.
+
         Parameters
         ----------
         began : float
@@ -959,7 +1011,18 @@ class LiveEstimator:
     def _catch_up(self, began: float, notes: list[str]) -> int:
         """Complete a second pass that lags by few rows, if there is time, before new rows come.
 
-        Return the number of rows that were computed again.
+        Parameters
+        ----------
+        began : float
+            Time at which the frame began, by `clock`.
+        notes : list of str
+            Extended in place.
+
+        Returns
+        -------
+        int
+            Number of rows that were computed again; 0 without a second pass, if it is a trial of a
+            search, or if the remaining rows do not fit into the budget beside a usual frame.
         """
         again = self.second_pass
         if again is None or again.base is None:
@@ -979,7 +1042,9 @@ class LiveEstimator:
         """Compute up to `count` rows of the second pass; if it has caught up or failed, accept or
         reject it, or record it as a trial of the search.
 
-        Return the number of rows that were computed. `notes` are extended in place.
+        While trials of a search are left, the pass is such a trial, which ends after
+        `StiffnessSearch.rows` rows. A row that cannot be solved marks the pass as failed. Return
+        the number of rows that were computed. `notes` are extended in place.
         """
         before = self.clock()
         first_row = again.rows
@@ -1013,11 +1078,14 @@ class LiveEstimator:
     def _start_second_pass(
         self, track: WindowPass, notes: list[str]
     ) -> WindowPass | None:
-        """Return a new second pass if one is needed, otherwise None.
+        """Return a new second pass, without rows yet, if one is needed, otherwise None.
 
-        One is needed for the next trial of a search for initial values, which begins if the first
-        pass failed at its start, or if the estimate has moved away from the linearisation points of
-        the first pass `track`. `notes` are extended in place.
+        During a search for initial values it is needed for the next trial, once there are enough
+        rows, and for the best values at the end; a search begins here if the first pass `track`
+        failed before rows left the window. If no trial succeeded, the search ends with a note.
+        Without a search a pass is needed if the estimate has moved farther than `REPEAT_DISTANCE`
+        from a linearisation point of `track`, or if the sweep needs another pass, but not after a
+        failure. `notes` are extended in place.
         """
         search = self.search
         at_start = track.start[0] is None
@@ -1070,6 +1138,9 @@ class LiveEstimator:
     ) -> None:
         """Move the linearisation point of a pass to the estimate if it is far and there is time.
 
+        Without effect if fewer than `StreamingModel.rows_per_chunk` rows were computed since the
+        last change. With a fixed number of rows per frame there is always time.
+
         Parameters
         ----------
         track : WindowPass
@@ -1103,15 +1174,19 @@ class LiveEstimator:
         self, track: WindowPass, again: WindowPass, notes: list[str]
     ) -> None:
         """Replace the first pass `track` by the second one, `again`, if that fits about as well as
-        expected, and enlarge the trust region; otherwise discard it and shrink the region. `notes`
-        are extended in place.
+        expected, and enlarge the trust region; otherwise discard it and shrink the region.
+
+        A pass that has not failed always replaces one that has. A search for initial values ends
+        either way. After `LARGEST_REJECTIONS` rejections in a row with grossly large residuals, a
+        search begins, once in the life of the estimator. The estimate is updated, and `notes` are
+        extended in place.
         """
         self.second_pass = None
         was_search = self.search is not None
         self.search = None
         points = [*track.linearisation_points, again.linearisation_points[0]]
         expected = max(track.information.loss(point) for point in points)
-        # Of a pass that turned the sum of squares is not that of a simulation.
+        # The loss of a pass whose linearisation point was changed is not that of a simulation.
         is_within_trust_region = (
             track.last_relinearised_row
             and self._largest_distance(
@@ -1169,7 +1244,11 @@ class LiveEstimator:
         self._update_estimate()
 
     def _drop_old_rows(self) -> None:
-        """Remove the oldest rows if the window is full."""
+        """Remove the oldest blocks of rows from the first pass and the log if the window is full.
+
+        While a second pass needs them, they stay, up to twice the window; beyond that the second
+        pass is discarded. A failed first pass with that many rows is restarted.
+        """
         if self.first_pass is None:
             return
         most = self._blocks * self._block_rows

@@ -37,6 +37,26 @@ LARGEST_CUBIC_GAP = 3
 LARGEST_GAP = 10
 
 
+@dataclass(frozen=True, eq=False)
+class BufferedFrame:
+    """Result of adding a frame to the buffer.
+
+    Attributes
+    ----------
+    rows : list of LoggedRow
+        Rows that the frame completes, in order of time, with the samples to evaluate after each.
+    late_samples : list of Sample
+        Samples to evaluate after the last earlier row; empty if the frame completes rows, which
+        then contain them.
+    notes : list of str
+        Irregularities of the frame, as sentences for the user.
+    """
+
+    rows: list[LoggedRow]
+    late_samples: list[Sample]
+    notes: list[str]
+
+
 @dataclass(eq=False)
 class FrameBuffer:
     """Buffer of the frames that have arrived.
@@ -54,7 +74,13 @@ class FrameBuffer:
     instruments : sequence of StreamStencil
         Rows that a sample of each instrument needs.
     counts : Counter
-        Numbers of irregularities of frames, by kind.
+        Numbers of irregularities of frames, by kind; changed in place.
+    start_s : float or None
+        Time of the first frame with a pose, at which the grid begins; None before it.
+    rows : int
+        Number of rows completed since the start.
+    last_s : float
+        Largest time of a frame; −∞ before the first.
     """
 
     interval_s: float
@@ -68,7 +94,7 @@ class FrameBuffer:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all frames and wait for a new start."""
+        """Discard all frames, rows and waiting samples, and wait for a new start; `counts` stay."""
         self.start_s: float | None = None
         self.rows = 0
         self.last_s = -np.inf
@@ -85,8 +111,8 @@ class FrameBuffer:
     def marker_samples(
         self, log: Sequence[LoggedRow]
     ) -> Iterator[tuple[float, Array]]:
-        """Yield time and positions (M, 3) of all marker samples; times are in samples from the
-        first row on.
+        """Yield time and positions (M, 3) of all marker samples of `all_samples`; times are in
+        samples from the first row on.
         """
         for of, when, tracks_m in self.all_samples(log):
             if not of:
@@ -111,10 +137,11 @@ class FrameBuffer:
             yield of, (t_s - (self.start_s or 0.0)) / self.interval_s, values
 
     def is_motion_unknown(self, t_s: float) -> bool:
-        """Return whether the time t_s is so long after the last pose that the motion is unknown.
+        """Return whether the time t_s is so long after the last pose that the motion is unknown,
+        that is more than `LARGEST_GAP` samples; false before the first pose.
 
-        This is also the case after many frames in turn that were too late, because the sender's
-        clock was set back.
+        This is also the case after `LARGEST_GAP` frames in turn that were too late, because the
+        sender's clock was set back.
         """
         if self._too_late >= LARGEST_GAP:
             return True
@@ -127,13 +154,14 @@ class FrameBuffer:
         pose: tuple[Array, Array] | None,
         tracks_m: Array,
         instrument_samples: Sequence[InstrumentSample] = (),
-    ) -> tuple[list[LoggedRow], list[Sample], list[str]]:
-        """Add a frame; return the completed rows, the samples after the last row, and notes.
+    ) -> BufferedFrame:
+        """Add a frame; return the rows that it completes, with samples and notes.
 
-        The samples are returned separately only if no row is completed; otherwise the rows contain
-        them. A frame with a known time, or one that is too late, is ignored with a note; of a
-        slightly late frame the pose is ignored, and so is a pose that is implausibly far from the
-        last one. Missing poses are interpolated once the next pose arrives.
+        A frame with the time of an earlier one, or more than `LARGEST_SAMPLE_DELAY` samples before
+        the last frame, is ignored with a note; of a slightly late frame the pose is ignored, and so
+        is a pose that is implausibly far from the last one. Missing poses are interpolated once the
+        next pose arrives. Before the first pose, and while the motion is unknown
+        (`is_motion_unknown`), samples are discarded. Irregularities are counted in `counts`.
 
         Parameters
         ----------
@@ -144,7 +172,8 @@ class FrameBuffer:
         tracks_m : (M, 3)
             Marker positions, NaN where missing.
         instrument_samples : sequence of InstrumentSample
-            Samples of custom sensors and wrenches, each with its own time.
+            Samples of custom sensors and wrenches, each with its own time; those farther than
+            `LARGEST_SAMPLE_DELAY` samples from t_s are discarded.
         """
         sample_s = self.interval_s
         notes = []
@@ -153,10 +182,10 @@ class FrameBuffer:
             for other in self._times
         ):
             self.counts["doubled"] += 1
-            return (
+            return BufferedFrame(
                 [],
                 [],
-                [
+                notes=[
                     f"a frame at {t_s:.6g} s was received before: this one is ignored"
                 ],
             )
@@ -165,10 +194,10 @@ class FrameBuffer:
             if self.last_s - t_s > LARGEST_SAMPLE_DELAY * sample_s:
                 self.counts["late"] += 1
                 self._too_late += 1
-                return (
+                return BufferedFrame(
                     [],
                     [],
-                    [f"the frame at {t_s:.6g} s is too late: ignored"],
+                    notes=[f"the frame at {t_s:.6g} s is too late: ignored"],
                 )
             self.counts["unordered"] += 1
             notes.append(
@@ -200,11 +229,12 @@ class FrameBuffer:
             else:
                 self.counts["without a pose"] += 1
         rows = self._completed_rows()
-        return rows, self._available_samples() if not rows else [], notes
+        late_samples = self._available_samples() if not rows else []
+        return BufferedFrame(rows, late_samples, notes=notes)
 
     def _is_jump(self, t_s: float, positions_m: Array) -> bool:
-        """Return whether a moving grasp is farther from its last position than it can have moved by
-        the time t_s.
+        """Return whether a coordinate of a moving grasp (G, 3) differs from its last one by more
+        than `largest_jump_m` for each sample until t_s, at least one; false before the first pose.
         """
         if not self._poses:
             return False
@@ -215,7 +245,11 @@ class FrameBuffer:
         )
 
     def _note_gaps(self, t_s: float) -> list[str]:
-        """Count missing frames and frames between samples, and return notes about them."""
+        """Count missing frames and frames between samples, and return notes about them.
+
+        Each gap is noted, of frames between samples only the first. Nothing is counted for the
+        first frame.
+        """
         if not np.isfinite(self.last_s):
             return []
         missing = round((t_s - self.last_s) / self.interval_s) - 1
@@ -251,6 +285,7 @@ class FrameBuffer:
         t_s : float
             Time [s], later than that of the previous pose.
         positions_m : (G, 3)
+            Positions of the moving grasps [m].
         quaternions : (G, 4)
             Unit quaternions x y z w of the moving grasps.
         """
@@ -270,8 +305,8 @@ class FrameBuffer:
         return self.start_s + row * self.interval_s / self.substeps
 
     def _completed_rows(self) -> list[LoggedRow]:
-        """Return the rows for which poses are available now, with the samples that are read after
-        them.
+        """Return the rows for which poses are available now, each with the samples that can be
+        evaluated after it, and increase `rows`; none before the first pose.
         """
         rows: list[tuple[Array, Array, list[Sample]]] = []
         if self.start_s is None:
@@ -283,18 +318,21 @@ class FrameBuffer:
             rows.append((*pose, self._available_samples()))
         if not rows:
             return []
-        places, quaternions, readings = zip(*rows, strict=True)
+        positions, quaternions, samples = zip(*rows, strict=True)
         matrices = Rotation.from_quat(np.concatenate(quaternions)).as_matrix()
         rotations = matrices.reshape(len(rows), -1, 3, 3)
-        poses = (
-            tuple(zip(*each, strict=True))
-            for each in zip(rotations, places, strict=True)
-        )
-        return [LoggedRow(*each) for each in zip(poses, readings, strict=True)]
+        logged = []
+        for k, row_samples in enumerate(samples):
+            poses = tuple(zip(rotations[k], positions[k], strict=True))
+            logged.append(LoggedRow(poses, row_samples))
+        return logged
 
     def _pose_at(self, t_s: float) -> tuple[Array, Array]:
         """Return positions (G, 3) and quaternions (G, 4), not normalised, interpolated through the
-        last poses: cubic, or linear across a large gap.
+        last poses, at most four: cubic, or linear between the last two if there is a gap of more
+        than `LARGEST_CUBIC_GAP` samples among them.
+
+        A pose at t_s itself is returned as it is. There must be at least one pose.
         """
         for at_s, positions_m, quaternions in self._poses:
             if abs(at_s - t_s) <= TIME_TOLERANCE_S:
@@ -317,7 +355,10 @@ class FrameBuffer:
 
     def _available_samples(self) -> list[Sample]:
         """Return the waiting samples that can be evaluated with the rows so far, and remove them
-        from the buffer; samples before the start are discarded.
+        from the buffer.
+
+        Samples before the start are discarded once they could be evaluated. Empty, and without
+        effect, before the first row.
         """
         if self.start_s is None or not self.rows:
             return []
@@ -327,7 +368,9 @@ class FrameBuffer:
         latest_s = now_s - self.neighbouring_samples * self.interval_s + room_s
 
         def ready(of: int, t_s: float) -> bool:
-            """Return whether the rows that a sample needs are available."""
+            """Return whether the rows that a sample at t_s needs are available; `of` is the number
+            of its instrument, 0 for markers.
+            """
             if not of:
                 return t_s <= latest_s
             instrument = self.instruments[of - 1]
@@ -345,6 +388,6 @@ class FrameBuffer:
             if each[1] >= self.start_s - (0 if each[0] else room_s)
         ]
         return [
-            Sample((now_s - t_s) / step_s, values, of)
+            Sample((now_s - t_s) / step_s, values, instrument=of)
             for of, t_s, values in available
         ]

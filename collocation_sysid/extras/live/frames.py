@@ -50,10 +50,10 @@ class Frame:
     pose : (positions, quaternions) or None
         Positions (G, 3) and quaternions (G, 4) of the grasps that move; None if missing.
     tracks_m : (M, 3)
-        Marker positions; NaN where missing.
+        Marker positions [m]; NaN where missing.
     has_wrench : bool
         Whether the frame contains a wrench, even if the problem has no sensor for it.
-    instrument_samples : tuple of OutputOptions
+    instrument_samples : tuple of InstrumentSample
         Samples of instruments, at their own times.
     """
 
@@ -112,7 +112,19 @@ def parse_pose(
 
 
 def _parse_single_pose(pose: Pose) -> tuple[Array, Array]:
-    """Return position (3,) and unit quaternion (4,) of one pose."""
+    """Return position (3,) [m] and unit quaternion (4,), x y z w, of one pose.
+
+    Parameters
+    ----------
+    pose : mapping, tuple or (4, 4) array
+        See `parse_pose`; a tuple of two values is (position, quaternion), anything else a matrix.
+
+    Raises
+    ------
+    InputError
+        If the mapping lacks a key, or if position, quaternion or matrix are not those of a pose
+        (NaN or None included).
+    """
     if isinstance(pose, Mapping):
         if missing := [key for key in _POSE_KEYS if key not in pose]:
             raise InputError(
@@ -138,13 +150,17 @@ def _parse_single_pose(pose: Pose) -> tuple[Array, Array]:
 def parse_markers(
     markers: ArrayLike | Mapping[str, Any] | None, names: Sequence[str]
 ) -> Array:
-    """Return marker positions (M, 3), NaN where missing.
+    """Return marker positions (M, 3) [m], NaN where missing.
+
+    A marker of which any coordinate is None or NaN is missing as a whole.
 
     Parameters
     ----------
     markers : (M, 3) array, mapping of name to (3,), or None
+        Positions in the order of `names`, or by name; all are missing if None. In a mapping,
+        markers that are omitted or None are missing.
     names : sequence of str
-        Names of the markers.
+        Names of the M markers.
 
     Raises
     ------
@@ -178,10 +194,11 @@ def parse_custom_readings(
     Parameters
     ----------
     readings : mapping of name to samples, or None
+        Samples in the forms of `_parse_samples`; None for no samples.
     gauges : sequence of Gauge
-        Custom sensors of the problem.
+        Custom sensors of the problem; instrument k is the k-th of them, from 1.
     t_s : float
-        Time of the frame.
+        Time of the frame [s].
 
     Raises
     ------
@@ -218,18 +235,23 @@ def parse_wrenches(
     instruments_before: int,
     t_s: float,
 ) -> tuple[InstrumentSample, ...]:
-    """Return samples of the sensors of grasps, each as number of the instrument, time and values; a
-    sample without a time has the time of the frame.
+    """Return samples of the sensors of grasps, each as number of the instrument, time and values
+    (6,); a sample without a time has the time of the frame.
+
+    Components that the sensor does not measure are NaN, and so are all torques if only three
+    values are given. Empty if `wrench_data` is None or the problem has no sensor.
 
     Parameters
     ----------
     wrench_data : wrench, mapping of grasp number to wrench, or None
+        Force [N] and torque [N m], 6 values or the first 3 of them, in the forms of
+        `_parse_samples`. The number of the grasp, as text, may be omitted if there is one sensor.
     wrenches : mapping of grasp number to Wrench
-        Sensors of the problem.
+        Sensors of the problem, by the number of the grasp from 1 on.
     instruments_before : int
         Number of instruments that precede these sensors.
     t_s : float
-        Time of the frame.
+        Time of the frame [s].
 
     Raises
     ------
@@ -364,6 +386,11 @@ class FrameReader:
         state.
     wrenches : mapping of grasp number to Wrench
         Sensors of grasps of the problem.
+
+    Attributes
+    ----------
+    line : int
+        Number of lines read so far, empty ones included.
     """
 
     def __init__(
@@ -383,7 +410,10 @@ class FrameReader:
         self._columns: list[str] | None = None
 
     def read(self, text: str) -> Frame | None:
-        """Return the frame of a line; None for an empty line, a comment or the header.
+        """Return the frame of a line; None for an empty line, a comment (``#``) or the header.
+
+        A line that begins with a brace is a JSON object, any other one belongs to the table, whose
+        first line is the header; both may alternate.
 
         Raises
         ------
@@ -403,8 +433,15 @@ class FrameReader:
             raise InputError(f"{where}: {error.message}") from error
 
     def _parse_object(self, json_object: Mapping[str, Any]) -> Frame:
-        """Return the frame of a JSON object; raise an `InputError` for unknown keys, and without
-        t_s.
+        """Return the frame of a JSON object.
+
+        The keys are those in `_KEYS`; all but "t_s" may be omitted or null, which means that
+        nothing was measured.
+
+        Raises
+        ------
+        InputError
+            For an unknown key, without "t_s", or for an invalid value.
         """
         if unknown := [key for key in json_object if key not in _KEYS]:
             raise InputError(
@@ -431,7 +468,17 @@ class FrameReader:
         )
 
     def _parse_row(self, cells: list[str]) -> Frame | None:
-        """Return the frame of a row of a table; None for the header, whose columns are stored."""
+        """Return the frame of a row of a table; None for the first row, the header, whose columns
+        are stored.
+
+        The pose is missing if any cell of any moving grasp is NaN or empty. Columns of markers and
+        instruments may be absent. An instrument without any number in the row has no sample.
+
+        Raises
+        ------
+        InputError
+            For an invalid header, a wrong number of cells, or a cell that is not a number.
+        """
         if self._columns is None:
             self._columns = self._checked_header(cells)
             return None
@@ -481,7 +528,9 @@ class FrameReader:
 
     @property
     def _instrument_columns(self) -> list[Sequence[str]]:
-        """Column names of each instrument."""
+        """Column names of each instrument: custom sensors, then sensors of grasps; the latter with
+        the number of the grasp and a dot in front if there are several.
+        """
         before = [
             "" if len(self.wrenches) == 1 else f"{number}."
             for number in self.wrenches
@@ -517,7 +566,9 @@ class FrameReader:
 
 
 def _parse_json(text: str) -> Mapping[str, Any]:
-    """Return the JSON object of a line, or raise an `InputError`."""
+    """Return the JSON object of a line that begins with a brace, or raise an `InputError` if it is
+    not valid JSON.
+    """
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
@@ -534,7 +585,9 @@ def _parse_json(text: str) -> Mapping[str, Any]:
 
 
 def parse_time(time: Any) -> float:
-    """Return a time [s] as a float, or raise an `InputError` if it is not a finite number."""
+    """Return a time [s] as a float; raise an `InputError` if it is not a number (text, boolean,
+    None, NaN) or beyond `LARGEST_NUMBER` in magnitude.
+    """
     number = isinstance(time, (int, float, np.number)) and not isinstance(
         time, bool
     )

@@ -66,7 +66,11 @@ def sparkline(values: Sequence[float], columns: int = COLUMNS) -> str:
 
 
 def display_of(updates: Sequence[LiveUpdate]) -> list[Shown]:
-    """Return the display of the last update, with the history of the estimates."""
+    """Return the display of the last of at least one update: a line of text, a table of the
+    estimates with their history as bars, and the verdict.
+
+    All updates must have the same parameters. Unknown standard errors are empty.
+    """
     last = updates[-1]
     rows = []
     for name, estimate in last.estimates.items():
@@ -97,8 +101,8 @@ def display_of(updates: Sequence[LiveUpdate]) -> list[Shown]:
 def final_display(
     updates: Sequence[LiveUpdate], settled: LiveUpdate
 ) -> list[Shown]:
-    """Return the display of the final estimate `settled`, and the median and 99 % quantile of the
-    latency of the frames, at least one.
+    """Return the display of the final estimate `settled`, as by `display_of`, and a line with the
+    median and 99 % quantile of the latency of the frames in `updates`, at least one.
     """
     took_ms = 1e3 * np.array([update.latency_s for update in updates])
     median, late = np.percentile(took_ms, [50, 99])
@@ -110,7 +114,7 @@ def final_display(
 
 
 def require_gif(file: Path) -> None:
-    """Raise an `InputError` unless the file is a GIF."""
+    """Raise an `InputError` unless the file's name ends in .gif, in any case of letters."""
     if file.suffix.lower() != ".gif":
         raise InputError(
             f"found '{file.suffix}'; expected .gif", file, where="--film"
@@ -118,12 +122,26 @@ def require_gif(file: Path) -> None:
 
 
 def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
-    """Write the estimates with their intervals as a growing plot in a GIF; return its path.
+    """Write the estimates with their statistical intervals as a growing plot in a GIF.
+
+    The film runs in real time, at most `FRAMES_A_SECOND`; an existing file is replaced.
+
+    Parameters
+    ----------
+    updates : sequence of LiveUpdate
+        At least one update, in order of time, all with the same parameters.
+    file : str or Path
+        File to write.
+
+    Returns
+    -------
+    Path
+        Path of the file.
 
     Raises
     ------
     InputError
-        If the file is not a GIF.
+        If the name of the file does not end in .gif.
     """
     path = Path(file)
     require_gif(path)
@@ -157,8 +175,23 @@ def _draw_parameter(
     t_s: Array,
     updates: Sequence[LiveUpdate],
 ) -> tuple[list, list[Array]]:
-    """Return the lines of a parameter's value and interval, without data yet, and their future
-    data.
+    """Add the axes of a parameter to a figure; return the three lines of its value and of the ends
+    of its interval, without data yet, and their data (T,), NaN for ends that are unknown.
+
+    Parameters
+    ----------
+    figure : Figure
+        Modified in place.
+    k : int
+        Index of the panel, from the top.
+    count : int
+        Number of panels.
+    name : str
+        Name of the parameter.
+    t_s : (T,)
+        Times of the updates.
+    updates : sequence of LiveUpdate
+        Updates that contain the parameter.
     """
     estimates = [update.estimates[name] for update in updates]
     value = np.array([each.value for each in estimates])

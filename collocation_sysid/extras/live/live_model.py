@@ -22,14 +22,16 @@ MIDDLE_PA = 1e4
 
 
 def model_from_problem(problem: Problem) -> StreamingModel:
-    """Return the model of a problem with one fitted experiment.
+    """Return the model of a problem with one fitted experiment; held-out experiments are ignored.
 
-    Parameters without a guess take typical values for the stiffness `MIDDLE_PA`.
+    Parameters without a guess take typical values for the stiffness `MIDDLE_PA`; those with a
+    guess keep it.
 
     Raises
     ------
     InputError
-        If the problem has a feature that live estimation does not support.
+        If not exactly one experiment is fitted, or if it has a feature that live estimation does
+        not support.
     """
     experiment = _only_experiment(problem)
     collocation = problem.collocation()
@@ -40,8 +42,13 @@ def model_from_problem(problem: Problem) -> StreamingModel:
 
 
 def _only_experiment(problem: Problem) -> Experiment:
-    """Return the single fitted experiment of a problem, or raise an `InputError` if it is
-    unsuitable.
+    """Return the single fitted experiment of a problem.
+
+    Raises
+    ------
+    InputError
+        If not exactly one experiment is fitted, or for the first of its features that live
+        estimation does not support.
     """
     fitted = [each for each in problem.experiments if not each.validation]
 
@@ -66,7 +73,9 @@ def _only_experiment(problem: Problem) -> Experiment:
 def _unsupported_features(
     experiment: Experiment,
 ) -> Iterator[tuple[str, object, str]]:
-    """Yield description, presence and alternative of each feature that live estimation lacks."""
+    """Yield each feature that live estimation lacks: its description, a value that is true if the
+    experiment has the feature, and the supported alternative.
+    """
     body = experiment.body
     grasps = experiment.grasps
     nuisance = experiment.nuisance

@@ -55,8 +55,9 @@ class ResidualScatter:
         """Return RMS and lag-one autocorrelation of residuals (M, 3) of consecutive samples, in
         standard deviations, NaN where missing.
 
-        The autocorrelation is zero if it is not significant or there are too few samples; both are
-        zero without residuals.
+        The autocorrelation is zero if it is not significant (or negative) or if there are fewer
+        than `FEWEST_SAMPLES` samples, and at most `LARGEST_AUTOCORRELATION`; both are zero without
+        residuals that are not NaN.
         """
         if not residuals:
             return cls()
@@ -95,8 +96,10 @@ def variance_factor(
     p : (P,)
         Estimate in transformed parameters.
     parameter_count : float
-        Number of fitted parameters.
+        Number of fitted parameters; the degrees of freedom are the rows of `known` less this
+        number, at least 1.
     scatter : ResidualScatter
+        Autocorrelation of the residuals; its RMS is not used.
     """
     freedom = max(1.0, known.row_count - parameter_count)
     loss = known.loss(p)
@@ -111,15 +114,17 @@ def variance_factor(
 def data_concerns(
     scatter: ResidualScatter, counts: Counter[str], samples: int
 ) -> list[Concern]:
-    """Return the concerns due to residuals, and to samples that were left out.
+    """Return the concerns due to residuals, outliers and restarts; empty if there are none.
 
     Parameters
     ----------
     scatter : ResidualScatter
+        Size and autocorrelation of the residuals.
     counts : Counter
-        Numbers of irregularities, by kind.
+        Numbers of irregularities, by kind; those of outliers ("wild") and of restarts
+        ("begun anew") are used.
     samples : int
-        Number of marker samples so far.
+        Number of marker positions measured so far, each marker of each frame counted once.
     """
     outlier_share = counts["wild"] / max(1, samples)
     restarts = counts["begun anew"]
@@ -151,11 +156,15 @@ def data_concerns(
 def estimate_concerns(
     estimates: Mapping[str, Estimate], distance: float
 ) -> list[Concern]:
-    """Return the concerns due to the estimates themselves.
+    """Return the concerns due to the estimates themselves; empty if there are none.
+
+    One concern if the estimate may still change (`LARGEST_SETTLED_DISTANCE`), and one for each
+    parameter that is at a bound or, otherwise, has a reason why it is not determined.
 
     Parameters
     ----------
     estimates : mapping of name to Estimate
+        Current estimates.
     distance : float
         Distance of the estimate from the linearisation point, in standard errors.
     """

@@ -40,6 +40,9 @@ def receive_datagrams(
 ) -> Iterator[str]:
     """Yield lines that arrive as UDP datagrams at a port of this machine, until an empty datagram.
 
+    A datagram may contain several lines; a line does not continue in the next datagram. Datagrams
+    longer than `DATAGRAM_BYTES` are cut.
+
     Parameters
     ----------
     port : int
@@ -65,26 +68,48 @@ def read_problem(
 ) -> Problem:
     """Return the problem of a file, or that of the folder of a run.
 
+    Parameters
+    ----------
+    recording : Path
+        Problem file; or the folder of a run, whose copy of the problem is read, with data files
+        relative to the folder of the original problem.
+    overrides : sequence of str
+        Changes of keys, as in the option ``--set``.
+    allow_code : bool
+        Whether Python code to which the problem refers may be executed.
+
     Raises
     ------
     InputError
-        If there is none.
+        If the file or folder has no valid problem.
     """
     if not recording.is_dir():
-        return Problem.read(recording, overrides, allow_code)
+        return Problem.read(recording, overrides, allow_code=allow_code)
     home = Result.read(recording).problem_folder(
         recording, "which a replay needs"
     )
     return Problem.read(
-        recording / "problem.toml", overrides, allow_code, folder=home
+        recording / "problem.toml",
+        overrides,
+        allow_code=allow_code,
+        folder=home,
     )
 
 
 def frames_of_recording(
     experiment: Experiment, model: StreamingModel
 ) -> Iterator[Frame]:
-    """Yield the frames of an experiment's recording in the order of time; samples of instruments
-    come with the first frame that is not earlier.
+    """Yield the frames of an experiment's recording, one for each sample time of `experiment`.
+
+    Each has the poses of the moving grasps and the markers of that time. Samples of instruments
+    come with the first frame that is not earlier; those after the last frame are left out.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment whose markers are measured at its sample times.
+    model : StreamingModel
+        Model of the experiment, which gives the moving grasps and the order of the instruments.
     """
     poses = [
         experiment.grasps[k].poses.at(experiment.t_s)
@@ -131,14 +156,19 @@ def paced_frames(
     clock: Callable[[], float] = time.monotonic,
     wait: Callable[[float], None] = time.sleep,
 ) -> Iterator[Frame]:
-    """Yield frames at a rate; after a delay the next ones follow immediately.
+    """Yield frames at a constant rate, whatever their own times; the first one immediately.
+
+    Frame k is due k / `rate_hz` after the first; after a delay the overdue ones follow
+    immediately.
 
     Parameters
     ----------
     frames : iterator of Frame
+        Frames to pass on unchanged.
     rate_hz : float
+        Frames per second, above zero.
     clock, wait : callable
-        Time in seconds, and a function that waits.
+        Function that returns a time [s], and a function that waits for a time [s].
     """
     began = clock()
     for number, frame in enumerate(frames):
@@ -163,7 +193,13 @@ def without_garbage_of_startup() -> Iterator[None]:
 
 
 def update_as_json(update: LiveUpdate) -> str:
-    """Return an update as a line of JSON; unknown values are null."""
+    """Return an update as one line of JSON, without line break.
+
+    The keys are "t_s", "parameters" (by name "value", "statistical_std_error" and
+    "statistical95"), "trust" ("verdict" and "reasons"), "marker_rms_m", "latency_s" (rounded to
+    microseconds) and "notes". Standard errors and intervals that are None, and a NaN marker
+    error, are null; `relinearised` is left out.
+    """
     parameters = {
         name: {
             "value": each.value,

@@ -25,11 +25,16 @@ TRIED_PA = STIFFEST_PA * 10.0 ** (-0.5 * np.arange(11))
 
 
 class StiffnessSearch:
-    """Search for initial values, from stiff to soft.
+    """Search for initial values with one trial per stiffness of `TRIED_PA`, from stiff to soft.
+
+    The parameters of a trial are typical ones of a body with that Young's modulus. The search
+    runs no simulation itself: the caller computes a pass at `next_trial` and hands it to
+    `record_trial`, until `is_done`.
 
     Parameters
     ----------
     model : StreamingModel
+        Model whose guesses are replaced.
     phi : (k,)
         Nuisance parameters of every trial.
 
@@ -64,10 +69,16 @@ class StiffnessSearch:
         )
 
     def record_trial(self, track: WindowPass) -> None:
-        """Record the loss of a pass as the result of the next trial.
+        """Record the loss of a pass as the result of the next trial; a failed pass has an infinite
+        loss.
 
-        After at least one success and at least three trials, two in a row that are far worse than
-        the best end the search.
+        After at least one success and at least three trials, the search ends if each of the last
+        two losses exceeds `FAILURE_RATIO` times the smallest one.
+
+        Raises
+        ------
+        IndexError
+            If no trial is left.
         """
         self._waiting.pop(0)
         self._tried.append(
@@ -83,8 +94,8 @@ class StiffnessSearch:
 
     @property
     def best(self) -> Array | None:
-        """Parameters p of the trial with the smallest loss; None if every trial failed. At least
-        one trial must be recorded.
+        """Linearisation point p, at its end, of the pass with the smallest loss; None if every
+        trial failed. At least one trial must be recorded (otherwise `ValueError`).
         """
         loss, p = min(self._tried, key=lambda each: each[0])
         return p if np.isfinite(loss) else None

@@ -44,6 +44,9 @@ class TimeBudget:
     def from_times(cls, one_s: float, many_s: float, many: int) -> TimeBudget:
         """Return the budget from the times [s] of one time step and of `many` that are computed
         together.
+
+        The time of a further step is limited to values from 0 to `one_s`, since measurements
+        scatter; it is `one_s` if `many` is 1.
         """
         more_s = (many_s - one_s) / (many - 1) if many > 1 else one_s
         return cls(one_s, min(max(more_s, 0.0), one_s))
@@ -51,6 +54,9 @@ class TimeBudget:
     def affordable_steps(self, remaining_s: float) -> int:
         """Return how many time steps fit into the remaining time [s] of a frame, after the time for
         the work that follows; 0 if none.
+
+        Expected times are multiplied by `delay`. If the time of a further step is zero or not
+        known, the number is at most 1.
         """
         remaining_s -= self.after_s
         spare_s = remaining_s / self.delay - self.first_s
@@ -86,6 +92,6 @@ class TimeBudget:
         self.after_s = max(REMAINDER_DECAY * self.after_s, took_s)
 
     def start_frame(self) -> None:
-        """Start another frame: let the recorded delays decay."""
+        """Start another frame: let `delay` (not below 1) and `turn_s` decay, in place."""
         self.delay = max(1.0, DELAY_DECAY * self.delay)
         self.turn_s *= DELAY_DECAY

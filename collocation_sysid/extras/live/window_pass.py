@@ -63,6 +63,7 @@ class WindowPass:
     Parameters
     ----------
     model : StreamingModel
+        Model of the recording.
     p : (P,)
         Linearisation point, parameters that are not transformed.
     prior : SquareRootInformation
@@ -77,7 +78,14 @@ class WindowPass:
     rows : int
         Number of rows in the window so far.
     has_failed : bool
-        Whether a row could not be solved.
+        Whether a row could not be solved; set by the user of the class.
+    start : (SweepState or None, (P,) array)
+        State before the window, None at the start of the recording, and the parameters at which it
+        is linearised; by default those of the first block of `base`.
+    sweep : StreamingSweep
+        Time marching with sensitivities; replaced by `relinearise_at`.
+    blocks : list of WindowBlock
+        Blocks of the window, the oldest first.
     """
 
     def __init__(
@@ -133,11 +141,15 @@ class WindowPass:
         """Compute further rows of one block and return how many; `add_residuals` adds their
         samples.
 
+        A new block begins if the last one is full. Without guesses, neither given nor from `base`,
+        `StreamingSweep.advance` decides where to start.
+
         Parameters
         ----------
         poses : sequence of Poses
+            Poses of the moving grasps at the rows, at most `remaining_rows_of_block`.
         guesses : sequence of (3n,), optional
-            Initial guesses of the positions; by default those of `base`, otherwise extrapolated.
+            Initial guesses of the positions; by default from the rows of `base`, if it has them.
 
         Raises
         ------
@@ -191,7 +203,9 @@ class WindowPass:
 
     @property
     def linearisation_points(self) -> list[Array]:
-        """Transformed parameters at which the rows of the window are linearised."""
+        """Transformed parameters (P,) at which the rows of the window are linearised, in order of
+        the rows; one for each change.
+        """
         return self.linearisation_points_from(0)
 
     def linearisation_points_from(self, row: int) -> list[Array]:
@@ -213,7 +227,9 @@ class WindowPass:
         ]
 
     def add_residuals(self, residuals: Sequence[LinearisedResidual]) -> None:
-        """Add the linearised residuals of samples after the last rows."""
+        """Add the linearised residuals of samples to the last block and to the information; at
+        least one row must have been computed.
+        """
         self.blocks[-1].residuals += residuals
         self.sweep.add_residuals(residuals)
 
@@ -225,8 +241,14 @@ class WindowPass:
         ]
 
     def repeat_rows(self, rows: Sequence[LoggedRow]) -> None:
-        """Compute logged rows and add their samples, as many at once as the block allows; raise
-        `SimulationError` if one cannot be solved.
+        """Compute the first of the logged rows, at most `repeatable_rows`, and add their samples.
+
+        The rows after them are ignored; `rows` tells how many were computed.
+
+        Raises
+        ------
+        SimulationError
+            If a row cannot be solved.
         """
         done = self.add_rows(
             [row.poses for row in rows[: self.repeatable_rows]]
@@ -240,7 +262,9 @@ class WindowPass:
 
     @property
     def remaining_rows_of_block(self) -> int:
-        """Largest number of rows that can be computed at once: those left in the block."""
+        """Largest number of rows that can be computed at once: those left in the block, or in a new
+        one if it is full, at most `StreamingModel.rows_per_chunk`.
+        """
         return min(
             self.model.rows_per_chunk,
             self.block_rows - self.rows % self.block_rows,
@@ -248,12 +272,16 @@ class WindowPass:
 
     @property
     def repeatable_rows(self) -> int:
-        """Largest number of rows that can be repeated at once; 1 without an initial guess."""
+        """Largest number of rows that can be computed at once with initial guesses from `base`; 1
+        if there are none.
+        """
         rows_of_base = 0 if self.base is None else self.base.rows - self.rows
         return max(1, min(rows_of_base, self.remaining_rows_of_block))
 
     def _rows_of_base(self, count: int) -> list[StoredRow]:
-        """Return the next `count` rows of the pass that is repeated; none if it has fewer."""
+        """Return the next `count` rows of `base`; an empty list without `base`, or if it has
+        fewer.
+        """
         if self.base is None or self.rows + count > self.base.rows:
             return []
         places = (divmod(self.rows + k, self.block_rows) for k in range(count))
@@ -266,14 +294,17 @@ class WindowPass:
         """Return initial guesses of positions, (3n,) each, from rows of the pass that is repeated.
 
         Each is extrapolated to p with the sensitivities of its row; the error of this prediction at
-        the last two rows is extrapolated and added.
+        the last two rows is extrapolated linearly and added. If the error is known at one row only,
+        it is taken as constant, and as zero if at none. Empty if `known` is empty.
         """
         if not known:
             return []
-        # Straight on from the last two, where there are two.
-        previous_error, last_error = (
-            [np.zeros_like(known[0].x)] * 2 + self._off[:1] + self._off
-        )[-2:]
+        if self._off:
+            last_error = self._off[-1]
+            previous_error = self._off[-2] if len(self._off) > 1 else last_error
+        else:
+            last_error = np.zeros_like(known[0].x)
+            previous_error = last_error
         predicted = map(self._predicted_positions, known)
         return [
             x + last_error + k * (last_error - previous_error)
@@ -298,9 +329,10 @@ class WindowPass:
         return base.x + base.columns @ step.astype(np.float32)
 
     def drop_oldest_block(self) -> int:
-        """Add the oldest block to the prior and remove it from the window.
+        """Add the samples of the oldest block to the prior and remove the block from the window;
+        return its number of rows.
 
-        Return its number of rows.
+        `start` becomes the state before the next block; there must be at least two blocks.
         """
         block = self.blocks.pop(0)
         self.rows -= len(block.stored_rows)
@@ -335,6 +367,7 @@ class CombinedPasses(NamedTuple):
     Attributes
     ----------
     information : SquareRootInformation
+        Information in transformed parameters, including the priors.
     residuals : list of LinearisedResidual
         Linearised residuals of all samples.
     points : list of (P,)
@@ -349,10 +382,13 @@ class CombinedPasses(NamedTuple):
     def from_passes(
         cls, track: WindowPass, again: WindowPass | None
     ) -> CombinedPasses:
-        """Return the joint information of a pass and of a repetition that has nearly caught up with
-        it.
+        """Return the joint information of a pass `track` and of a repetition `again` that has
+        nearly caught up with it: the samples that both have count from the repetition, the rest
+        from the pass.
 
-        If the repetition is None, has failed or lags behind too far, that of the pass alone.
+        If the repetition is None, has failed, has no base (a trial of other initial values), or
+        lags behind by more than `LARGEST_LAG` samples or than its own samples, the information is
+        that of the pass alone.
         """
         residuals = track.residuals
         repeated = (
@@ -367,7 +403,9 @@ class CombinedPasses(NamedTuple):
             or not repeated
             or len(remaining) > min(LARGEST_LAG, len(repeated))
         ):
-            return cls(track.information, residuals, track.linearisation_points)
+            return cls(
+                track.information, residuals, points=track.linearisation_points
+            )
         points = [
             *again.linearisation_points,
             *track.linearisation_points_from(again.rows),
@@ -375,7 +413,7 @@ class CombinedPasses(NamedTuple):
         return cls(
             track.sweep.with_residuals(again.information, remaining),
             [*repeated, *remaining],
-            points,
+            points=points,
         )
 
     def scatter(self, transformed: Array) -> ResidualScatter:

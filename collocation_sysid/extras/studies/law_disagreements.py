@@ -25,9 +25,9 @@ from ...statistics.estimates import IntervalCoordinate
 from ...statistics.remedies import LAW
 from .study_rows import Row
 
-# Ratio of what alike models find beyond which they disagree.
+# Ratio of the largest to the smallest estimate above which equally good models disagree.
 LEAST_DISAGREEMENT_RATIO = 1.05
-# Moduli at small strain, which every law has; with dampings what means the same by any.
+# Moduli at small strain, which mean the same in every law, as damping coefficients do.
 MODULI = ("young_pa", "poisson")
 
 
@@ -86,14 +86,15 @@ def find_disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
 
     Compared are Young's modulus, Poisson's ratio and damping coefficients, also of regions, that
     all models have with positive estimates. They differ notably if the largest estimate is more
-    than `LEAST_DISAGREEMENT_RATIO` times the smallest.
+    than `LEAST_DISAGREEMENT_RATIO` times the smallest. The order is that of the chosen model's
+    parameters; empty if none differs.
 
     Parameters
     ----------
     rows : sequence of Row
         Models that predict equally well.
     chosen : Row
-        Chosen model, one of them.
+        Chosen model, one of them (the same object).
     """
     others = [row for row in rows if row is not chosen]
     result = []
@@ -123,8 +124,18 @@ def _disagreement(
     values: Mapping[str, float],
     budget_line: Mapping[str, object] | None,
 ) -> Disagreement:
-    """Return the disagreement of one parameter: its values by model, and the chosen model's budget
-    with the choice of the law as a further source; without a budget line the intervals are None.
+    """Return the disagreement of one parameter.
+
+    Parameters
+    ----------
+    name : str
+        Name of the parameter.
+    values : mapping of str to float
+        Positive estimates by model, the chosen one first.
+    budget_line : mapping or None
+        Fields of the chosen model's `BudgetLine`, to which the choice of the law is added as a
+        further source; None if it is unknown, which leaves budget and interval None and the share
+        0.
     """
     if budget_line is None:
         return Disagreement(
@@ -140,7 +151,7 @@ def _disagreement(
     with_law = line.with_source(
         LAW,
         float(np.sqrt(np.mean((coordinates - coordinates[0]) ** 2))),
-        coordinate,
+        coordinate=coordinate,
     )
     return Disagreement(
         name,
@@ -152,7 +163,10 @@ def _disagreement(
 
 
 def law_table(differences: Sequence[Disagreement]) -> Table:
-    """Return a table of estimates by law, with their spread and the chosen law's intervals."""
+    """Return a table of estimates by law, with their spread (largest over smallest estimate, less
+    one) and the chosen law's intervals without and with the choice of the law; intervals that are
+    unknown are empty.
+    """
     laws = dict.fromkeys(model for each in differences for model in each.values)
     rows = []
     for each in differences:

@@ -73,7 +73,7 @@ LIKELY = 1.0
 def model_rows(
     planned: Sequence[PlannedRun], records: Mapping[str, Record]
 ) -> list[Row]:
-    """Return one row for each model, in their order.
+    """Return one row for each model, in the order of the first run of each.
 
     Parameters
     ----------
@@ -85,7 +85,12 @@ def model_rows(
     Returns
     -------
     list of Row
-        Values are None if they are not known.
+        By key: "model", "status" ("missing" if the fit to all recordings is not done), "converged",
+        "free" (number of parameters), "unit" of the errors, "rms" of the fit to all, "held_out_rms"
+        over all predictions, "predictions" and "blocks" by recording, "failures" (messages by
+        recording), "evidence", "parameters", "budget", "total_s", "independent", "delta_aic" (AIC
+        less the smallest), "log_ratio" and "log_ratio_error" (prediction error relative to the
+        best), "chosen". Values are None if they are not known.
     """
     of_model: dict[str, dict[str, Any]] = {}
     for run in planned:
@@ -103,8 +108,16 @@ def model_rows(
 
 
 def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
-    """Return the row of a model from its fits by name of the held-out recording; "" is the fit to
-    all. Unknown values are None.
+    """Return the row of a model from its fits, without the columns that compare models; see
+    `model_rows`.
+
+    Parameters
+    ----------
+    label : str
+        Name of the model.
+    fits : mapping of str to mapping
+        Results of `fit_record` by name of the held-out recording, "" for the fit to all; empty
+        mappings for runs without a result.
     """
     complete_fit = fits.get("", {})
     predictions = {
@@ -138,7 +151,9 @@ def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
 
 
 def _pooled_rms(predictions: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the RMS over all predictions; None if one is missing or their units differ."""
+    """Return the RMS over the samples of all predictions; None if there is none, one is missing, or
+    their units differ.
+    """
     if not predictions or any(each.get("rms") is None for each in predictions):
         return None
     if len({each["unit"] for each in predictions}) > 1:
@@ -166,8 +181,9 @@ def _add_criterion(rows: Sequence[Row]) -> None:
 
 
 def _add_ratios(rows: Sequence[Row]) -> None:
-    """Add to each row, in place, the logarithm of the ratio of its prediction error to the smallest
-    one, with its standard error; None without a prediction.
+    """Add "log_ratio", the logarithm of the ratio of its prediction error to the smallest one, and
+    its standard error "log_ratio_error" to each row, in place; both None without a prediction of
+    all held-out data.
     """
     best = _best_prediction(rows)
     for row in rows:
@@ -208,18 +224,19 @@ def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
 
 
 def _best_prediction(rows: Sequence[Row]) -> Row | None:
-    """Return the converged model with the smallest prediction error for held-out data; None if
-    nothing was predicted.
+    """Return the converged model with the smallest prediction error for held-out data; None if no
+    converged model has predicted all recordings.
     """
     predicted = [r for r in rows if r["converged"] and r["held_out_rms"]]
     return min(predicted, key=lambda r: r["held_out_rms"], default=None)
 
 
 def chosen_row(rows: Sequence[Row]) -> Row | None:
-    """Return the model to use: the one with fewest parameters among those that predict equally
-    well; None if none could be fitted.
+    """Return the model to use: the one with fewest parameters among those that predict as well as
+    the best within `LIKELY` standard errors, of several the one with the smallest error.
 
-    Without predictions it is the one with the least AIC.
+    If nothing was predicted it is the one with the least AIC; None if none has an AIC either. The
+    rows must have "delta_aic" and "log_ratio".
     """
     best = _best_prediction(rows)
     if best is None:
@@ -244,7 +261,8 @@ def _equally_good(rows: Sequence[Row], errors: float) -> list[Row]:
 
 
 def advice(rows: Sequence[Row]) -> str:
-    """Return in words which model to use, why, and how certain that is.
+    """Return in words which model to use, why, and how certain that is, and in which estimates
+    equally good laws disagree.
 
     Parameters
     ----------
@@ -298,8 +316,8 @@ def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
 
 
 def _failed_prediction(row: Row, chosen: Row) -> str:
-    """Return a sentence on a model with which some held-out samples cannot be predicted, and on its
-    AIC if that speaks for it.
+    """Return a sentence on the model `row`, with which some held-out samples cannot be predicted,
+    and on its AIC if that is lower than that of the `chosen` model by more than `NO_SUPPORT`.
     """
     without = " and ".join(
         f"'{name}'" for name, rms in row["predictions"].items() if not rms
@@ -343,8 +361,8 @@ def display_unit(unit: str) -> tuple[float, str]:
 
 
 def _log_ratio_between(chosen: Row, rival: Row) -> tuple[float, float]:
-    """Return the logarithmic ratio of the rival's error to the chosen model's, and its
-    standard error.
+    """Return the logarithm of the ratio of the rival's prediction error to the chosen model's, and
+    its standard error: the larger of those of both relative to the best.
     """
     ratio = rival["log_ratio"] - chosen["log_ratio"]
     return ratio, max(rival["log_ratio_error"], chosen["log_ratio_error"])
@@ -372,7 +390,10 @@ def _certainty(chosen: Row, rival: Row) -> str:
 
 
 def model_notes(rows: Sequence[Row]) -> list[str]:
-    """Return notes that explain the table and list failures."""
+    """Return notes that explain the table and list failures: what is held out, the equivalent
+    number of independent measurements if known, models that did not converge, and failed
+    predictions. There must be at least one row.
+    """
     names = rows[0]["predictions"]
     test_data = (
         "each recording in turn"
@@ -490,12 +511,13 @@ def _independent_measurements(
 
 # Share of a single recording that is fitted.
 FITTED = 2 / 3
-# Parts in time of what is held out: longer than most errors persist, and enough to see a scatter.
+# Number of blocks in time of held-out data: each longer than most errors persist, and enough of
+# them for a standard deviation.
 BLOCKS = 8
 
 
 def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
-    """Fit a model to all recordings, or to all but the held-out one, and return its fit and
+    """Fit a model to all recordings, or to all but the held-out data, and return its fit and
     prediction.
 
     Parameters
@@ -505,13 +527,20 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     method : str
         Name of the method.
     test_name : str
-        Recording that is predicted; "" to fit all.
+        Fitted recording that is predicted, see `reserve_test_data`; "" to fit all.
 
     Returns
     -------
     dict
-        Status, parameters and RMS; with converged fits also "evidence" and "budget" if all are
-        fitted, else "prediction", which is None with a "failure" if the simulation failed.
+        "status", "converged", "rms" by unit (None where nothing is measured), "parameters", "free"
+        (names) and "time_s". If the fit converged also "evidence" and "budget" if all are fitted,
+        else "prediction", which is None with a "failure" if the simulation failed. A fit that
+        cannot be linearised counts as not converged.
+
+    Raises
+    ------
+    InputError
+        If the problem cannot be solved with the method.
     """
     known, start_s = (
         reserve_test_data(problem, test_name)
@@ -564,9 +593,19 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
 def _budget_record(
     problem: Problem, solution: Solution, fit: LinearisedFit
 ) -> dict[str, Any]:
-    """Return the uncertainty budget of each estimate, without noise of the poses, step and mesh.
+    """Return the uncertainty budget of each estimate, without noise of the poses, step and mesh, as
+    the fields of `BudgetLine` by name.
 
     Empty if the error bars cannot be computed.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem with the options of the uncertainty.
+    solution : Solution
+        Its converged solution.
+    fit : LinearisedFit
+        The measurements linearised at the solution.
     """
     options = problem.uncertainty
     parameters = solution.collocation.parameters
@@ -590,7 +629,9 @@ def _budget_record(
     )
     return {
         name: asdict(line)
-        for name, line in budget(sources, known, {}, parameters).items()
+        for name, line in budget(
+            sources, known, numerical={}, parameters=parameters
+        ).items()
     }
 
 
@@ -598,7 +639,15 @@ def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
     """Return the problem without a recording, or without its end, and the time of the first
     held-out sample [s].
 
-    The end of a single recording is held out. The time is −∞ if the complete recording is held out.
+    If it is the only fitted recording, the measurements after two thirds of its duration are
+    removed: markers and wrenches become NaN, depth images are left out, and custom sensors become
+    NaN unless nothing would remain. Otherwise the recording becomes one for validation, and the
+    time is −∞. `problem` is not modified.
+
+    Raises
+    ------
+    StopIteration
+        If the problem has no recording with this name.
     """
     chosen = next(e for e in problem.experiments if e.name == name)
     if len(fitted_recordings(problem)) > 1:
@@ -633,8 +682,8 @@ def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
 
 
 def _without_later_wrench(grasp: Grasp, end_s: float) -> Grasp:
-    """Return the grasp with measurements of its sensor after `end_s` [s] replaced by NaN; unchanged
-    without a sensor.
+    """Return a copy of the grasp with measurements of its sensor after `end_s` [s] replaced by NaN;
+    the grasp itself without a sensor.
     """
     wrench = grasp.wrench
     if wrench is None:
@@ -644,8 +693,8 @@ def _without_later_wrench(grasp: Grasp, end_s: float) -> Grasp:
 
 
 def _without_later_values(gauge: Gauge, end_s: float) -> Gauge:
-    """Return the custom sensor without measurements after a time [s]; itself if none would
-    remain.
+    """Return the custom sensor `gauge` with measurements after `end_s` [s] replaced by NaN; itself
+    if none would remain.
     """
     values = np.where(
         (gauge.sample_times_s > end_s)[:, None], np.nan, gauge.measured_values
@@ -691,8 +740,22 @@ def _prediction_error(
     a simulation.
 
     The measurements are markers [m] or, without any, forces [N] on the complete specimen, or
-    stresses [Pa] of a specimen without a mesh; `unit` says which. Samples up to `start_s` are
-    ignored; the RMS is None without samples.
+    stresses [Pa] of a specimen without a mesh; "unit" says which.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Recording with all its measurements.
+    rollout : ForwardSimulation
+        Simulation at the same samples.
+    start_s : float
+        Samples up to this time are ignored.
+
+    Returns
+    -------
+    dict
+        "rms" (None without samples), "unit", "samples", and "blocks", `BLOCKS` sums of squares in
+        the order of time.
     """
     markers = experiment.markers
     unit = "m"

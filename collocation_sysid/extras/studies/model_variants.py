@@ -25,15 +25,15 @@ from ...problem import Problem
 from ...problem.problem_reading import read_problem_file
 from .study_arguments import unique_items
 
-# Where a branch's share starts; time constants start evenly between a sample and the recording.
+# Initial guess of a new branch's share of the stiffness.
 SHARE = 0.1
 # Largest number of branches: no recording determines as many time constants.
 MOST_BRANCHES = 20
-# Constants of which a material needs one beside those of its shape.
+# Elastic constants for the compressibility, of which a material needs one.
 VOLUMETRIC = {"lambda_pa", "kappa_pa", "poisson"}
-# Budget entries that stand for other laws of damping, in place of which these are fitted.
+# Budget entries for other damping laws; they are switched off if damping laws are compared.
 DAMPING_ASSUMPTIONS = ("damping_law", "rayleigh_damping")
-# Of a material of which nothing is said; and of the shear modulus, what a constant about zero has.
+# Poisson's ratio if the file states none.
 USUAL_POISSON = 0.3
 # Typical change of a constant about zero, over the shear modulus.
 LESS = 0.1
@@ -64,7 +64,7 @@ def parse_materials(text: str) -> tuple[str, ...]:
     Raises
     ------
     InputError
-        For an unknown name, with the most similar known one.
+        Without any name, or for an unknown one, with the most similar known one.
     """
     return _parse_names(text, MATERIALS, option="--materials")
 
@@ -75,7 +75,7 @@ def parse_dampings(text: str) -> tuple[str, ...]:
     Raises
     ------
     InputError
-        For an unknown name, with the most similar known one.
+        Without any name, or for an unknown one, with the most similar known one.
     """
     return _parse_names(text, DAMPINGS, option="--damping")
 
@@ -126,15 +126,16 @@ def models(
     region: str | None = None,
     dampings: Sequence[str] = (),
 ) -> list[ModelVariant]:
-    """Return a model for every problem file with every material, law of damping and number of
-    branches.
+    """Return a model for every problem file with every material, damping law and number of
+    branches; of several files the labels begin with that of the file.
 
     Parameters
     ----------
     problems : sequence of Problem
-        Of the same recordings, each with its file.
+        At least one, of the same recordings, each with its file.
     overrides, materials, branches, region, dampings
-        See `variants`.
+        See `variants`. Without materials, branches and dampings the files themselves are the
+        models.
 
     Raises
     ------
@@ -191,25 +192,32 @@ def variants(
     region: str | None = None,
     dampings: Sequence[str] = (),
 ) -> list[ModelVariant]:
-    """Every material with every law of damping and every number of branches.
+    """Return a model for every combination of material, damping law and number of branches, in this
+    order; the last changes fastest.
 
     Parameters
     ----------
-    path, overrides
-        The problem file.
-    materials : sequence of names; the file's own if there is none
-    branches : sequence of numbers of Prony branches; as in the file if there is none
+    path : Path
+        Problem file.
+    overrides : sequence of str
+        Overrides "key=value" of the file; those of the models follow them.
+    materials : sequence of str
+        Names of materials; the file's own if empty.
+    branches : sequence of int
+        Numbers of Prony branches; as in the file if empty.
     times_s : (shortest, longest)
-        Time constants of branches start between them.
+        Time constants of new branches start between them, evenly on a logarithmic scale [s].
     region : str, optional
-        Whose material, law and branches they are; by default every part of the body has them.
-    dampings : sequence of names of laws of damping; as in the file if there is none
-        Where some are compared, the first-order estimate of other laws is no budget entry.
+        Region that gets material, damping law and branches; by default every part of the body.
+    dampings : sequence of str
+        Names of damping laws; as in the file if empty. If there are any, the budget's first-order
+        estimate of other damping laws is switched off.
 
     Raises
     ------
     InputError
-        For an unknown region, and branches that belong to others.
+        For an unknown region, and if branches are compared and the file has branches of another
+        region.
     """
     file, _ = read_problem_file(path, overrides)
     content = file.model_dump(mode="json", exclude_unset=True, by_alias=True)
@@ -269,7 +277,15 @@ def variants(
 def file_variants(
     problems: Sequence[Problem], overrides: Sequence[str]
 ) -> list[ModelVariant]:
-    """Return problem files of the same recordings as models, named after the files.
+    """Return problem files of the same recordings as models, named after the files (with their
+    paths if two files have the same name).
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        At least one problem, each with its file.
+    overrides : sequence of str
+        Overrides "key=value" of all files.
 
     Raises
     ------
@@ -303,7 +319,9 @@ def file_variants(
 
 
 def _measured_counts(problem: Problem) -> dict[str, int]:
-    """Return how many numbers are measured in each fitted recording."""
+    """Return how many numbers (coordinates of markers, components of wrenches) are measured in each
+    fitted recording, by name.
+    """
     return {
         e.name: 3 * e.markers.sample_count
         + sum(int(np.isfinite(wrench.values).sum()) for wrench in e.wrenches)
@@ -322,7 +340,20 @@ def _measured_text(measured: Mapping[str, int]) -> str:
 def _require_region(
     body: Mapping[str, Any], region: str | None, branches: bool, path: Path
 ) -> None:
-    """Raise `InputError` for an unknown region, or for branches that belong to other regions."""
+    """Raise `InputError` for an unknown region, or, if `branches` are compared, for branches in the
+    file that belong to other regions.
+
+    Parameters
+    ----------
+    body : mapping
+        Table ``[object]`` of the problem.
+    region : str or None
+        Name of the region; None for the complete body.
+    branches : bool
+        Whether numbers of branches are compared.
+    path : Path
+        Problem file, for messages.
+    """
     names = [each["name"] for each in body.get("region", [])]
     if region is not None and not names:
         message = f"found {region!r}; expected none: it has no regions"
@@ -352,7 +383,21 @@ def _require_region(
 def _law_changes(
     body: Mapping[str, Any], laws: Mapping[str, str], region: str | None
 ) -> dict[str, Any]:
-    """Return the object's keys with a material or damping for a region, or for all parts."""
+    """Return changed keys of the problem that give a material or damping law to a region, or for
+    None to all parts.
+
+    For all parts the laws of the body are set, and those of regions are removed, so that they
+    follow the body.
+
+    Parameters
+    ----------
+    body : mapping
+        Table ``[object]`` of the problem; not modified.
+    laws : mapping
+        Name of the law by key ("material", "damping").
+    region : str or None
+        Name of the region.
+    """
     regions = [dict(each) for each in body.get("region", [])]
     for each in regions:
         if region is None:
@@ -452,8 +497,16 @@ def _with_part_material(
 
 
 def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
-    """Return the shear modulus at small strain [Pa] from the guesses or fixed values of the part
-    whose constants begin with `prefix`, or else those of the body; None if unknown.
+    """Return the shear modulus at small strain [Pa] that follows from guesses or fixed values; None
+    if unknown.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Table by parameter name.
+    prefix : str
+        Prefix of the constants of a part, such as "tip."; constants that the part lacks are those
+        without a prefix.
     """
 
     def guess(name: str) -> float:
@@ -509,7 +562,20 @@ def _branch_tables(
     others: set[str],
     region: str | None,
 ) -> list[dict[str, Any]]:
-    """Return the first `count` branches of the file, followed by new ones if there are fewer."""
+    """Return the tables of `count` branches: the first ones of the file, followed by new ones if
+    there are fewer.
+
+    Parameters
+    ----------
+    own : sequence of mapping
+        Tables of the file's branches of this region.
+    count : int
+        Number of branches.
+    others : set of str
+        Names of the branches of other regions, which new names avoid.
+    region : str or None
+        Region of the new branches; None for the complete body.
+    """
     tables = [dict(each) for each in own[:count]]
     used_names = {each["name"] for each in tables} | others
     names = (f"prony_{k}" for k in range(1, count + len(used_names) + 1))
@@ -526,18 +592,19 @@ def _with_memory(
     tables: Sequence[Mapping[str, Any]],
     times_s: tuple[float, float],
 ) -> dict[str, Any]:
-    """Return the parameters with a share and a time constant of each branch.
+    """Return the parameters with a share and a time constant of each branch; those that the file
+    has are kept.
 
     Parameters
     ----------
     parameters : mapping
-        Parameters of the file.
+        Parameters of the file; not modified.
     old : sequence of str
         Names of the file's branches; parameters of those that are removed are removed.
     tables : sequence of mapping
-        Tables of the new branches.
+        Tables of all branches of the model.
     times_s : tuple of two floats
-        Interval in which time constants start [s].
+        Interval in which time constants of new branches start, evenly on a logarithmic scale [s].
     """
     names = [each["name"] for each in tables]
     removed_names = {name for name in old if name not in names}
@@ -555,7 +622,9 @@ def _with_memory(
 
 
 def as_inline_toml(value: Any) -> str:
-    """Return a value in TOML's inline syntax."""
+    """Return a value in TOML's inline syntax, on one line; mappings, lists, tuples, texts, booleans
+    and numbers are supported, None is not.
+    """
     if isinstance(value, Mapping):
         return (
             "{"

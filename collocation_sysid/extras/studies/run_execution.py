@@ -34,7 +34,7 @@ from ...fem.kernels import available_threads
 from .study_planning import PlannedRun
 
 COMMAND = (sys.executable, "-m", "collocation_sysid.extras.studies.run_worker")
-# Runs side by side must not fight for cores, and compared times must mean the same.
+# Environment of a run: one thread, since runs share the cores and their times are compared.
 ONE_THREAD = {
     name: "1"
     for name in (
@@ -46,9 +46,9 @@ ONE_THREAD = {
         "VECLIB_MAXIMUM_THREADS",
     )
 }
-# Time between two looks at a run that may be interrupted [s]: a person does not notice it.
+# Interval at which a process is checked [s], too short for a person to notice.
 LOOK_EVERY_S = 0.2
-# What a run that is late has to write the best answer that it found.
+# Time after the time limit in which a run may still write the best iterate [s].
 GRACE_S = 10.0
 
 
@@ -66,11 +66,18 @@ def execute(
         A `PlannedRun` as a dictionary.
     time_limit_s : float, optional
         Time after which the process is asked to end, loading included [s]; it is killed if it does
-        not. The record then contains the best iterate, if there is one.
+        not. The record then contains the best iterate, if there is one. No limit by default.
     is_stopped : callable
         Function that is called now and then; the process is killed once it returns true.
     retries : int
         Further attempts if the process crashes.
+
+    Returns
+    -------
+    dict
+        The fields of `planned`, those of `run_worker.record_of_run` for the last attempt (of a
+        process that was stopped, crashed or exceeded the limit at least "outcome" and "message"),
+        its "wall_s" [s], the number of "attempts" and "time_limit_s".
     """
     attempts = 0
     record = {}
@@ -94,8 +101,11 @@ def _attempt(
     time_limit_s: float | None,
     stopped: Callable[[], bool],
 ) -> Record:
-    """Execute a run once, in a process with one thread, and return its record; after a time limit
-    with the best iterate, if the process wrote one.
+    """Execute a run once, in a process with one thread, and return its record.
+
+    After a time limit it is the record with the best iterate, if the process wrote one, with the
+    outcome `TIMEOUT`; an error that the process reported stays an error. Without a record of the
+    process the outcome is `TIMEOUT`, `STOPPED` or `CRASHED`.
     """
     with tempfile.TemporaryDirectory(prefix="collocation-sysid-") as place:
         file = Path(place) / "record.json"
@@ -140,12 +150,16 @@ def _watch(
     time_limit_s: float | None,
     is_stopped: Callable[[], bool],
 ) -> Record | None:
-    """Send the run to the process and wait for its end.
+    """Send the run to the process and wait for its end, the time limit, or a stop.
+
+    At the time limit the process is asked to end and waited for, at most `GRACE_S`. A process that
+    is to be stopped is left running; the caller kills it.
 
     Returns
     -------
     Record or None
-        None if the process ended by itself; a record if it was stopped or too late.
+        None if the process ended by itself, otherwise "outcome" (`TIMEOUT` or `STOPPED`) and
+        "message".
     """
     assert process.stdin is not None
     deadline = None if time_limit_s is None else time.monotonic() + time_limit_s
@@ -179,7 +193,9 @@ def _watch(
 
 
 def _crash_message(code: int, stderr: IO[bytes]) -> str:
-    """Return how a process ended, with the last line of its error output."""
+    """Return how a process with this exit code ended, with the last line of its error output, if
+    any.
+    """
     cause = killed_by(code) or f"its process ended with code {code}"
     stderr.seek(0)
     lines = stderr.read()[-2000:].decode(errors="replace").split("\n")
@@ -187,7 +203,7 @@ def _crash_message(code: int, stderr: IO[bytes]) -> str:
     return f"{cause}: {last}" if last else cause
 
 
-# What became of a run.
+# Outcomes of a run.
 FINISHED = "finished"
 ERROR = "error"
 TIMEOUT = "timeout"
@@ -210,11 +226,13 @@ class RunStore:
     folder: Path
 
     def save(self, record: Record) -> None:
-        """Write the record of a run."""
+        """Write the record of a run, atomically, under its "key"; an earlier record is replaced."""
         write_text_file(self._file(record["key"]), as_json(record) + "\n")
 
     def load(self, key: str) -> Record | None:
-        """Return the record of a run; None if it does not exist or cannot be read."""
+        """Return the record of a run; None if it does not exist, cannot be read, or has another
+        key.
+        """
         try:
             record = json.loads(self._file(key).read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -230,7 +248,15 @@ class RunStore:
     ) -> Record | None:
         """Return the record of a run; None if the run should be executed again.
 
-        A run is repeated if it crashed, or if it exceeded a time limit below the present one.
+        A run is repeated if it crashed, or if it exceeded a time limit below the present one. A run
+        that ended with an error is not repeated.
+
+        Parameters
+        ----------
+        key : str
+            Key of the run.
+        time_limit_s : float or None
+            Present time limit [s]; None for no limit.
         """
         record = self.load(key)
         if record is None or record["outcome"] == CRASHED:
@@ -289,7 +315,7 @@ class RunExecutor:
     worker_count : int
         Number of runs at once.
     stop : callable
-        Function that ends the running runs.
+        Function that tells all running runs to end, without waiting for them.
     """
 
     submit: Callable[[PlannedRun], Future]
@@ -307,6 +333,8 @@ def run_all(
 ) -> None:
     """Execute the runs of a study and store their records, each as soon as it has ended.
 
+    Runs that were stopped are neither stored nor reported. Without runs nothing happens.
+
     Parameters
     ----------
     planned : sequence of PlannedRun
@@ -314,16 +342,17 @@ def run_all(
     store : RunStore
         Storage of the records.
     options : RunOptions
-        Options of the execution.
+        Options of the execution: threads of this process, or the workers of a scheduler.
     on_record : callable
-        Function that is called with every new record and the number of runs at once.
+        Function that is called with every new record, in the order in which runs end, and the
+        number of runs at once.
 
     Raises
     ------
     InputError
         If the scheduler cannot be reached.
     KeyboardInterrupt
-        After the running runs have been ended; finished ones are in the store.
+        After the running runs have been told to end; finished ones are in the store.
     """
     if not planned:
         return
@@ -347,8 +376,17 @@ def run_all(
 def _result_record(
     future: Future, planned: PlannedRun, limits: RunOptions
 ) -> Record:
-    """Return the record of a run from its future; if that raises, a record of a crash, because its
-    worker was lost.
+    """Return the record of a run from its finished future; if that raises, a record of a crash,
+    because its worker was lost.
+
+    Parameters
+    ----------
+    future : Future
+        Future of the record.
+    planned : PlannedRun
+        The run.
+    limits : RunOptions
+        Options with the time limit, which the record of a crash contains.
     """
     try:
         return future.result()

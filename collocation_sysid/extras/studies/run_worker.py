@@ -1,4 +1,4 @@
-"""Worker process for one run of a study: ``python -m collocation_sysid.extras.studies.worker OUT``.
+"""Worker process of one run: ``python -m collocation_sysid.extras.studies.run_worker OUT``.
 
 The run is read as one line of JSON from stdin, and its record is written to the file OUT. The
 process ends when its stdin is closed, so that it never outlives the study.
@@ -29,7 +29,11 @@ from .run_execution import ERROR, FINISHED
 
 
 def main() -> None:
-    """Entry point: read the run, execute it, and write its record."""
+    """Entry point: read the run, execute it, and write its record.
+
+    The run is read from stdin, and the record is written to the file that the first command-line
+    argument names. The function does not return: the process ends with code 0.
+    """
     heed_interrupts()
     planned = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_study, daemon=True).start()
@@ -44,10 +48,19 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
     ----------
     planned : dict
         A `PlannedRun` as a dictionary.
+
+    Returns
+    -------
+    dict
+        "outcome" (`FINISHED` or `ERROR`) and "message". Of a finished run also "model", see
+        `fit_record`, if `test_name` is not None (a comparison of models), else "result" and "tip",
+        see `_tip_record`. Of an unexpected error also "traceback".
     """
     try:
         problem = Problem.read(
-            planned["problem"], planned["overrides"], planned["allow_code"]
+            planned["problem"],
+            planned["overrides"],
+            allow_code=planned["allow_code"],
         )
         test_name = planned.get("test_name")
         if test_name is not None:
@@ -72,9 +85,12 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
 
 
 def _tip_record(finished: Run) -> dict[str, Any] | None:
-    """Return measured and simulated track of the marker farthest from the grasp in the first fitted
-    experiment, for JSON; None without markers. The simulated track is None if the simulation
-    failed.
+    """Return measured and simulated track of the marker farthest from the grasp in the undeformed
+    body, of the first fitted experiment, for JSON; None without markers.
+
+    The distance is that from the mean of the grasped nodes, or of all nodes without a grasp.
+    "max_m" is the largest distance between the tracks [m]; it and the simulated track
+    "rolled_out_m" are None if the forward simulation failed.
     """
     experiment = finished.solution.collocation.transcriptions[0].experiment
     markers = experiment.markers
@@ -111,7 +127,7 @@ def _tip_record(finished: Run) -> dict[str, Any] | None:
 
 
 def _end_with_study() -> None:
-    """Wait until stdin is closed, and end the process."""
+    """Wait until stdin is closed, and end the process at once with code 1, without any clean-up."""
     os.read(0, 1)  # returns when the other end is closed
     os._exit(1)
 

@@ -21,7 +21,9 @@ RANGE = "such as 50:5000:log:9 or 0:1:5"
 
 
 def unique_items(text: str) -> tuple[str, ...]:
-    """Return the items of text separated by commas, each once, in their order."""
+    """Return the items of text separated by commas, stripped, each once, in their order; empty ones
+    are left out.
+    """
     return tuple(
         dict.fromkeys(item.strip() for item in text.split(",") if item.strip())
     )
@@ -33,7 +35,8 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
     Raises
     ------
     InputError
-        For an unknown name, with the most similar known one.
+        If there is no name, or for an unknown one, with the most similar known one; it refers to
+        the command-line `option`.
     """
     names = unique_items(text)
     if not names:
@@ -58,11 +61,12 @@ def read_truth(
     Parameters
     ----------
     sources : sequence of str
-        TOML files, or "name=value" separated by commas; later ones override earlier ones.
+        TOML files, with values at the top level or in a table ``parameters``; or "name=value"
+        separated by commas. Later ones override earlier ones.
     known_names : sequence of str
         Names of all parameters of the problem.
     needed : sequence of str
-        Names of those that are estimated.
+        Names of those that are estimated, all of which must have a value if there is a source.
 
     Raises
     ------
@@ -153,12 +157,14 @@ def parse_varied_keys(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
     Parameters
     ----------
     texts : sequence of str
-        "key=a,b,c", "key=first:last:count" or "key=first:last:log:count".
+        "key=a,b,c", "key=first:last:count" or "key=first:last:log:count" (evenly spaced, ends
+        included). Commas within brackets, braces and quotes do not separate values.
 
     Raises
     ------
     InputError
-        Quotes the text that cannot be read.
+        For a text that cannot be read, which is quoted; for a key that is given twice; without any
+        key; and for more than `MOST_RUNS` combinations.
     """
     over: dict[str, tuple[str, ...]] = {}
     for text in texts:
@@ -191,16 +197,16 @@ def parse_varied_keys(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def require_few(count: int, option: str, noun: str) -> None:
-    """Raise `InputError` if a study has more than `MOST_RUNS` runs.
+    """Raise `InputError` if `count` exceeds `MOST_RUNS`.
 
     Parameters
     ----------
     count : int
-        Number of runs.
+        Number of runs, or of anything that makes runs.
     option : str
         Command-line option that the message refers to.
     noun : str
-        What is counted, for the message.
+        Plural noun for what is counted, for the message.
     """
     if count > MOST_RUNS:
         number = f"{count:,}" if count < 10**15 else "more than 10¹⁵"
@@ -212,7 +218,15 @@ def require_few(count: int, option: str, noun: str) -> None:
 
 
 def _range_values(key: str, text: str) -> Iterable[str]:
-    """Return the values of a range "first:last:count" or "first:last:log:count" as text."""
+    """Return the values of a range "first:last:count" or "first:last:log:count", ends included, as
+    text with 12 digits.
+
+    Raises
+    ------
+    InputError
+        For another form, numbers that are not finite, a count below 1 or above `MOST_RUNS`, an
+        unknown spacing, or a logarithmic range that is not positive; the message names the `key`.
+    """
     first, *middle, count = text.split(":")
     try:
         low = float(first)

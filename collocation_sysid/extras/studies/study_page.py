@@ -47,7 +47,7 @@ from .study_rows import (
 RESOLUTION_DPI = 150
 # Largest number of failures on the terminal; summary.md lists all.
 SHOWN_FAILURES = 8
-# Heads of the tables where there is room, on pages.
+# Headings of tables on pages, by their short form in the terminal.
 WORDS = {
     **{column.head: column.words for column in COLUMNS.values()},
     "": "chosen",
@@ -60,6 +60,7 @@ WORDS = {
     "held out N": "held out, RMS [N]",
     "relative to best": "held out, relative to the best",
 }
+# Units that a short heading may end with.
 UNITS = ("Pa", "s", "1/s", "kg/m³")
 MEDIANS_NOTE = (
     "Errors, misfits and costs are medians over the runs with a result."
@@ -102,7 +103,7 @@ class StudyReport:
 
     @property
     def views(self) -> list[Table]:
-        """Tables for the terminal, each within 80 columns."""
+        """Tables for the terminal, each within 80 columns, with short headings."""
         if self.kind == METHOD_STUDY:
             return comparison_views(method_rows(self.rows))
         if self.kind == MODEL_STUDY:
@@ -137,7 +138,7 @@ class StudyReport:
 
     @property
     def failures(self) -> list[str]:
-        """One line for each run without a result."""
+        """One line for each run that has a record without a result."""
         return [
             f"{run.label}: {record['outcome']}: {record.get('message', '')}"
             for run in self.planned
@@ -147,7 +148,7 @@ class StudyReport:
 
     @property
     def notes(self) -> list[str]:
-        """Notes that explain the tables."""
+        """Notes that explain the tables, and the number of runs without a record, if there are any."""
         missing = len(self.planned) - len(self.records)
         notes = (
             [f"{missing} of {len(self.planned)} runs remain to be done."]
@@ -173,7 +174,19 @@ def load_report(
     store: RunStore,
     yardstick: SuccessCriterion | None = None,
 ) -> StudyReport:
-    """Return the report of planned runs from their stored records."""
+    """Return the report of planned runs from their stored records.
+
+    Parameters
+    ----------
+    title, kind
+        See `StudyReport`.
+    planned : sequence of PlannedRun
+        All runs of the study, at least one; those without a record remain to be done.
+    store : RunStore
+        Storage of the records.
+    yardstick : SuccessCriterion, optional
+        Criterion of success; by default convergence alone.
+    """
     loaded = {run.key: store.load(run.key) for run in planned}
     records = {
         key: record for key, record in loaded.items() if record is not None
@@ -191,7 +204,9 @@ def load_report(
 
 
 def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
-    """Return the tables of a study within 80 columns, and its failures."""
+    """Return what the terminal shows of a study within 80 columns: the advice of a comparison of
+    models, tables, notes, up to `SHOWN_FAILURES` failures, and the folder.
+    """
     # What no line of the tables says.
     parts: list[Shown] = (
         [*report.headline, ""] if report.kind == MODEL_STUDY else []
@@ -210,7 +225,16 @@ def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
 
 
 def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
-    """Return a table of the runs of a study, with those that are finished."""
+    """Return a table of the runs of a study with their guesses ("–" if there is none), and which of
+    them are finished.
+
+    Parameters
+    ----------
+    planned : sequence of PlannedRun
+        Runs; they are numbered from 1.
+    finished : sequence of str
+        Keys of the finished runs.
+    """
     rows = tuple(
         (
             str(number),
@@ -287,7 +311,7 @@ def report_json(report: StudyReport) -> dict[str, Any]:
 
 def as_csv(rows: Sequence[Row]) -> str:
     """Return rows as CSV; the columns are those of all rows, in the order of their first
-    occurrence.
+    occurrence. Values that a row lacks, and None, are empty.
     """
     columns = dict.fromkeys(name for row in rows for name in row)
     text = io.StringIO()
@@ -308,7 +332,9 @@ def report_section(report: StudyReport) -> TitledParts:
 
 
 def _in_words(head: str) -> str:
-    """Return the heading in words for a short heading `head` of the terminal."""
+    """Return the heading in words for a short heading `head` of the terminal; unchanged if there is
+    none.
+    """
     if head.startswith("Δ") and head.endswith(" %"):
         return f"error of {head[1:-2]} [%]"
     symbol, space, unit = head.partition(" ")
@@ -323,7 +349,9 @@ Cell = Callable[[Row], str]
 
 
 def comparison_views(summaries: Sequence[Row]) -> list[Table]:
-    """Return tables of success, quality and cost of every method."""
+    """Return tables of success, quality and cost of every method from the rows of `method_rows`;
+    the column of evaluations is left out if no method counts them.
+    """
     success: dict[str, Cell] = {
         "runs": lambda row: str(row["runs"]),
         "success": lambda row: f"{row['successes']}/{row['runs']}",
@@ -428,7 +456,16 @@ def sweep_sentences(rows: Sequence[Row]) -> list[str]:
 
 
 def sweep_views(rows: Sequence[Row], varied_keys: Sequence[str]) -> list[Table]:
-    """Return tables of estimates and quality by swept values."""
+    """Return tables of estimates and quality, a line for each run with the values of the swept
+    keys.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row`, at least one.
+    varied_keys : sequence of str
+        Swept keys.
+    """
     places = {
         short: _varied_cell(key) for key, short in shortened_keys(varied_keys)
     }
@@ -544,8 +581,16 @@ def _table_view(
     number_columns: Mapping[str, Cell],
     rows: Sequence[Row],
 ) -> Table:
-    """Return a table with a line for each row and a column for each cell; the first columns are
-    `names`.
+    """Return a table with a line for each row and a column for each cell.
+
+    Parameters
+    ----------
+    title : str
+        Title; empty for none.
+    names, number_columns : mapping of heading to Cell
+        Cells of the first columns, which name the row, and of the others.
+    rows : sequence of Row
+        Rows in the order of the lines.
     """
     columns = {**names, **number_columns}
     cells = tuple(tuple(cell(row) for cell in columns.values()) for row in rows)
@@ -553,7 +598,9 @@ def _table_view(
 
 
 def _text_cell(name: str) -> Cell:
-    """Return the cell of the text that rows have under this name."""
+    """Return the cell of the value that rows have under this name, as text; `KeyError` for rows
+    without it.
+    """
     return lambda row: str(row[name])
 
 
@@ -604,17 +651,19 @@ def _error_cells(rows: Sequence[Row]) -> dict[str, Cell]:
 
 
 def _number_cells(*names: str) -> dict[str, Cell]:
-    """Return the cells of the columns with these names in `COLUMNS`, by heading."""
-    return {
-        COLUMNS[name].head: lambda row, name=name: COLUMNS[name].format(
-            row[name]
-        )
-        for name in names
-    }
+    """Return the cells of the columns with these names in `COLUMNS`, by short heading."""
+    return {COLUMNS[name].head: _column_cell(name) for name in names}
+
+
+def _column_cell(name: str) -> Cell:
+    """Return the cell of the column with this name in `COLUMNS`, in its format."""
+    return lambda row: COLUMNS[name].format(row[name])
 
 
 def _estimate_cell(name: str) -> Cell:
-    """Return the cell of an estimate, with its standard error if that is known."""
+    """Return the cell of an estimate, with its combined standard error if that is known; "–"
+    without an estimate.
+    """
 
     def cell(row: Row) -> str:
         """Return the text of the cell in a row."""

@@ -72,7 +72,9 @@ class PlannedRun:
 
     @property
     def label(self) -> str:
-        """Short description of the run for the user."""
+        """Short description of the run for the user: model and held-out recording, swept values, or
+        method and start.
+        """
         if self.test_name is not None:
             what = f" without '{self.test_name}'" if self.test_name else ""
             return f"{self.varied_values['model']}{what}"
@@ -91,8 +93,9 @@ class PlannedRun:
 def shortened_keys(
     keys: Sequence[str] | Mapping[str, Any],
 ) -> Iterator[tuple[str, str]]:
-    """Yield each dotted key with the shortest ending that distinguishes it from the others; of
-    parameters at least two parts, name and key.
+    """Yield each dotted key with the shortest ending that distinguishes it from the others, in
+    order; of parameters at least two parts, name and key. If no ending does, it is the complete
+    key.
     """
     for key in keys:
         parts = key.split(".")
@@ -114,7 +117,8 @@ class Starts(Options):
     """Starts of the runs: the first at the file's guess, the others around the truth, or the guess
     without one.
 
-    A start depends only on the seed and its number, so that more of them can be added later.
+    A start depends only on the seed, its number and the estimated parameters, so that more of them
+    can be added later.
 
     Attributes
     ----------
@@ -137,15 +141,15 @@ class Starts(Options):
     def overrides(
         self, problem: Problem, truth: Mapping[str, float], start: int
     ) -> Iterator[str]:
-        """Yield the overrides of one start: guesses, log-uniform around truth or guess, within the
-        bounds.
+        """Yield the overrides "key=value" of one start: guesses, log-uniform around truth or guess
+        within the factor `spread`, limited to the bounds.
 
         Parameters
         ----------
         problem : Problem
             Problem with its parameters.
         truth : mapping of str to float
-            True values by name, empty if unknown.
+            True values by name; parameters that it lacks are distributed around their guess.
         start : int
             Number of the start; 0 yields nothing.
 
@@ -184,6 +188,9 @@ def plan_comparison(
     """Return a run of every method from every start; all methods have the same starts and time
     grid.
 
+    An automatic number of substeps is replaced by the problem's first one, so that the methods do
+    not choose their own. Runs are ordered by start, then by method.
+
     Parameters
     ----------
     problem : Problem
@@ -220,7 +227,7 @@ def plan_comparison(
     for start in range(starts.starts):
         start_overrides = [
             *overrides,
-            *starts.overrides(problem, truth or {}, start),
+            *starts.overrides(problem, truth or {}, start=start),
         ]
         file, _ = read_problem_file(problem.path, start_overrides)
         details = {"start": start, "allow_code": allow_code}
@@ -296,6 +303,8 @@ def plan_models(
 
     Of a single recording, the last third is held out.
 
+    Runs are ordered by the held-out recording, first "" (all are fitted), then by model.
+
     Parameters
     ----------
     problem : Problem
@@ -361,6 +370,10 @@ def _planned_run(
     """Return the run of a file with its overrides, with a key that depends on all that decides its
     result.
 
+    The key is a hash of the content of the file (with only the solver's options for this method),
+    the start, for a comparison of models the held-out recording, the data files, and the version of
+    this package; not of the path.
+
     Parameters
     ----------
     path : Path
@@ -425,7 +438,7 @@ def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
 
 
 def _texts(content: Any) -> Iterator[str]:
-    """Yield all texts in nested content."""
+    """Yield all texts in nested mappings, lists and tuples; keys are not included."""
     if isinstance(content, str):
         yield content
     elif isinstance(content, Mapping):

@@ -97,7 +97,9 @@ def comparison_plots(
 
 
 def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
-    """Return colour and rows of each method, in the order of their first rows."""
+    """Return colour and rows of each method by its name, in the order of their first rows; colours
+    repeat if there are more methods than colours.
+    """
     methods = dict.fromkeys(row["method"] for row in rows)
     return {
         method: (
@@ -111,8 +113,15 @@ def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
 def convergence_in_time(
     rows: Sequence[Row], records: Mapping[str, Record]
 ) -> Figure:
-    """Return a figure of loss and violation of the equations of motion against time, a line
-    per run.
+    """Return a figure of loss and violation of the equations of motion against time, a line per
+    run; values that are not positive are left out.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Runs with a result.
+    records : mapping of key of the run to Record
+        Records with the history of each result.
     """
     figure = new_figure(PAGE_MM, 70)
     panels = figure.subplots(1, 2)
@@ -220,9 +229,16 @@ def basins(
     rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: bool
 ) -> Figure:
     """Return a figure of the start points over each pair of parameters, a row of panels for each
-    method.
+    method; a single parameter is paired with itself.
 
-    Guesses are drawn relative to `centre`: the truth, or the best answer.
+    Parameters
+    ----------
+    rows : sequence of Row
+        Runs with a guess of each parameter.
+    centre : mapping of str to float
+        Reference by name, relative to which guesses are drawn.
+    is_truth_known : bool
+        Whether the reference is the truth, otherwise the best estimate; for the labels.
     """
     names = list(centre)
     pairs = list(itertools.combinations(names, 2)) or [(names[0], names[0])]
@@ -295,8 +311,17 @@ def _ratio_axes(axes: Axes, factor: float) -> None:
 
 
 def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
-    """Return a figure of the measured marker farthest from the grasp, and of its simulation with
-    each method's best solution; measurements are those of the first row.
+    """Return a figure of the measured marker farthest from the grasp, and of its forward simulation
+    with each method's best solution.
+
+    Measurements are those of the first row, whose record must have a "tip". Methods whose best run
+    has no simulated track are left out.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Runs with a result.
+    records : mapping of key of the run to Record
     """
     figure = new_figure(PAGE_MM, 65)
     panels = figure.subplots(1, 3, sharex=True)
@@ -343,7 +368,15 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
 def sweep_plots(
     rows: Sequence[Row], varied_keys: Sequence[str]
 ) -> dict[str, Figure]:
-    """Return the figures of a sweep by file name; empty if no run has a result."""
+    """Return the figures of a sweep by file name without suffix; empty if no run has a result.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        One for each run.
+    varied_keys : sequence of str
+        Swept keys.
+    """
     if all(row["rms_m"] is None for row in rows):
         return {}
     return {"sweep": estimates_against(rows, varied_keys)}
@@ -355,7 +388,14 @@ def estimates_against(
     """Return a figure of estimates with their 95 % intervals: a row for each parameter, a column
     for each swept key.
 
-    Answers that did not converge are crosses. Values of the first other key have colours.
+    Estimates that did not converge are crosses. Values of the first other key have colours.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        One for each run, at least one with a result.
+    varied_keys : sequence of str
+        Swept keys.
     """
     names = parameters_in(rows)
     width = max(PAGE_MM / 2, min(PAGE_MM, 80.0 * len(varied_keys)))
@@ -402,7 +442,9 @@ def estimates_against(
 
 
 def _axis_positions(values: Sequence[str]) -> tuple[Array, dict[float, str]]:
-    """Return the positions of swept values on the axis, evenly spaced, and their labels."""
+    """Return the position of each value on the axis (rows,), which counts the distinct values from
+    0 in the order of their first occurrence, and the label of each position.
+    """
     order = list(dict.fromkeys(values))
     names = {
         float(place): _shortened(value) for place, value in enumerate(order)
@@ -426,7 +468,19 @@ def _groups(
     key: str,
     shorts: Mapping[str, str],
 ) -> Iterator[tuple[str | None, str, float, Array]]:
-    """Return label, colour, offset and mask of the rows that share a value of another key."""
+    """Yield label, colour, offset on the axis, and mask (rows,) of the rows that share a value of
+    the first other key; one group of all rows, without a label, if `key` is the only one.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+    varied_keys : sequence of str
+        All swept keys.
+    key : str
+        Key of the axis.
+    shorts : mapping of str to str
+        Short form of each key, for the label.
+    """
     other = next((name for name in varied_keys if name != key), None)
     if other is None:
         yield None, COLOUR_CYCLE[0], 0.0, np.ones(len(rows), dtype=bool)
@@ -448,7 +502,25 @@ def _draw_estimates(
     colour: str,
     label: str | None,
 ) -> None:
-    """Draw the estimates and intervals of one group of rows."""
+    """Draw the estimates and intervals of one group of rows into `axes`: dots if converged, else
+    crosses; unknown ones are left out.
+
+    Parameters
+    ----------
+    axes : Axes
+        Modified in place.
+    rows : sequence of Row
+        All rows of the sweep.
+    places : (rows,) array
+        Position of each row on the axis.
+    name : str
+        Name of the parameter.
+    chosen : (rows,) array of bool
+        Rows of the group.
+    colour : str
+    label : str or None
+        Entry in the legend, once; None for none.
+    """
     value, low, high = (
         np.array([row[f"{what}_{name}"] for row in rows], dtype=float)
         for what in ("value", "low", "high")

@@ -14,7 +14,7 @@ from ..design.motion_design import FORBIDDEN
 from .run_execution import Record
 from .study_planning import PlannedRun
 
-# Motions between lines of a search without a terminal.
+# Number of motions between two lines of a search whose output is no terminal.
 EVERY = 20
 
 
@@ -61,9 +61,14 @@ class StudyProgress(Watched):
         Parameters
         ----------
         record : Record
-            Record of the run.
+            Record of one of the remaining runs, which has not been counted yet.
         worker_count : int
             Number of runs that are executed at once.
+
+        Raises
+        ------
+        KeyError
+            If the run is not among the remaining ones.
         """
         run = self._waiting.pop(record["key"])
         if record.get("wall_s") is not None:
@@ -93,8 +98,17 @@ class StudyProgress(Watched):
 
 
 class DesignProgress(Watched):
-    """Progress of the search for a motion: one updated line on a terminal, else a line now
-    and then.
+    """Progress of the search for a motion: one updated line on a terminal, else a line every
+    `EVERY` motions.
+
+    Parameters
+    ----------
+    console : Console
+        Terminal.
+    evaluations : int
+        Number of motions that will be evaluated.
+    quiet : bool
+        Whether to show nothing.
     """
 
     def __init__(
@@ -104,14 +118,15 @@ class DesignProgress(Watched):
         self.evaluations = evaluations
 
     def show_best(self, number: int, log_size: float) -> None:
-        """Show the smallest error bar so far.
+        """Show the number of evaluated motions and the smallest error bar so far.
 
         Parameters
         ----------
         number : int
             Number of motions so far.
         log_size : float
-            Logarithm of the smallest relative error bar.
+            Logarithm of the smallest relative error bar; from `FORBIDDEN` on, no motion was
+            feasible.
         """
         best = (
             "none feasible yet"
@@ -137,7 +152,12 @@ def remaining_time_s(
     walls: Mapping[str, Sequence[float]],
     worker_count: int,
 ) -> float | None:
-    """Return the estimated time for the waiting runs [s]; None if it is unknown.
+    """Return the estimated time for the waiting runs [s]; None if no run waits or none has
+    finished.
+
+    A run is expected to take the mean time of its method, or of all runs if its method has none.
+    The estimate is the sum divided by the number of runs at once, but at least the longest expected
+    time.
 
     Parameters
     ----------

@@ -46,7 +46,9 @@ class NumberColumn:
     has_median: bool = True
 
     def format(self, value: float | None) -> str:
-        """Return a number as text; a dash for None."""
+        """Return `value` times the factor as text in the format of the column; a dash for None.
+        With the default format, magnitudes from 100 on are rounded to whole numbers.
+        """
         if value is None:
             return "–"
         value *= self.factor
@@ -154,9 +156,10 @@ class SuccessCriterion(Options):
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95 % interval of a success rate (E. B. Wilson, J. Am. Stat. Assoc. 22, 1927).
+    """Return the 95 % interval of a success rate (E. B. Wilson, J. Am. Stat. Assoc. 22, 1927).
 
-    Unlike the normal approximation it holds at rates of 0 and 1 and for few trials.
+    Unlike the normal approximation it holds at rates of 0 and 1 and for few of the `trials`. It is
+    (0, 1) without trials, begins at 0 without `successes`, and ends at 1 without failures.
     """
     if trials == 0:
         return 0.0, 1.0
@@ -176,19 +179,20 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 def run_row(
     run: PlannedRun, record: Record | None, yardstick: SuccessCriterion
 ) -> Row:
-    """Return one run as a flat row; values are None if they are not known.
+    """Return one run as a flat row; values are None if they are not known or NaN.
 
-    Columns ``guess_*``, ``value_*``, ``std_error_*``, ``low_*``, ``high_*`` and ``error_*``
-    (relative to the truth) contain the parameters; swept keys have columns of their own.
+    Columns ``guess_*``, ``value_*``, ``std_error_*``, ``low_*``, ``high_*`` (combined standard
+    error and interval) and ``error_*`` (relative to the truth, only for parameters whose truth is
+    known) contain the parameters; swept keys have columns of their own.
 
     Parameters
     ----------
     run : PlannedRun
-        Run.
+        Run of a comparison of methods or a sweep.
     record : Record or None
-        Its record; None if it was not executed.
+        Its record; None if it was not executed: its "status" is then "missing".
     yardstick : SuccessCriterion
-        Criterion of success.
+        Criterion of success. A run that exceeded its time limit counts as not converged.
     """
     record = record or {"outcome": "missing", "message": "not run yet"}
     result: Result | None = read(Result | None, record.get("result"))
@@ -233,7 +237,9 @@ def run_row(
 def _parameter_columns(
     run: PlannedRun, result: Result | None, truth: Mapping[str, float]
 ) -> Row:
-    """Return the columns of the parameters."""
+    """Return the columns of the estimated parameters of a run, see `run_row`; a guess that the run
+    lacks is that of its result.
+    """
     row: Row = {}
     estimates = {} if result is None else result.parameters
     for name, guess in run.guess.items():
@@ -262,7 +268,9 @@ def _parameter_columns(
 
 
 def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
-    """Return the names of the parameters for which rows have a column of this kind."""
+    """Return the names of the parameters for which the first of `rows`, at least one, has a column
+    with the prefix `kind`.
+    """
     return [
         name.removeprefix(kind) for name in rows[0] if name.startswith(kind)
     ]
@@ -326,26 +334,39 @@ def _method_summary(method: str, rows: Sequence[Row]) -> Row:
 
 
 def best_run(rows: Sequence[Row]) -> Row | None:
-    """Return the run with the lowest loss, among successes if there are any, else converged runs.
+    """Return the run with the lowest loss among the successes, without any among the converged
+    runs, and without these among all runs with a result.
 
-    None if no run has a result.
+    A loss of None counts as infinite; None if no run has a result.
     """
     completed = [row for row in rows if row["rms_m"] is not None]
 
-    def rank(row: Row) -> tuple[bool, bool, float]:
-        """Return the sort key of a run."""
-        loss = row["loss"] if row["loss"] is not None else inf
-        return not row["success"], not row["converged"], loss
+    def loss(row: Row) -> float:
+        """Return the loss of a run; infinite if unknown."""
+        return inf if row["loss"] is None else row["loss"]
 
-    return min(completed, key=rank, default=None)
+    candidates = (
+        [row for row in completed if row["success"]]
+        or [row for row in completed if row["converged"]]
+        or completed
+    )
+    return min(candidates, key=loss, default=None)
 
 
 def reference_parameters(
     rows: Sequence[Row], yardstick: SuccessCriterion
 ) -> dict[str, float]:
-    """Return the parameters from which guesses are measured: the truth, or those of the best run.
+    """Return the parameters relative to which guesses are measured: the truth, or the estimates of
+    the best run.
 
-    Empty if the best run did not converge.
+    Empty if there is no truth and the best run did not converge.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        At least one run.
+    yardstick : SuccessCriterion
+        True values; if there are any, one for each estimated parameter (otherwise `KeyError`).
     """
     names = parameters_in(rows)
     if yardstick.truth:
@@ -357,7 +378,16 @@ def reference_parameters(
 
 
 def guess_distance(row: Row, centre: Mapping[str, float]) -> float:
-    """Return the largest ratio between a guess and the reference; NaN without a reference."""
+    """Return the largest ratio, at least 1, between a guess and its reference in either direction;
+    NaN without a reference.
+
+    Parameters
+    ----------
+    row : Row
+        Run with a guess of each parameter in `centre`.
+    centre : mapping of str to float
+        Positive reference by name.
+    """
     logs = [
         abs(np.log(row[f"guess_{name}"] / value))
         for name, value in centre.items()

@@ -39,11 +39,15 @@ def all_pictures(
 ) -> dict[str, Figure]:
     """Return all pictures of a run except that of its Jacobian, by file name without ending.
 
+    Pictures without data are left out. A specimen has pictures of its measurements over strain
+    only.
+
     Parameters
     ----------
     replays : sequence of MotionRecord
         The experiments; the mesh is drawn with grasps and markers of the first.
     result : Result
+        Content of ``result.json`` of the same run.
     truth : mapping, optional
         True parameters by name, see `convergence`.
     """
@@ -85,8 +89,8 @@ def all_pictures(
 def with_unique_names(
     pictures: Iterable[tuple[str, Figure]],
 ) -> dict[str, Figure]:
-    """Return pictures by file name; a number is appended to a name that another picture has
-    already.
+    """Return pictures by file name without suffix, in which characters that a file name cannot have
+    become underscores; "_2", "_3", … is appended to a name that an earlier picture has already.
     """
     named = dict[str, Figure]()
     for text, figure in pictures:
@@ -99,7 +103,9 @@ def with_unique_names(
 
 
 def _experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
-    """Yield name and picture of everything that is known of one experiment."""
+    """Yield name and picture of everything that is known of one experiment; of a specimen only its
+    measurements over strain.
+    """
     t_s = replay.t_s
     measured = replay.measured_m
     fitted = _infinities_as_nan(replay.markers_m)

@@ -44,6 +44,7 @@ class Confidence:
     Attributes
     ----------
     names : (k,) str
+        Names of the parameters.
     values : (k,)
         The estimates.
     covariance : (k, k)
@@ -74,8 +75,8 @@ class Confidence:
         return cls(
             names,
             values,
-            uncertainty.covariance[np.ix_(indices, indices)],
-            uncertainty.quantiles[indices],
+            covariance=uncertainty.covariance[np.ix_(indices, indices)],
+            quantiles=uncertainty.quantiles[indices],
         )
 
 
@@ -110,7 +111,7 @@ def ellipse_outline(
 
 
 def confidence_ellipses(confidence: Confidence) -> Figure:
-    """Draw the joint 95 % region of every pair of parameters.
+    """Return a figure of the joint 95 % region of every pair of parameters.
 
     Axes are deviations from the estimate, in percent, or factors where these are large; the cross
     is the 95 % interval of each parameter alone. A narrow slanted region means that the data
@@ -185,7 +186,9 @@ def confidence_ellipses(confidence: Confidence) -> Figure:
 def _draw_pair(
     axes: Axes, outline: Array, half_width: float, half_height: float
 ) -> None:
-    """Draw a region (points, 2) and a cross of half widths `half_width` and `half_height`."""
+    """Draw a region with the outline (points, 2) into `axes`, and a cross of half widths
+    `half_width` and `half_height`.
+    """
     axes.fill(*outline.T, facecolor=to_rgba(SKY, 0.35), edgecolor=BLUE, lw=1.0)
     for line in (
         [[-half_width, half_width], [0, 0]],
@@ -222,13 +225,15 @@ class _DeviationAxis:
             return cls(
                 reach,
                 (-size, 0.0, size),
-                (f"÷{factor:g}", "1", f"×{factor:g}"),
-                "",
+                labels=(f"÷{factor:g}", "1", f"×{factor:g}"),
+                unit="",
             )
         share = round_length(1 - np.exp(-0.9 * reach))
         number = f"{100 * share:g}"
         ticks = (float(np.log1p(-share)), 0.0, float(np.log1p(share)))
-        return cls(reach, ticks, (f"−{number}", "0", f"+{number}"), " [%]")
+        return cls(
+            reach, ticks, labels=(f"−{number}", "0", f"+{number}"), unit=" [%]"
+        )
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -241,7 +246,7 @@ class _DeviationAxis:
 
 
 def correlation_matrix(confidence: Confidence) -> Figure:
-    """Draw the correlation of every pair of parameters, as colours and numbers.
+    """Return a figure of the correlation of every pair of parameters, as colours and numbers.
 
     Parameters
     ----------
@@ -285,7 +290,10 @@ LEGEND_LINE_MM = 3.8
 
 
 def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Draw the contributions to the variance of each estimate as stacked bars.
+    """Return a figure of the contributions to the variance of each estimate as stacked bars.
+
+    The largest sources have colours of their own; the rest, and sources below
+    `SMALLEST_DRAWN_SHARE` of every variance, are drawn together as "others".
 
     Parameters
     ----------

@@ -34,8 +34,8 @@ OUTLINE_MARGIN = 0.5
 
 
 def depth_picture(rows: Array) -> Figure:
-    """Draw depth images with outlines of the surface, and below them the distances from the
-    surface.
+    """Return a figure of depth images with outlines of the surface, and below them of the
+    distances from the surface.
 
     The samples that have outlines are shown side by side. Without a fit there is no second row; if
     no point counts, the picture has only a sentence about that.
@@ -131,6 +131,7 @@ def _new_panels(
     times : (m,)
         Times of the samples, one column each.
     rows : int
+        Number of rows of panels.
 
     Returns
     -------

@@ -50,10 +50,11 @@ OTHER_REGION_COLOUR = np.array([0.85, 0.85, 0.85])
 
 
 def field_picture(replay: MotionRecord, name: str, values: Array) -> Figure:
-    """Draw the estimate and the ends of its interval on the body, and below them on a cut through
-    it.
+    """Return a figure of the estimate and the ends of its interval on the body, and below them on a
+    cut through it.
 
-    Colours fade to white where the posterior is hardly narrower than the prior.
+    Colours fade to white where the posterior is hardly narrower than the prior. Elements of other
+    regions are grey.
 
     Parameters
     ----------
@@ -100,7 +101,7 @@ def field_picture(replay: MotionRecord, name: str, values: Array) -> Figure:
                 FOOT_MM + (1 - row) * (height + GAP_MM),
             )
             view = SheetView.fit_points(
-                camera, nodes_m, (width, height), corner
+                camera, nodes_m, room_mm=(width, height), corner_mm=corner
             )
             colours = scale.to_rgba(values[:, place])[:, :3]
             colours = (1 - np.nan_to_num(untold)) * colours + np.nan_to_num(
@@ -108,7 +109,10 @@ def field_picture(replay: MotionRecord, name: str, values: Array) -> Figure:
             )
             colours[np.isnan(values[:, place])] = OTHER_REGION_COLOUR
             BodyDrawing(axes, view, surface=faces).update(
-                nodes_m, no_nodes, np.zeros((0, 3)), colours[own[owners]]
+                nodes_m,
+                no_nodes,
+                markers_m=np.zeros((0, 3)),
+                colours=colours[own[owners]],
             )
             if row == 0:
                 axes.text(

@@ -33,8 +33,8 @@ RELATIVE_AMPLITUDE = 0.08
 
 
 def instability_picture(instability: StabilityLoss) -> Figure:
-    """Draw the body displaced along its unstable mode, coloured by the mode's amplitude, with its
-    stretches and wavelength as the title.
+    """Return a figure of the body displaced along its unstable mode, coloured by the mode's
+    amplitude, with its stretches and wavelength as the title.
     """
     extent_m = float(np.ptp(instability.positions_m, axis=0).max())
     shown_m = (
@@ -49,7 +49,7 @@ def instability_picture(instability: StabilityLoss) -> Figure:
     height = min(width / aspect, MAX_BODY_HEIGHT_MM)
     figure, axes = sheet(PAGE_MM, HEAD_MM + height + FOOT_MM)
     view = SheetView.fit_points(
-        camera, shown_m, (width, height), (MARGIN_MM, FOOT_MM)
+        camera, shown_m, room_mm=(width, height), corner_mm=(MARGIN_MM, FOOT_MM)
     )
     amplitude = np.linalg.norm(instability.mode, axis=1)[
         instability.faces
@@ -59,7 +59,7 @@ def instability_picture(instability: StabilityLoss) -> Figure:
     )[:, :3]
     none = np.zeros(len(shown_m), dtype=bool)
     BodyDrawing(axes, view, surface=instability.faces).update(
-        shown_m, none, np.zeros((0, 3)), colours
+        shown_m, none, markers_m=np.zeros((0, 3)), colours=colours
     )
     title = (
         f"unstable mode: stretches {instability.smaller_stretch:.3g} "

@@ -34,8 +34,8 @@ DECADES = 6
 
 
 def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
-    """Draw the constraint Jacobian of the first timesteps, and one of its blocks, coloured by
-    magnitude.
+    """Return a figure of the constraint Jacobian of the first timesteps, and of one of its blocks,
+    coloured by magnitude.
 
     At the left are the dense columns of the parameters, in the middle the block band of the
     positions, at the right the last shown block on the diagonal. Entries are scaled as in the
@@ -133,9 +133,10 @@ def _first_steps(
 def _draw_magnitudes(
     axes: Axes, matrix: sp.csc_array, norm: LogNorm
 ) -> AxesImage:
-    """Draw the magnitudes of a sparse matrix on a raster no finer than the picture.
+    """Draw the magnitudes of a sparse matrix without negative entries on a raster no finer than the
+    picture, and return the image.
 
-    Each raster element has the largest magnitude of its entries.
+    Each raster element has the largest magnitude of its entries; those without an entry stay empty.
     """
     rows, columns = matrix.shape  # type: ignore[misc]
     entries = sp.coo_array(matrix)

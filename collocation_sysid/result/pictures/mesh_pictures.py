@@ -37,7 +37,7 @@ from .scene import (
     sheet,
 )
 
-# More names than this would be a list, not a picture.
+# Largest number of markers whose names are written.
 MAX_WRITTEN_NAMES = 24
 # Height of the titles [mm].
 HEAD_MM = 6.0
@@ -45,13 +45,13 @@ HEAD_MM = 6.0
 FOOT_MM = 14.0
 # Distance between two views [mm].
 GAP_MM = 3.0
-# Height of a line of text.
+# Height of a line of text [mm].
 LINE_MM = 3.2
-# Mean width of a letter.
+# Mean width of a letter [mm].
 LETTER_MM = 1.4
 # Largest height of a view [mm], so that two fit on a page.
 MAX_BODY_HEIGHT_MM = 70.0
-# Shortest distance on paper at which two marks are drawn apart: nearer ones cover each other.
+# Shortest distance on paper at which two marks are drawn apart [mm]; nearer ones overlap.
 MIN_MARK_DISTANCE_MM = 0.4
 DECLARED_POSITION = "position given"
 UNSTATED_PLACE = "position not given"
@@ -77,7 +77,8 @@ MARK_STYLES: dict[str, dict[str, Any]] = {
 
 
 def mesh_picture(replay: MotionRecord) -> Figure:
-    """Draw the undeformed body from the front and from behind, with names of its markers.
+    """Return a figure of the undeformed body from the front and from behind, with grasped nodes,
+    markers and, if they are few, their names.
 
     Tendons are drawn through the body. A cross is the stated place of a marker whose estimated
     place differs; a frame surrounds a marker whose place was not stated.
@@ -125,14 +126,16 @@ def mesh_picture(replay: MotionRecord) -> Figure:
     for camera, corner, mine in zip(
         (front, behind), corners, (first, ~first), strict=True
     ):
-        view = SheetView.fit_points(camera, everything, (width, height), corner)
+        view = SheetView.fit_points(
+            camera, everything, room_mm=(width, height), corner_mm=corner
+        )
         BodyDrawing(
             axes,
             view,
             surface=surface,
             parts=replay.surface_parts,
             nodes=replay.surface_nodes,
-        ).update(nodes_m, is_grasped, places_m)
+        ).update(nodes_m, is_grasped, markers_m=places_m)
         marks |= _draw_declared_positions(
             axes, view, places_m=places_m, declared_m=declared_m
         )
@@ -164,22 +167,34 @@ def mesh_picture(replay: MotionRecord) -> Figure:
         corner_mm=(COLUMN_MM / 2 - 12, 4.0),
         longest_mm=15.0,
     )
-    entries = ["grasped"] if is_grasped.any() else []
-    entries += ["markers", "behind the body"] if len(names) else []
+    lines = _legend_lines(replay, marks)
+    for k, handles in enumerate(lines):
+        draw_legend(axes, handles, corner_mm=(1.0, total - 1.5 - k * LINE_MM))
+    return figure
+
+
+def _legend_lines(replay: MotionRecord, marks: set[str]) -> list[list[Line2D]]:
+    """Return the lines of the legend of a mesh, without empty ones: grasped nodes and markers, the
+    kinds of `marks` that were drawn (keys of `MARK_STYLES`), and the parts if there are several.
+    """
+    entries = ["grasped"] if replay.is_prescribed.any() else []
+    if len(replay.marker_names):
+        entries += ["markers", "behind the body"]
     lines = [
         legend_handles(*entries),
-        [Line2D([], [], label=w, **MARK_STYLES[w]) for w in sorted(marks)],
+        [
+            Line2D([], [], label=name, **MARK_STYLES[name])
+            for name in sorted(marks)
+        ],
     ]
-    if len(part_names) > 1:
+    if len(replay.part_names) > 1:
         lines.append(
             [
                 part_legend_handle(k, name or "rest")
-                for k, name in enumerate(part_names)
+                for k, name in enumerate(replay.part_names)
             ]
         )
-    for k, handles in enumerate(filter(None, lines)):
-        draw_legend(axes, handles, corner_mm=(1.0, total - 1.5 - k * LINE_MM))
-    return figure
+    return [handles for handles in lines if handles]
 
 
 def _draw_declared_positions(
@@ -235,9 +250,23 @@ def _are_named_in_front(
 ) -> NDArray[np.bool_]:
     """Return for each marker (M,) whether its name is written in the front view, else in the one
     from behind.
+
+    It is the view in which the marker is not hidden; if it is hidden in both or in none, the nearer
+    one.
+
+    Parameters
+    ----------
+    front, behind : ParallelCamera
+        Cameras of the two views.
+    places_m : (M, 3)
+        Places of the markers.
+    nodes_m : (n, 3)
+        Nodes of the body.
+    surface : (F, 3)
+        Nodes of the boundary triangles.
     """
     hidden = [
-        camera.are_hidden(places_m, nodes_m, surface)
+        camera.are_hidden(places_m, nodes_m, surface=surface)
         for camera in (front, behind)
     ]
     is_in_front = front.depths_m(places_m) >= front.depths_m(nodes_m).mean()
@@ -295,8 +324,8 @@ def _write_names(
 
 
 def spread_levels(levels: Array, gap: float) -> Array:
-    """Return ascending levels (k,), moved as little as possible to be at least `gap` from each
-    other.
+    """Return ascending levels (k,), moved as little as possible (least squares) to be at least
+    `gap` from each other; the given levels must be ascending.
     """
     steps = gap * np.arange(len(levels))
     # The nearest ascending sequence to levels − steps: neighbours out of order share their mean.
@@ -315,7 +344,7 @@ HISTOGRAM_BINS = 24
 
 
 def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
-    """Draw histograms of the size and the quality of the elements.
+    """Return a figure with histograms of the size and the quality of the elements.
 
     The size is the root mean square edge, the quality the mean ratio 12 (3V)^(2/3) / Σ l², which is
     1 for the regular tetrahedron and near 0 for a flat one.

@@ -34,9 +34,11 @@ from ..figure_style import (
 def drawn_models(
     fitted_m: Array | None, simulated_m: Array | None
 ) -> list[tuple[str, Array, dict[str, Any]]]:
-    """Return label, markers (T, M, 3) and line style of each trajectory that is not None.
+    """Return label, values and line style of each trajectory that is not None, fitted before
+    simulated.
 
-    The second line is dashed, so that the first remains visible where they agree.
+    The second line is dashed, so that the first remains visible where they agree. The values, such
+    as markers (T, M, 3), are returned as they are.
     """
     named = (
         ("fitted", fitted_m, {"color": BLUE, "lw": LINE_PT}),
@@ -53,9 +55,10 @@ def drawn_models(
     ]
 
 
+# Left, bottom, width and height of axes, in shares of the figure.
 Box = tuple[float, float, float, float]
 
-# More markers make a figure higher than a page, in which it is scaled down to illegible numbers.
+# Largest number of markers, with which the figure fits on a page.
 MAX_SHOWN_MARKERS = 3
 
 
@@ -100,7 +103,8 @@ def marker_tracks(
     simulated_m: Array | None = None,
     max_markers: int = MAX_SHOWN_MARKERS,
 ) -> Figure:
-    """Draw the coordinates of markers over time, each with model minus measurement below.
+    """Return a figure of the coordinates of markers over time, each with model minus measurement
+    below.
 
     All error axes have the same scale, so that errors can be compared.
 
@@ -233,7 +237,7 @@ def _axes_boxes(
 
 
 def _column_width_mm() -> float:
-    """Return the width of one of the three columns."""
+    """Return the width of one of the three columns [mm]."""
     layout = TRACK_LAYOUT
     return (
         PAGE_MM
@@ -246,10 +250,11 @@ def _column_width_mm() -> float:
 def _worst_markers(
     measured_m: Array, models_m: Sequence[Array], count: int
 ) -> list[int]:
-    """Return the indices of at most `count` markers with the largest residuals, in their original
-    order.
+    """Return the indices of at most `count` markers with the largest RMS residuals, in their
+    original order.
 
-    Residuals are those of the first model; without a model the first markers are returned.
+    Residuals are those of the first model; without a model, or if there are not more markers, the
+    first markers are returned.
     """
     if measured_m.shape[1] <= count or not models_m:
         return list(range(min(count, measured_m.shape[1])))
@@ -270,7 +275,8 @@ def marker_errors(
     fitted_m: Array | None,
     simulated_m: Array | None = None,
 ) -> Figure:
-    """Draw the root mean square distance of the markers over time, fitted and simulated.
+    """Return a figure of the root mean square distance of the markers over time, fitted and
+    simulated.
 
     Parameters
     ----------
@@ -304,8 +310,8 @@ def marker_errors(
 
 
 def rms_over_markers(squares: Array) -> Array:
-    """Return the root mean square distance (T,) from squared distances (T, M); NaN without any
-    marker.
+    """Return the root mean square distance (T,) from squared distances (T, M) of the markers, of
+    which NaN are left out; NaN for samples without any marker.
     """
     present = np.isfinite(squares)
     total = np.where(present, squares, 0.0).sum(axis=1)
@@ -320,8 +326,8 @@ HEIGHT_MM = 42.0
 def sensor_picture(
     samples: Array, names: Sequence[str], units: Sequence[str] = ()
 ) -> Figure:
-    """Draw the numbers of a sensor over time, three in a row, as the force above the torque of a
-    wrench.
+    """Return a figure of the numbers of a sensor over time, three in a row, as the force above the
+    torque of a wrench.
 
     A row of three numbers without any measurement is left out; at least one must be measured.
 
@@ -330,6 +336,7 @@ def sensor_picture(
     samples : (S, 1 + 3m)
         Time [s], and m numbers as measured, fitted and simulated; NaN where there are none.
     names : sequence of m str
+        Titles of the numbers.
     units : sequence of m str, or empty
         Units of the numbers; not written if empty.
     """

@@ -6,6 +6,7 @@ The 3-D axes of matplotlib cost tenths of a second each and leave wide margins.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +24,24 @@ ELEVATION_DEG = 18.0
 AMBIENT_BRIGHTNESS = 0.62
 # Direction towards the light in the axes of the camera.
 LIGHT_DIRECTION = np.array([-0.4, 0.5, 0.8]) / np.linalg.norm([-0.4, 0.5, 0.8])
+
+
+class VisibleFaces(NamedTuple):
+    """Triangles of a surface that are turned towards the viewer, from far to near.
+
+    Attributes
+    ----------
+    polygons : (k, 3, 2)
+        Corners in the picture [m].
+    brightness : (k,)
+        From `AMBIENT_BRIGHTNESS` to 1.
+    indices : (k,)
+        Indices of these triangles in the surface.
+    """
+
+    polygons: Array
+    brightness: Array
+    indices: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +62,8 @@ class ParallelCamera:
     ) -> ParallelCamera:
         """Return the camera that is in the direction `direction` (3,) from the body, with `up` (3,)
         upright.
+
+        Neither vector needs to have unit length; they must not be parallel.
         """
         direction = np.asarray(direction, dtype=float)
         direction = direction / np.linalg.norm(direction)
@@ -83,7 +104,9 @@ class ParallelCamera:
         )
 
     def turned(self, angle_deg: float, up: ArrayLike) -> ParallelCamera:
-        """Return the camera moved around the body by an angle [°] about `up` (3,)."""
+        """Return the camera moved around the body by an angle [°] about `up` (3,), a unit vector;
+        counter-clockwise as seen from above.
+        """
         turn = Rotation.from_rotvec(
             np.radians(angle_deg) * np.asarray(up, dtype=float)
         )
@@ -108,8 +131,9 @@ class ParallelCamera:
 
     def visible_faces(
         self, positions_m: Array, surface: Triangles
-    ) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Return the triangles that are turned towards the viewer, from far to near.
+    ) -> VisibleFaces:
+        """Return the triangles that are turned towards the viewer, from far to near; those that
+        others hide are included.
 
         Parameters
         ----------
@@ -117,15 +141,6 @@ class ParallelCamera:
             Positions of the nodes.
         surface : (F, 3)
             Nodes of the triangles, counter-clockwise as seen from outside.
-
-        Returns
-        -------
-        polygons : (k, 3, 2)
-            Corners in the picture [m].
-        brightness : (k,)
-            From `AMBIENT_BRIGHTNESS` to 1.
-        chosen : (k,)
-            Indices of these triangles in `surface`.
         """
         corners = positions_m[surface] @ self.axes.T
         normals = np.cross(
@@ -139,10 +154,10 @@ class ParallelCamera:
             np.argsort(corners[front, :, 2].mean(axis=1), kind="stable")
         ]
         light = np.clip(normals[order] @ LIGHT_DIRECTION, 0.0, 1.0)
-        return (
+        return VisibleFaces(
             corners[order, :, :2],
             AMBIENT_BRIGHTNESS + (1 - AMBIENT_BRIGHTNESS) * light,
-            order,
+            indices=order,
         )
 
     def are_hidden(
@@ -156,6 +171,7 @@ class ParallelCamera:
         Parameters
         ----------
         points_m : (k, 3)
+            Points [m]; NaN where missing.
         positions_m : (n, 3)
             Positions of the nodes.
         surface : (F, 3)

@@ -57,7 +57,9 @@ _GRASPED_STYLE = {
 
 
 def sheet(width_mm: float, height_mm: float) -> tuple[Figure, Axes]:
-    """Return a figure with one invisible pair of axes [mm], from the lower left corner."""
+    """Return a figure of a size [mm] and its only axes, which are invisible and fill it; their
+    coordinates are millimetres from the lower left corner.
+    """
     figure = fixed_figure(width_mm, height_mm)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0, width_mm), ylim=(0, height_mm))
@@ -97,6 +99,7 @@ class SheetView:
         Parameters
         ----------
         camera : ParallelCamera
+            Viewing direction.
         points_m : (…, 3)
             Points to show; NaN is ignored.
         room_mm, corner_mm : (2,)
@@ -106,7 +109,11 @@ class SheetView:
         room = np.asarray(room_mm, dtype=float)
         corner = np.asarray(corner_mm, dtype=float)
         scale = float(np.min(room / np.maximum(high - low, 1e-12)))
-        return cls(camera, scale, corner + room / 2 - scale * (low + high) / 2)
+        return cls(
+            camera,
+            scale,
+            origin_mm=corner + room / 2 - scale * (low + high) / 2,
+        )
 
     def moved_by(self, by_mm: ArrayLike) -> SheetView:
         """Return the view moved on the sheet by `by_mm` (2,)."""
@@ -118,7 +125,9 @@ class SheetView:
 
 
 def aspect_ratio(camera: ParallelCamera, points_m: Array) -> float:
-    """Return width over height of points (…, 3) in the picture of a camera."""
+    """Return width over height of points (…, 3) in the picture of a camera; NaN is ignored, and the
+    height must not be zero.
+    """
     low, high = _projected_extent(camera, points_m)
     return float((high - low)[0] / (high - low)[1])
 
@@ -126,19 +135,19 @@ def aspect_ratio(camera: ParallelCamera, points_m: Array) -> float:
 def _projected_extent(
     camera: ParallelCamera, points_m: Array
 ) -> tuple[Array, Array]:
-    """Return the lower left and the upper right corner (2,) [m] of points (…, 3) in the picture.
-
-    Points that are NaN are left out.
+    """Return the lower left and the upper right corner (2,) [m] of points (…, 3) in the picture of
+    a camera; points that are NaN are left out.
     """
     places = camera.project(points_m).reshape(-1, 2)
     return np.nanmin(places, axis=0), np.nanmax(places, axis=0)
 
 
 def with_nearby_outlines(points_m: Array, outlines_m: Array | None) -> Array:
-    """Return points (T, n, 3) of a body joined with outlines (T, o, 3) of obstacles near it.
+    """Return the points (T, n, 3) of a body joined with the outlines (T, o, 3) of obstacles near
+    it, as (T, n + o, 3).
 
-    Outline points further away than half the body's extent are moved to that distance. Without
-    outlines (None) the points alone are returned.
+    Outline points further away than half the body's extent are moved to that distance; NaN stays
+    NaN. Without outlines (None) the points alone are returned.
     """
     if outlines_m is None:
         return points_m
@@ -158,7 +167,8 @@ class BodyDrawing:
     ----------
     axes : Axes
         Axes of a `sheet`.
-    view : DepthCameraModel
+    view : SheetView
+        Projection onto the sheet.
     surface : (F, 3)
         Nodes of the boundary triangles.
     parts : (F,), optional
@@ -246,17 +256,19 @@ class BodyDrawing:
             Points of depth cameras; unchanged by default.
         """
         camera = self.view.camera
-        polygons, brightness, faces = camera.visible_faces(
-            positions_m, self.surface
-        )
-        if (
-            colours is not None
-        ):  # colours that tell something are shaded half as much
+        visible_faces = camera.visible_faces(positions_m, self.surface)
+        faces = visible_faces.indices
+        brightness = visible_faces.brightness
+        if colours is not None:
+            # Colours of a field are shaded half as much, so that they can be compared.
             brightness = (1 + brightness) / 2
         unshaded = self.part_colours if colours is None else colours
         shaded: Any = brightness[:, None] * unshaded[faces]
         self.faces.set_verts(
-            list(self.view.origin_mm + self.view.mm_per_m * polygons)
+            list(
+                self.view.origin_mm
+                + self.view.mm_per_m * visible_faces.polygons
+            )
         )
         if self.edge_colour is not None:
             return
@@ -275,10 +287,14 @@ class BodyDrawing:
             ]
             self.depth_points.set_data(
                 *self.view.to_sheet_mm(
-                    few_m[~camera.are_hidden(few_m, positions_m, self.surface)]
+                    few_m[
+                        ~camera.are_hidden(
+                            few_m, positions_m, surface=self.surface
+                        )
+                    ]
                 ).T
             )
-        hidden = camera.are_hidden(markers_m, positions_m, self.surface)
+        hidden = camera.are_hidden(markers_m, positions_m, surface=self.surface)
         self.hidden_markers.set_data(
             *self.view.to_sheet_mm(markers_m[hidden]).T
         )
@@ -326,8 +342,8 @@ def draw_directions(
     origin_mm: ArrayLike,
     length_mm: float = 5.0,
 ) -> None:
-    """Draw arrows along x, y and z from `origin_mm` (2,); an axis nearly along the viewing
-    direction is left out.
+    """Draw arrows of `length_mm` along x, y and z from `origin_mm` (2,) on a sheet, as the camera
+    projects them; an axis nearly along the viewing direction is left out.
     """
     start = np.asarray(origin_mm, dtype=float)
     for letter, direction in zip("xyz", camera.project(np.eye(3)), strict=True):
@@ -369,7 +385,7 @@ def legend_handles(*entries: str) -> list[Line2D]:
 
 
 def part_legend_handle(part: int, name: str) -> Line2D:
-    """Return the legend handle of the part of the body with index `part`."""
+    """Return the legend handle of the part of the body with index `part`, with the label `name`."""
     look: Any = {
         **_GRASPED_STYLE,
         "ms": 4.0,
@@ -383,7 +399,9 @@ def part_legend_handle(part: int, name: str) -> Line2D:
 def draw_legend(
     axes: Axes, entries: Sequence[Line2D], corner_mm: ArrayLike
 ) -> None:
-    """Draw one line of legend whose upper left corner is at `corner_mm` (2,)."""
+    """Draw one line of legend with these entries into the axes of a sheet; its upper left corner is
+    at `corner_mm` (2,).
+    """
     names = [str(entry.get_label()) for entry in entries]
     place: Any = tuple(np.asarray(corner_mm))
     box = Legend(

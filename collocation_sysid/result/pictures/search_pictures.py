@@ -39,17 +39,18 @@ def convergence(
     names: Sequence[str] | None = None,
     truth: Mapping[str, float] | None = None,
 ) -> Figure:
-    """Draw marker error, loss, violation of the dynamics, and parameters against the iteration
-    number.
+    """Return a figure of marker error, loss, violation of the equations of motion, and parameters
+    against the iteration number; values that are not positive are left out.
 
     Parameters
     ----------
     history : sequence of Iteration
+        Iterations of a search; if empty, the axes are empty.
     names : sequence of str, optional
         Parameters to draw; all by default.
     truth : mapping, optional
-        True values by parameter, relative to which parameters are drawn; their final values by
-        default.
+        True values of these parameters by name, relative to which they are drawn; their final
+        values by default.
     """
     figure = framed_figure(
         COLUMN_MM, 132, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=4
@@ -142,7 +143,9 @@ def _draw_parameters(
     names: Sequence[str],
     truth: Mapping[str, float] | None,
 ) -> None:
-    """Draw the parameters over the iterations, relative to `truth` or to their final values."""
+    """Draw the named parameters over the iterations into `axes`, relative to `truth` or, if that is
+    None, to their final values; a reference of zero counts as 1.
+    """
     axes.axhline(1.0, color=BLACK, lw=0.6)
     numbers = [iteration.number for iteration in history]
     for k, name in enumerate(names if history else ()):
@@ -187,7 +190,8 @@ HEIGHT_MM = 52
 
 
 def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
-    """Draw the misfit of a scan over Young's modulus.
+    """Return a figure of the misfit of a scan over Young's modulus; failed simulations are crosses
+    at the lower edge.
 
     Parameters
     ----------

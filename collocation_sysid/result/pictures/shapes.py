@@ -49,7 +49,7 @@ GAP_MM = 4.0
 BAR_MM = 2.5
 # Width of the colour bar with its labels [mm].
 BAR_ROOM_MM = 20.0
-# From pale to dark, on which markers and grasped nodes stand out; its darkest fifth is left out.
+# Colour map from pale to dark, without its darkest fifth, so that markers stand out.
 FIELD_COLOURS = ListedColormap(
     colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256))
 ).with_extremes(bad="0.85")
@@ -77,7 +77,7 @@ def shapes_picture(
     field: SurfaceField | None = None,
     camera: ParallelCamera | None = None,
 ) -> Figure:
-    """Draw the body at evenly spaced samples, side by side in one scale.
+    """Return a figure of the body at evenly spaced samples, side by side in one scale.
 
     Heights are true; horizontally the shapes are moved together. Samples that are not finite, as in
     a simulation that diverged, are left out.
@@ -152,9 +152,9 @@ def shapes_picture(
         body.update(
             positions_m[t],
             replay.is_prescribed[t],
-            measured_m[t],
-            colour,
-            obstacles_m,
+            markers_m=measured_m[t],
+            colours=colour,
+            outlines_m=obstacles_m,
         )
         text = {"ha": "center", "va": "center", "fontsize": SMALL_PT}
         middle = start + scale * (last - first) / 2
@@ -174,8 +174,11 @@ def shapes_picture(
 
 
 def _draw_colour_bar(axes: Axes, field: SurfaceField, samples: Index) -> Array:
-    """Draw the colour bar of a field, and return the colours (k, F, 3) at samples with indices
-    (k,).
+    """Draw the colour bar of a field into `axes`, and return the colours (k, F, 3) at samples with
+    indices (k,).
+
+    The scale begins at zero if the smallest value is small relative to the largest, and is the same
+    for all samples.
     """
     values = field.values_at(samples)
     low = np.nanmin(values)
@@ -235,6 +238,7 @@ def _camera_facing_weights(
     Parameters
     ----------
     replay : MotionRecord
+        Experiment, for its surface and the upward direction.
     positions_m : (T, n, 3)
         Positions of the nodes.
     weights : (T, F)
@@ -267,7 +271,7 @@ FIELD_TITLES = {
     "energy_density_j_m3": "elastic energy [J/m³]",
     "det_f": "volume relative to the undeformed volume, det F",
 }
-# More would be too small to tell anything.
+# Largest number of shapes; more would be too small to be read.
 MAX_SHAPES = 20
 
 
@@ -278,12 +282,14 @@ def field_shapes(
     field: str | None,
     count: int,
 ) -> Figure:
-    """Draw `count` shapes of an experiment, coloured by a field of its elements.
+    """Return a figure of `count` shapes of an experiment, coloured by a field of its elements.
 
     Parameters
     ----------
     replay : MotionRecord
+        Experiment with shapes.
     body : Body
+        Its body.
     constants : mapping of name to value
         Constants of the body, for stresses and energies.
     field : str or None
@@ -312,7 +318,19 @@ def field_shapes(
 def _surface_field(
     replay: MotionRecord, body: Body, constants: Mapping[str, float], field: str
 ) -> SurfaceField:
-    """Return a field of the elements, a key of `FIELD_TITLES`, on the boundary triangles."""
+    """Return a field of the elements on the boundary triangles of an experiment.
+
+    Parameters
+    ----------
+    replay : MotionRecord
+        Experiment with shapes.
+    body : Body
+        Its body.
+    constants : mapping of name to value
+        Constants of the body.
+    field : str
+        Key of `FIELD_TITLES`.
+    """
     elements = ElementFields.from_body(body, body.theta_from_values(constants))
     cells = body.mesh.surface_cells
 

@@ -35,8 +35,8 @@ def spectrum_picture(
     fitted_m: Array | None,
     natural_hz: Array | None,
 ) -> Figure:
-    """Draw the spectral density of the measured tracks and of the residual, with the natural
-    frequencies.
+    """Return a figure of the spectral density of the measured tracks and of the residual, with the
+    natural frequencies.
 
     Parameters
     ----------
@@ -119,7 +119,9 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
 
 
 def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
-    """Draw lines at the natural frequencies below `limit_hz`, numbered from 1 at the top."""
+    """Draw lines at the natural frequencies (k,) [Hz] below `limit_hz` into `axes`, numbered from 1
+    at the top; neighbours that are too near share a label.
+    """
     shown = natural_hz[natural_hz < limit_hz]
     for group in _neighbour_groups(shown, 0.05 * limit_hz):
         for hertz in shown[group]:
@@ -148,8 +150,8 @@ def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
 
 
 def _neighbour_groups(ascending: Array, gap: float) -> list[NDArray[np.int64]]:
-    """Return groups of indices of ascending values whose neighbours are nearer to each other than
-    `gap`.
+    """Return groups of indices of ascending values, in which neighbours are nearer to each other
+    than `gap`; every value is in one group.
     """
     breaks = np.flatnonzero(np.diff(ascending) >= gap) + 1
     return [

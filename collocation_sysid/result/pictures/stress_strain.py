@@ -26,7 +26,7 @@ HEIGHT_MM = 58
 def strain_picture(
     strain: Array, t_s: Array, samples: Array, name: str, unit: str
 ) -> Figure:
-    """Draw one measurement of a specimen over its strain, in the order of time.
+    """Return a figure of one measurement of a specimen over its strain, in the order of time.
 
     Parameters
     ----------
@@ -71,7 +71,11 @@ def strain_picture(
 
 
 def _readable_unit(values: Array, unit: str) -> tuple[str, float]:
-    """Return a readable unit for values, and the factor to it; "" for ratios."""
+    """Return a readable unit for values, and the factor to it.
+
+    Stresses ("Pa") get the largest unit in which the largest magnitude is at least `READABLE`;
+    other units are kept with the factor 1, and "1" becomes "".
+    """
     if unit != "Pa":
         return ("" if unit == "1" else unit), 1.0
     largest = float(np.nanmax(np.abs(values), initial=0.0))

@@ -126,6 +126,7 @@ class QuickCheck:
     Attributes
     ----------
     bodies : tuple of BodyCheck
+        One for each body.
     recordings : tuple of RecordingCheck, one for each experiment
     holds : tuple of GraspCheck, one for each grasp
     """
@@ -161,13 +162,14 @@ class CheckResult(QuickCheck):
     method : str
         The chosen method.
     memory_mb : float or None
-        Its memory; None if it is not among the `method_costs`.
+        Estimated memory of the chosen method; None if it is not among the `costs`.
     costs : tuple of MethodCost, one for each method with a known cost
     jacobian_error, hessian_error : float
         Largest relative deviation from central differences along random directions.
     causes : tuple of Hypothesis
         Likely errors in the description; their sentences are the first warnings.
     notes : tuple of str
+        Sentences for information, without a remedy.
     concerns : tuple of Concern
         Expected problems, with the remedy; `warnings` are their sentences.
     """
@@ -205,7 +207,7 @@ class CheckResult(QuickCheck):
 
     @property
     def derivatives_agree(self) -> bool:
-        """Whether both derivative checks pass."""
+        """Whether the errors of both derivative checks are below `DERIVATIVE_TOLERANCE`."""
         return (
             max(self.jacobian_error, self.hessian_error) < DERIVATIVE_TOLERANCE
         )
@@ -225,7 +227,7 @@ class CheckResult(QuickCheck):
 def quick_check(problem: Problem) -> QuickCheck:
     """Return a check of bodies, recordings and grasps without a simulation.
 
-    Parameters without a guess get usual values.
+    Parameters without a guess get usual values of a soft body; the problem is not modified.
     """
     usual = typical_parameters(problem.parameters, SOFT_PA)
     return QuickCheck(**_quick_fields(replace(problem, parameters=usual), {}))
@@ -327,24 +329,21 @@ def check_problem(
         )
         causes = rank((*causes, *mistakes))
         notes += _depth_notes(problem) if not full else []
-    fit_s = (
-        FIT_SIMULATIONS
-        * total_s
-        * min(1.0, CHECKED_SAMPLES / _grid_rows(collocation))
-    )
-    sensed = any(
+    has_both = any(
         e.wrenches and e.markers.sample_count for e in problem.experiments
     )
-    if sensed and not causes and (full or fit_s <= LONGEST_SIMULATION_S):
-        report_progress(
-            "comparing the wrenches with the prediction from the markers"
-        )
-        causes = rank(wrench_mistakes(collocation))
-    elif sensed and not causes:
-        notes.append(
-            "the wrenches were not compared with the prediction from the markers, which would "
-            f"take about {fit_s:.2g} s; check --full does it"
-        )
+    if has_both and not causes:
+        fit_s = _wrench_comparison_s(collocation, total_s)
+        if full or fit_s <= LONGEST_SIMULATION_S:
+            report_progress(
+                "comparing the wrenches with the prediction from the markers"
+            )
+            causes = rank(wrench_mistakes(collocation))
+        else:
+            notes.append(
+                "the wrenches were not compared with the prediction from the markers, which would "
+                f"take about {fit_s:.2g} s; check --full does it"
+            )
     findings = CheckResult(
         **_simulated_fields(problem, simulated, z=z),
         timesteps=_grid_rows(collocation),
@@ -392,13 +391,28 @@ def check_problem(
     return replace(findings, notes=(*known, *notes))
 
 
+def _wrench_comparison_s(collocation: Collocation, total_s: float) -> float:
+    """Return the estimated time [s] to fit the first samples to the markers alone, for the
+    comparison with the wrenches; `total_s` is the time to simulate the complete recordings.
+    """
+    share = min(1.0, CHECKED_SAMPLES / _grid_rows(collocation))
+    return FIT_SIMULATIONS * total_s * share
+
+
 def _simulated_fields(
     problem: Problem, collocation: Collocation, z: Array
 ) -> dict[str, Any]:
     """Return the fields of `QuickCheck` and the totals of `CheckResult` for simulations at the
     guess.
 
-    The collocation may be that of the first samples.
+    Parameters
+    ----------
+    problem : Problem
+        Complete problem.
+    collocation : Collocation
+        Program that was simulated, perhaps that of the first samples.
+    z : (variables,) array
+        Its variables.
     """
     positions_m = {}
     for part in collocation.iterates(z):
@@ -482,7 +496,9 @@ def _program_fields(
 def _natural_modes(
     problem: Problem, collocation: Collocation
 ) -> tuple[ModesCheck, ...]:
-    """Return the natural modes at the guess of all fitted experiments that move."""
+    """Return the natural modes at the guess of all fitted experiments that move, with the scheme
+    and step of the collocation.
+    """
     scheme = as_scheme(collocation.scheme)
     guesses = problem.parameters.guesses
     return tuple(
@@ -500,7 +516,16 @@ def _natural_modes(
 def _concerns(
     problem: Problem, findings: CheckResult, unstable: Sequence[Instability]
 ) -> tuple[Concern, ...]:
-    """Return the expected problems, the likeliest mistakes first."""
+    """Return the expected problems, the likeliest mistakes first.
+
+    Parameters
+    ----------
+    problem : Problem
+    findings : CheckResult
+        Findings; its concerns are not used.
+    unstable : sequence of Instability
+        Losses of stability in the simulation at the guess.
+    """
     experiments = problem.experiments
     parameters = problem.parameters
     bodies = findings.bodies
@@ -543,10 +568,10 @@ def _concerns(
 def _contact_concerns(
     simulated: Collocation, z: Array, is_complete: bool
 ) -> list[Concern]:
-    """Return concerns about contact at the guess.
+    """Return concerns about contact in the simulation with the variables z at the guess.
 
-    `is_complete` is false if only the first samples were simulated: then only about penetration at
-    the start.
+    `is_complete` is false if only the first samples were simulated: then there are only concerns
+    about penetration at the start.
     """
     concerns = contact_concerns(
         contact_summaries_of_parts(simulated.iterates(z)), AT_THE_GUESS
@@ -578,8 +603,8 @@ def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
 
 
 def _body_concerns(body: BodyCheck, alone: bool) -> tuple[Concern, ...]:
-    """Return the concerns of a body; unless it is the only body (`alone`), with the names of its
-    experiments.
+    """Return the concerns of a body; unless it is the only body (`alone`), their data name its
+    experiments under "of".
     """
     of = f"in the body of {', '.join(map(repr, body.experiments))}"
     named = (
@@ -638,6 +663,7 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
     """Return likely errors in the description of a problem; mostly none.
 
     Odd sizes and densities come first, as others may follow from them; then the likeliest.
+    Parameters without a guess get usual values.
 
     Raises
     ------

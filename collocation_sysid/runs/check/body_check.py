@@ -55,6 +55,7 @@ class ElementShape:
     aspect_ratio : float
         Longest edge over smallest height: 1.22 for the regular tetrahedron.
     longest_edge_m : float
+        Length of the longest edge.
     """
 
     element: int
@@ -70,6 +71,7 @@ class Slenderness:
     Attributes
     ----------
     length_m, thickness_m : float
+        Longest extent, and thickness where the body bends.
     cells_across : float
         Thickness over the size of a cell of six tetrahedra.
     """
@@ -80,7 +82,7 @@ class Slenderness:
 
 
 def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
-    """Return the `count` elements of lowest quality, worst first."""
+    """Return the `count` elements of lowest quality, worst first; all of them if there are fewer."""
     corners = mesh.points_m[mesh.tetrahedra]
     areas = [_areas(corners[:, face]) for face in _FACES]
     heights = 3 * mesh.volumes_m3 / np.max(areas, axis=0)
@@ -119,9 +121,11 @@ def element_concerns(
     Parameters
     ----------
     body : Body
+        Body with its mesh and elements.
     theta : array
         Constants θ at the guess.
     shape : Slenderness
+        Slenderness of the body.
     worst : ElementShape
         Element of the lowest quality.
     """
@@ -198,8 +202,15 @@ class BodyCheck:
     experiments : tuple of str
         Names of its experiments.
     element : str
-    size_m : (x, y, z) extents along the axes
-    edges_m : shortest, mean and longest edge
+        Name of the element, such as "tet10".
+    nodes, elements : int
+        Numbers of nodes and elements.
+    volume_m3, mass_kg : float
+        Volume of the mesh, and mass at the guess, without point masses.
+    size_m : (x, y, z) extents of the mesh along the axes
+    smallest_element_quality, median_element_quality : float
+        Mean ratio, see `ElementShape`.
+    edges_m : shortest, mean and longest edge of the mesh
     worst_elements : tuple of ElementShape, worst first
     cells_across : float
         Number of elements across the body's thickness.
@@ -317,7 +328,9 @@ def _rest_shape(body: Body) -> str | None:
 
 
 def _rest_shape_change_m(body: Body, theta: Array) -> float:
-    """Return the largest distance of the mesh from the stress-free shape [m], NaN without one."""
+    """Return the largest distance of the mesh of a body from its stress-free shape [m]: 0 if the
+    mesh is that shape, NaN if none can be computed at the constants θ (k,).
+    """
     if body.inverse_equilibrium is None:
         return 0.0
     if body.rest_shape_failure(theta) is not None:
@@ -329,8 +342,8 @@ def _rest_shape_change_m(body: Body, theta: Array) -> float:
 
 
 def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
-    """Yield a concern for each field whose shapes represent too little of the prior variance; keys
-    are names of constants.
+    """Yield a concern for each field, by name of the constant, whose shapes represent less than the
+    share `LEAST_FIELD_VARIANCE` of the prior variance.
     """
     for name, field in fields.items():
         if field.share < LEAST_FIELD_VARIANCE:
@@ -338,7 +351,9 @@ def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
 
 
 def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
-    """Return constants, and E and ν at small strain, by name."""
+    """Return E and ν at small strain of each part, then the constants θ of the body without
+    coefficients of fields, by name with the region; stated moduli replace computed ones.
+    """
     moduli = {}
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
         young, poisson = engineering_constants(*lame)
@@ -370,6 +385,7 @@ class GraspCheck:
     Attributes
     ----------
     experiment : str
+        Name of the experiment.
     nodes : int
         Number of nodes.
     low_m, high_m : (3,) corners of the box around them, on the undeformed body
@@ -397,8 +413,14 @@ class GraspCheck:
 def check_grasps(
     experiment: Experiment, mean_edge_m: float
 ) -> tuple[GraspCheck, ...]:
-    """Return a summary of the grasped nodes for each grasp of an experiment, see `GraspCheck`;
-    `mean_edge_m` is the mean edge length of the mesh [m].
+    """Return a summary of the grasped nodes for each grasp of the body in an experiment, without
+    obstacles, see `GraspCheck`.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    mean_edge_m : float
+        Mean edge length of the mesh [m].
     """
     points_m = experiment.body.nodes.points_m
     return tuple(
@@ -475,7 +497,9 @@ def grasp_sentence(grasp_check: GraspCheck) -> str:
 
 
 def grasp_concerns(grasp_check: GraspCheck) -> list[Concern]:
-    """Return a concern if rounding decides which nodes are held."""
+    """Return one concern if some nodes are so near to a face of the box that rounding decides
+    whether they are held; otherwise none.
+    """
     by_chance = bool(grasp_check.nearly_grasped or grasp_check.nearly_free)
     counts = {
         "nodes": grasp_check.nodes,

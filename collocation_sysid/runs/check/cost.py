@@ -39,6 +39,14 @@ def require_memory(
     Small programs, other methods than interior point and reduced space, and machines of unknown
     memory pass.
 
+    Parameters
+    ----------
+    problem : Problem
+    collocation : Collocation
+        Program of the problem, with guesses.
+    method : Method
+        Method that will solve it.
+
     Raises
     ------
     InputError
@@ -77,7 +85,8 @@ def interior_point_mb(entries: int) -> float:
 
 
 def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
-    """Return the numbers of nonzeros of Jacobian and Hessian, extrapolated from a few samples.
+    """Return the numbers of nonzeros of the Jacobian and the Hessian of the lifted program,
+    extrapolated linearly from a few samples of each experiment.
 
     Parameters
     ----------
@@ -116,10 +125,10 @@ TIMED_ROWS = 12
 TYPICAL_SWEEPS = 10
 # Iterations that interior point mostly takes.
 TYPICAL_ITERATIONS = 10
-# Time of an iteration [s] per nonzero and per unknown of a time step to the power POWER: IPOPT with
+# Time of an iteration [s] per nonzero and per TIMESTEP_POWER of the unknowns of a step: IPOPT with
 # MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps on one core.
 SECONDS_PER_NONZERO = 4.5e-10
-# The power `POWER` of the unknowns of a time step, as measured.
+# Power of the unknowns of a time step in that time, as measured.
 TIMESTEP_POWER = 1.4
 # Time of a method [s] above which a quicker one is recommended.
 LONG_SOLVE_S = 60.0
@@ -134,7 +143,9 @@ class MethodCost:
     Attributes
     ----------
     method : str
+        Name of the method.
     memory_mb : float
+        Estimated memory [MB].
     time_s : float or None
         None where it is unknown: the equations at the guess cannot be solved.
     """
@@ -156,6 +167,7 @@ def method_costs(
     Parameters
     ----------
     collocation : Collocation
+        Program of the complete recordings.
     short : Collocation
         First samples of the same experiments, in which sweeps are timed.
     z : (variables,) array
@@ -200,8 +212,15 @@ def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
 
 
 def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
-    """Return a note if the quickest of the other methods is far quicker than the chosen one, which
-    takes long; none if a time is unknown.
+    """Return a note if the quickest of the other methods takes at most a tenth of the time of the
+    chosen one, which takes more than a minute; none if a time is unknown.
+
+    Parameters
+    ----------
+    chosen : MethodCost
+        Cost of the chosen method.
+    others : sequence of MethodCost
+        Costs of at least one method; the chosen one may be among them.
     """
     quickest = min(others, key=lambda cost: cost.time_s or np.inf)
     if chosen.time_s is None or quickest.time_s is None:
@@ -220,8 +239,8 @@ def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
 def cost_concerns(
     chosen: MethodCost, others: Sequence[MethodCost]
 ) -> list[Concern]:
-    """Return a concern if the chosen method needs more memory than this machine has; none if that
-    is unknown.
+    """Return a concern if the chosen method needs at least the memory that this machine has, with
+    another method that fits as remedy; none if the machine's memory is unknown.
     """
     available = machine_memory_mb()
     if available is None or chosen.memory_mb < available:
@@ -248,10 +267,18 @@ def _estimated_sweeps_s(
     factorisation: Choice,
 ) -> float | None:
     """Return the estimated time of all sweeps of a solve [s], from one timed sweep over the first
-    rows of each experiment.
+    rows of each experiment; None if the equations cannot be solved.
 
-    None if the equations cannot be solved. `z` has the variables of the program `short` at the
-    start.
+    Parameters
+    ----------
+    collocation : Collocation
+        Complete program, which gives the number of rows.
+    short : Collocation
+        Program of the first samples.
+    z : (variables,) array
+        Variables of `short` at the start.
+    factorisation : {"auto", "band", "sparse", "supernodal"}
+        Option of reduced space.
     """
     total = 0.0
     for segment, part in zip(

@@ -20,7 +20,7 @@ from ...recording.time_tables import FEWEST_SHARED_SAMPLES
 
 # First samples of a motion that contain all kinds of equations; more would not change derivatives.
 SAMPLES = 12
-# The same of a static experiment.
+# Number of first samples of a static experiment that contain all kinds of equations.
 STATIC_SAMPLES = 3
 # Step of the differences, which balances truncation and rounding of fourth-order differences.
 STEP = 1e-5
@@ -38,7 +38,9 @@ def first_sample_count(experiment: Experiment) -> int:
 
 
 def shortened_problem(problem: Problem) -> Problem:
-    """Return the problem with a few first samples of every experiment."""
+    """Return the problem with a few first samples of every experiment, also of those for
+    validation.
+    """
     short = tuple(
         shortened_experiment(e, first_sample_count(e))
         for e in problem.experiments
@@ -55,6 +57,7 @@ def shortened_experiment(experiment: Experiment, samples: int) -> Experiment:
     Parameters
     ----------
     experiment : Experiment
+        Experiment to shorten; not modified.
     samples : int
         Least number of samples.
     """
@@ -104,6 +107,7 @@ def derivative_errors(
     Parameters
     ----------
     collocation : Collocation
+        Program without lifted variables.
     z : (variables,) array
         Start.
 
@@ -188,8 +192,19 @@ def _difference_step(collocation: Collocation) -> float:
 def _slope_error(
     function, gradient, z: Array, rng: np.random.Generator, step: float
 ) -> float:
-    """Return the relative error of a gradient along a random direction, at a point near z, with
-    central differences of `function`.
+    """Return the relative error of a gradient along a random direction, at a random point near z,
+    from central differences.
+
+    Parameters
+    ----------
+    function, gradient : callable
+        Functions of the variables: the value, and its gradient (variables,).
+    z : (variables,) array
+        Centre of the random points.
+    rng : Generator
+        Source of the random numbers; its state advances.
+    step : float
+        Step of the differences.
     """
     point = z + 1e-3 * rng.normal(size=len(z))
     direction = rng.normal(size=len(z))

@@ -28,6 +28,7 @@ class MarkerCheck:
     Attributes
     ----------
     name : str
+        Name of the marker.
     distance_m : float
         Distance from the body, or from the node it was attached to.
     samples, missing : int
@@ -51,13 +52,17 @@ class RecordingCheck:
     Attributes
     ----------
     experiment : str
+        Name of the experiment.
     validation, static : bool
+        Whether it is for validation, and whether it is a series of equilibria.
     duration_s, rate_hz : float
+        Duration, and samples per second.
     frames : int
         Number of sample times.
     samples, missing : int
         Numbers of marker samples that are present, and that are missing.
     markers : tuple of MarkerCheck
+        One for each marker; empty without markers.
     instruments : tuple of str
         Other instruments, in words.
     air_density_kg_m3 : float
@@ -81,12 +86,12 @@ class RecordingCheck:
 
     @property
     def farthest_marker(self) -> MarkerCheck:
-        """The marker farthest from the body."""
+        """The marker farthest from the body; `ValueError` without markers."""
         return max(self.markers, key=lambda marker: marker.distance_m)
 
     @property
     def most_missing_marker(self) -> MarkerCheck:
-        """The marker with most samples missing."""
+        """The marker with most samples missing; `ValueError` without markers."""
         return max(self.markers, key=lambda marker: marker.missing)
 
 
@@ -151,13 +156,25 @@ def check_recording(
 def recording_concerns(
     recording: RecordingCheck, body: BodyCheck
 ) -> list[Concern]:
-    """Return concerns about the markers of a recording; each names the worst marker only."""
+    """Return up to four concerns about the markers of a recording; each names the worst marker
+    only. Empty without markers.
+
+    Parameters
+    ----------
+    recording : RecordingCheck
+        Recording to judge.
+    body : BodyCheck
+        Its body, which gives the scale of distances.
+    """
     if not recording.markers:
         return []
 
     def of(
         marker: MarkerCheck, distance_m: float | None = 0.0
     ) -> dict[str, Any]:
+        """Return the data of a concern about a marker; `distance_m` [m] is None or 0 if it does not
+        matter.
+        """
         by_mm = 1e3 * (distance_m or 0.0)
         frames = recording.frames
         named = {"marker": marker.name, "experiment": recording.experiment}

@@ -48,10 +48,11 @@ class ModeCheck:
     Attributes
     ----------
     frequency_hz : float
+        Undamped natural frequency.
     samples_per_period, steps_per_period : float
         Samples of the recording, and steps of the time grid.
     damping_ratio : float
-        Of the material.
+        Damping ratio of the mode by the material; 1 or more if it is overdamped.
     numerical_damping_ratio : float
         Damping ratio that the scheme adds; negative where it takes some away.
     period_error : float
@@ -73,13 +74,16 @@ class ModesCheck:
     Attributes
     ----------
     experiment : str
+        Name of the experiment.
     about : str
         State about which the body oscillates: "rest state" or "undeformed shape".
     modes : tuple of ModeCheck, by frequency
     scheme : str
+        Name of the time scheme.
     timestep_s : float
         Step of the time grid.
     duration_s : float
+        Duration of the recording.
     substeps_needed : int or None
         The fewest with which the scheme damps and slows the first mode little; None if too many.
     not_oscillating : int
@@ -113,7 +117,9 @@ def check_modes(
     Parameters
     ----------
     experiment : Experiment
+        Experiment that moves.
     scheme : Scheme
+        Time scheme of the solve.
     step_s : float
         Step of the time grid [s].
     theta : array
@@ -128,7 +134,7 @@ def check_modes(
     )
     free = np.flatnonzero(~is_prescribed[least])
     modes = natural_modes(
-        Forces.from_experiment(experiment, time_s, theta),
+        Forces.from_experiment(experiment, time_s, theta=theta),
         x,
         free_dofs=free,
         count=MODE_COUNT,
@@ -140,7 +146,11 @@ def check_modes(
         limit = _damping_limit(findings[0])
         ratio = _oscillating_damping_ratio(findings[0].damping_ratio)
         needed = substeps_needed(
-            scheme, omega, experiment.timestep_s, limit, damping_ratio=ratio
+            scheme,
+            omega,
+            timestep_s=experiment.timestep_s,
+            damping_limit=limit,
+            damping_ratio=ratio,
         )
     return ModesCheck(
         experiment.name,
@@ -160,9 +170,19 @@ def _reference_state(
     time_s: float,
     theta: Array,
 ) -> tuple[Array, str]:
-    """Return node positions (n, 3) [m] about which the body oscillates, and the name of this state.
+    """Return positions about which the body oscillates, and the name of this state: the equilibrium
+    if nodes are held and it can be found ("rest state"), else the undeformed shape, placed rigidly
+    ("undeformed shape").
 
-    The equilibrium if it can be found, else the undeformed shape.
+    Parameters
+    ----------
+    experiment : Experiment
+    is_prescribed : (n, 3)
+        Coordinates that are held.
+    time_s : float
+        Time of the poses and loads [s].
+    theta : (k,) array
+        Constants θ of the body.
     """
     if is_prescribed.any():
         try:
@@ -180,6 +200,17 @@ def _mode_findings(
 ) -> tuple[ModeCheck, ...]:
     """Return frequency, samples and steps per period, damping ratio, and the errors of the scheme
     in period and damping, for each mode, lowest first.
+
+    Parameters
+    ----------
+    modes : Modes
+        Natural modes.
+    experiment : Experiment
+        Its sampling interval is used.
+    scheme : Scheme
+        Time scheme.
+    step_s : float
+        Step of the time grid [s].
     """
     findings = []
     for frequency, ratio in zip(
@@ -315,7 +346,9 @@ def mode_notes(motion: ModesCheck) -> list[str]:
 
 
 def _step_remedy(motion: ModesCheck) -> str:
-    """Return the remedy for too few steps: a setting, or a higher rate."""
+    """Return the remedy for too few steps: a setting of the substeps, or a higher rate if too many
+    would be needed.
+    """
     if motion.substeps_needed is None:
         return "record at a higher rate"
     return f"set transcription.{_substeps_setting(motion)}"
