@@ -53,6 +53,10 @@ from .markers.marker_association import MarkerAssociation
 from .shared_nuisances import nuisance_indices, shared_charts
 from .transcription import RowWeights, SegmentOffsets, Transcription
 
+# Distance of a parameter from its bound, in units of z, at which it counts as at the bound: more
+# than the distance at which interior-point methods stop.
+BOUND_TOLERANCE = 1e-6
+
 
 def convert_variables(
     z: Array, source: Collocation, target: Collocation
@@ -71,8 +75,9 @@ def convert_variables(
 
     Returns
     -------
-    (to.variables,) array
-        Variables; lifted ones follow from positions and parameters.
+    (target.variable_count,) array
+        Variables of `target`, z itself if both have the same number. Lifted variables of the target
+        follow from positions and parameters; those of the source are dropped.
     """
     return (
         z if len(z) == target.variable_count else target.pack(*source.unpack(z))
@@ -218,8 +223,10 @@ class Collocation:
         )
 
     def with_lifted_variables(self) -> Collocation:
-        """Return the program with lifted variables, or self if it has them already or
-        nothing can be lifted.
+        """Return the program with lifted variables, or self if it has them already or nothing can
+        be lifted.
+
+        The transcriptions are shared with the copy.
         """
         has_sensors = any(len(s.sensed_dofs) for s in self.transcriptions)
         has_complementarity = any(
@@ -249,16 +256,17 @@ class Collocation:
 
     @property
     def variable_count(self) -> int:
-        """Number of variables z."""
+        """Number of variables z, including lifted ones."""
         return self.phi_columns.stop + self.lifted_count()
 
     @property
     def constraint_count(self) -> int:
-        """Number of constraints g."""
+        """Number of constraints g, including the equations of lifted variables."""
         return self.transcriptions[-1].next_offsets.row + self.lifted_count()
 
     def lifted_count(self, kind: str | None = None) -> int:
-        """Return the number of lifted variables, which is also that of their equations.
+        """Return the number of lifted variables, which is also that of their equations; 0 unless
+        `has_lifted_variables`.
 
         Parameters
         ----------
@@ -286,7 +294,9 @@ class Collocation:
 
     @property
     def loss_scale(self) -> float:
-        """Factor of the loss in the objective: one over the number of measurements."""
+        """Factor of the loss in the objective: one over the number of measurements, or 1 without
+        any.
+        """
         return 1.0 / max(1, self.measurement_count)
 
     def pack(self, p: Array, positions: Sequence[Array]) -> Array:
@@ -344,7 +354,7 @@ class Collocation:
         return slice(first, first + self.nphi)
 
     def iterates(self, z: Array) -> list[ExperimentIterate]:
-        """Return every experiment at the variables z, with lifted variables taken from z."""
+        """Return every fitted experiment at the variables z, with lifted variables taken from z."""
         parts = self.iterates_at(*self.unpack(z))
         for each in self.lifted:
             parts[each.segment_index] = each.with_lifted(
@@ -354,21 +364,26 @@ class Collocation:
 
     @cached_property
     def parameter_indices(self) -> list[Index]:
-        """Indices of (q, φ) of each experiment in p."""
+        """Indices (nq + k,) of (q, φ) of each experiment in p."""
         return [segment.parameter_indices for segment in self.transcriptions]
 
     @property
     def threads(self) -> int:
-        """Number of threads that all bodies may use."""
+        """Number of threads that every body may use: the least of the bodies' numbers."""
         return min(segment.body.threads for segment in self.transcriptions)
 
     def iterates_at(
         self, p: Array, positions: Sequence[Array]
     ) -> list[ExperimentIterate]:
-        """Return every experiment at parameters p (nq + nphi,) and positions (N, 3n) [m], or their
-        first rows.
+        """Return every fitted experiment at parameters and positions, from which lifted quantities
+        follow.
 
-        Lifted quantities follow from positions and parameters.
+        Parameters
+        ----------
+        p : (nq + nphi,) array
+            Parameters (q, φ_1, φ_2, …).
+        positions : sequence of (N, 3n) arrays
+            Positions of each fitted experiment [m], or their first rows.
         """
         return [
             ExperimentIterate(
@@ -383,7 +398,7 @@ class Collocation:
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Name of each entry of p: the parameters' names, then the labels of the nuisance
-        parameters.
+        parameters; of a shared one, the label in the last experiment that has it.
         """
         names = [item.name for item in self.parameters.free] + [""] * self.nphi
         for segment in self.transcriptions:
@@ -396,10 +411,11 @@ class Collocation:
         return tuple(names)
 
     def prior_residuals(self, p: Array) -> tuple[Array, Array]:
-        """Return residuals (nq + nphi,) of the priors at p and their derivatives, both in standard
-        deviations.
+        """Return residuals (nq + nphi,) of the priors at p, and the derivative (nq + nphi,) of each
+        by its own parameter, both in standard deviations.
 
-        A parameter without a prior has the residual 0.
+        A parameter without a prior has the residual and the derivative 0; φ is measured in standard
+        deviations already.
         """
         residuals, slopes = self.parameters.prior_residuals(p[: self.nq])
         return (
@@ -409,7 +425,9 @@ class Collocation:
 
     @property
     def parameter_bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of p, (nq + nphi,) each; infinite for most φ."""
+        """Lower and upper bounds of p, (nq + nphi,) each; infinite for most φ. For a shared φ, the
+        narrowest of all experiments.
+        """
         lower, upper = self.parameters.bounds_q
         low, high = (np.full(self.nphi, bound) for bound in (-np.inf, np.inf))
         for segment in self.transcriptions:
@@ -426,12 +444,13 @@ class Collocation:
     def follow_estimates(
         self, p: Array, positions: Sequence[Array] = ()
     ) -> tuple[Collocation, Array]:
-        """Update the associations where the estimates p have left them.
+        """Return the program with associations that belong to the estimates p, and p relative to
+        them; see `Transcription.follow_estimates`.
 
         Parameters
         ----------
         p : (nq + nphi,) array
-            Parameters.
+            Parameters; not modified.
         positions : sequence of (rows, 3n) arrays
             First rows of each experiment [m], which depth cameras need; empty without depth
             cameras.
@@ -461,20 +480,21 @@ class Collocation:
     def place_unknown_markers(
         self, p: Array, positions: Sequence[Array]
     ) -> tuple[Collocation, Array]:
-        """Initialise unknown marker places and depth cameras before a solve, see
-        `Transcription.place_unknown_markers`.
+        """Return the program with unknown marker places and depth cameras initialised before a
+        solve, and p in it; see `Transcription.place_unknown_markers`.
 
         Parameters
         ----------
         p : (nq + nphi,) array
-            Parameters.
+            Parameters; not modified.
         positions : sequence of (rows, 3n) arrays
             First rows of each experiment [m].
 
         Returns
         -------
         (Collocation, array)
-            The program with the new associations, which is self if all is stated, and p in it.
+            The program with the new associations, and p in it; self and p if no experiment has
+            unknown places or depth cameras.
         """
         if not any(segment.rows_to_place for segment in self.transcriptions):
             return self, p
@@ -487,8 +507,8 @@ class Collocation:
         )
 
     def with_marker_places(self, places_m: Sequence[Array]) -> Collocation:
-        """Return the program with associations about given marker places (M, 3) [m] for each
-        experiment.
+        """Return the program with associations centred at given marker places, one array (M, 3) [m]
+        on the undeformed body for each fitted experiment.
         """
         charts = [
             s.association.centred_at(m)
@@ -508,8 +528,11 @@ class Collocation:
         p: Array,
         phis: Sequence[Array],
     ) -> tuple[Collocation, Array]:
-        """Return the program with another association of each experiment, and p (nq + nphi,) with
-        the φ of each experiment in `phis`, which refer to these associations.
+        """Return the program with another association of each fitted experiment, and p (nq + nphi,)
+        with the φ of each experiment in `phis`, which refer to these associations.
+
+        Of shared entries, the association and the φ of the first experiment are used. Values that
+        depend on associations are computed anew.
         """
         other = copy(self)
         updated = self._combine_parameters(p[: self.nq], phis)
@@ -547,7 +570,9 @@ class Collocation:
         )
 
     def bounds(self) -> tuple[Array, Array]:
-        """Return lower and upper bounds of z; equal where a value is prescribed."""
+        """Return lower and upper bounds of z, (variables,) each;
+        equal where a value is prescribed.
+        """
         lower, upper = self.parameter_bounds
         lows, highs = zip(
             *(segment.bounds() for segment in self.transcriptions), strict=True
@@ -566,13 +591,17 @@ class Collocation:
     # Objective --------------------------------------------------------------------------------
 
     def objective(self, z: Array) -> float:
-        """Return the objective at z: loss and priors, divided by the number of measurements."""
+        """Return the objective at z: loss and priors, divided by the number of measurements;
+        constraints do not contribute.
+        """
         residuals, _ = self.prior_residuals(self.parameters_from(z))
         loss = sum(part.loss for part in self.iterates(z))
         return self.loss_scale * float(residuals @ residuals + loss)
 
     def gradient(self, z: Array) -> Array:
-        """Return the gradient (variables,) of the objective by z."""
+        """Return the gradient (variables,) of the objective by z, at constant values of all other
+        variables.
+        """
         parts = self.iterates(z)
         residuals, slopes = self.prior_residuals(self.parameters_from(z))
         by_p = 2 * residuals * slopes
@@ -640,28 +669,30 @@ class Collocation:
         )
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
-        """Return the values of ∂g/∂z in the order of `jacobian_structure`.
+        """Return the values of ∂g/∂z in the order of `jacobian_structure`; history variables that
+        are eliminated are treated as constant.
 
         Parameters
         ----------
         z : (variables,) array
             Variables.
         out : array, optional
-            Overwritten with the result and returned.
+            Overwritten with the result and returned; a new array by default.
         """
         return self.constraints_and_jacobian(z, out)[1]
 
     def constraints_and_jacobian(
         self, z: Array, out: Array | None = None
     ) -> tuple[Array, Array]:
-        """Return constraints g and the values of ∂g/∂z, from one evaluation of the elements.
+        """Return constraints g (constraints,) and the values of ∂g/∂z, see `jacobian_values`, from
+        one evaluation of the elements.
 
         Parameters
         ----------
         z : (variables,) array
             Variables.
         out : array, optional
-            Overwritten with the values of ∂g/∂z.
+            Overwritten with the values of ∂g/∂z and returned; a new array by default.
         """
         parts = self.iterates(z)
         height = self.transcriptions[-1].next_offsets.row
@@ -765,7 +796,9 @@ class Collocation:
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
-        """Positions of the diagonal entries of q, and of x, in the values of the Hessian."""
+        """Positions of the diagonal entries of q (nq,), and of x of all experiments, in the values
+        of the Hessian.
+        """
         of_q = np.cumsum(np.arange(1, self.nq + 1)) - 1
         of_x = []
         used = self.nq * (self.nq + 1) // 2
@@ -865,19 +898,26 @@ class Collocation:
 
     def kkt_residual(self, z: Array, multipliers: Array) -> float:
         """Return the largest violation of the first-order optimality conditions at z, in the
-        scaling of the program.
+        scaling of the program: the maximum norm of both conditions.
 
         The conditions are stationarity of objective + multipliers · g in every variable that is not
-        prescribed (at a bound, the gradient may point outwards), and feasibility.
+        prescribed, and feasibility. A parameter closer than 1e-6 to its bound may have a gradient
+        that points outwards; bounds of other variables are not considered.
+
+        Parameters
+        ----------
+        z : (variables,) array
+            Variables.
+        multipliers : (constraints,) array
+            Multipliers of g.
         """
         rows = self.constraint_values(z)
         slope = self.gradient(z) + self.jacobian_vjp(z, multipliers)
         lower, upper = self.bounds()
         slope[lower == upper] = 0
-        tolerance = 1e-6
         for part in (slice(self.nq), self.phi_columns):
-            at_lower = (z - lower)[part] < tolerance
-            at_upper = (upper - z)[part] < tolerance
+            at_lower = (z - lower)[part] < BOUND_TOLERANCE
+            at_upper = (upper - z)[part] < BOUND_TOLERANCE
             slope[part][at_lower] = np.minimum(slope[part][at_lower], 0)
             slope[part][at_upper] = np.maximum(slope[part][at_upper], 0)
         return float(
@@ -890,7 +930,7 @@ class Collocation:
         """Return ∇²_z (loss_weight · objective + multipliers · g), both triangles, as a sparse
         matrix.
 
-        `multipliers` is None for the Gauss–Newton matrix, see `hessian_values`.
+        Arguments as in `hessian_values`; `multipliers` is None for the Gauss–Newton matrix.
         """
         indptr, indices = self.hessian_structure
         values = self.hessian_values(z, loss_weight, multipliers)
@@ -900,12 +940,16 @@ class Collocation:
     # Reading a point --------------------------------------------------------------------------
 
     def residuals_n(self, z: Array) -> list[Array]:
-        """Return the residuals of the equations of motion (N, free dofs) of each experiment [N]."""
+        """Return the residuals of the equations of motion (N, free dofs) of each fitted experiment
+        [N], zero while a grasp prescribes the dof.
+        """
         return [part.residual_n for part in self.iterates(z)]
 
     def largest_force_n(self, z: Array) -> float:
-        """Return the largest force on a dof [N] at z, internal or external and without inertia, as
-        a scale for violations.
+        """Return the largest magnitude of a force on a dof [N] at z, as a scale for violations.
+
+        Internal and external forces are compared separately, without inertia, at all dofs including
+        grasped ones.
         """
         largest = 0.0
         for part in self.iterates(z):
@@ -918,8 +962,8 @@ class Collocation:
         return largest
 
     def largest_violations(self, z: Array, count: int = 5) -> list[Violation]:
-        """Return the `count` largest residuals of the equations of motion at z, of all experiments,
-        in descending order.
+        """Return the `count` residuals of the equations of motion at z with the largest magnitudes,
+        of all experiments together, in descending order; fewer if there are fewer.
         """
         violations = []
         for part in self.iterates(z):
@@ -944,8 +988,8 @@ class Collocation:
         )[:count]
 
     def rms_marker_distance_m(self, z: Array) -> float:
-        """Return the root mean square distance of the markers from their measurements [m];
-        0 without markers.
+        """Return the root mean square distance of the markers from their measurements [m], over all
+        samples of all experiments; 0 without markers.
         """
         squares = samples = 0.0
         for part in self.iterates(z):
@@ -964,8 +1008,8 @@ class Collocation:
 def _with_shared_associations(
     transcriptions: Sequence[Transcription], charts: Sequence[MarkerAssociation]
 ) -> tuple[Transcription, ...]:
-    """Return the transcriptions with the given associations, made equal where nuisance parameters
-    are shared.
+    """Return the transcriptions with the given associations, in which places and clocks of shared
+    nuisance parameters are those of the first experiment that shares them.
     """
     parts = zip(transcriptions, charts, strict=True)
     same = shared_charts(

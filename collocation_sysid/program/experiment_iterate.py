@@ -67,8 +67,9 @@ class ExperimentIterate:
 
     @cached_property
     def histories(self) -> tuple[AnyHistory, ...]:
-        """History variables of the body and of forces at all evaluations, then given contact
-        pressures: lifted ones where they are variables, else computed from the positions.
+        """History variables of the body and of forces at all evaluations, then forces of
+        complementary contact with given pressures: lifted ones where they are variables, otherwise
+        computed from the positions.
         """
         dynamics = self.equations.dynamics
         pressed = dynamics.contact_with_pressures(self.x, self.lifted_pressures)
@@ -86,7 +87,9 @@ class ExperimentIterate:
 
     @cached_property
     def observables(self) -> list[Array]:
-        """Observables (n, e, 3) of each measurement."""
+        """Values (n, e, 3) of the observable of each measurement, in the order of
+        `segment.residuals`; lifted ones are the values of the variables.
+        """
         return [
             self.lifted_observables[k]
             if k in self.lifted_observables
@@ -115,8 +118,8 @@ class ExperimentIterate:
 
     @property
     def outline_distances_px(self) -> list[tuple[OutlineResidual, Array]]:
-        """Measurement models of the outlines, each with the distances (n,) of outline
-        points from their edges [pixels].
+        """Measurement models of the outlines, each with the signed distances (n,) of outline points
+        from their edges [pixels]; points without an edge are left out.
         """
         distances = []
         for reading, observation in self.surface_residuals[
@@ -129,7 +132,7 @@ class ExperimentIterate:
 
     @property
     def loss(self) -> float:
-        """Loss of all measurements, without priors."""
+        """Loss Σ ρ of all measurements of this experiment, without priors."""
         pairs = zip(self.segment.residuals, self.observables, strict=True)
         return sum(
             reading.loss(observation, self.phi)
@@ -146,10 +149,11 @@ class ExperimentIterate:
         ]
 
     def gradient(self) -> tuple[Array, Array]:
-        """Return the gradient of the loss by x (N, 3n) [1/m] and by (q, φ) (nq + k,).
+        """Return the gradient of the loss by x (N, 3n) [1/m] and by (q, φ) (nq + k,), including the
+        dependence through reaction forces.
 
         Observables that are variables of the program (`lifted_observables`) are treated as
-        constant.
+        constant; priors are not included.
         """
         nq = self.segment.nq
         phi = self.phi
@@ -179,13 +183,15 @@ class ExperimentIterate:
 
     @cached_property
     def forces(self) -> Linearisation:
-        """Forces at the evaluations with their derivatives; valid until the segment
-        linearises again.
+        """Forces at the evaluations with their derivatives; stored in the segment's
+        `linearisation_buffer`, hence valid until the segment linearises again.
         """
         rows = self.segment.linearisation_buffer
         return self.equations.dynamics.linearise(self.x, rows, self.histories)
 
     @property
     def residual_n(self) -> Array:
-        """Violation of the equations of motion (N, free dofs) [N]."""
+        """Residuals of the equations of motion (N, free dofs) [N],
+        see `Transcription.residual_n`.
+        """
         return self.segment.residual_n(self.x, self.equations, self.histories)

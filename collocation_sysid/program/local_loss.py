@@ -61,7 +61,10 @@ class LocalLoss:
     def hessian(
         self, x: Array, phi: Array, has_observation_curvature: bool = True
     ) -> Array:
-        """Return the values of the entries.
+        """Return the values of the entries of `structure`, in SI units.
+
+        A loss that is quadratic is evaluated once; its Hessian contains the observation curvature,
+        which is zero.
 
         Parameters
         ----------
@@ -70,7 +73,8 @@ class LocalLoss:
         phi : (k,) array
             Nuisance parameters.
         has_observation_curvature : bool
-            If false, neglect the curvature of the observations (Gauss–Newton).
+            If false, neglect the curvature of the observations (Gauss–Newton): the derivatives of
+            the loss through second derivatives of the residuals.
         """
         return (
             self._constant
@@ -90,7 +94,9 @@ class LocalLoss:
 
     @cached_property
     def _constant(self) -> Array:
-        """Values of the entries at zero positions."""
+        """Values of the entries at zero positions and parameters; valid everywhere if
+        `_is_quadratic`.
+        """
         rows = max(
             (points.rows[-1] + 1 for _, points in self.residuals), default=1
         )
