@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -91,7 +92,8 @@ class ContactCandidates:
     def inputs(
         self, contact: Contact, xi: Array, nu: Array, theta: Array
     ) -> tuple[Array, Array]:
-        """Return the inputs (k, i) and the data (d, i) of the law's `point_force_function` at the i
+        """Return the inputs (3 or 6, i), positions and with velocity dependence velocities relative
+        to the obstacle's frame, and the data (d, i) of the law's `point_force_function` at the i
         candidates.
 
         Parameters
@@ -121,7 +123,7 @@ class ContactCandidates:
 
     def assemble(self, push: Array, size: int) -> Array:
         """Return forces (size,) [N] on the dofs of a body from forces `push` (3, i) [N] on the i
-        candidates.
+        candidates; the reaction on the obstacle is left out.
         """
         on_nodes = self.weights[:, :, None] * push.T[:, None]
         summed = np.bincount(
@@ -130,8 +132,29 @@ class ContactCandidates:
         return np.asarray(summed, dtype=float)
 
 
+class LinearisedContact(NamedTuple):
+    """Contact forces in a time step and their derivative by the unknown positions.
+
+    Attributes
+    ----------
+    force : (3n,) array
+        Forces [N].
+    symmetric : (m,) array
+        Lower triangle of the symmetric part of the derivative [N/m].
+    skew : (m,) or (0,) array
+        Lower triangle of its skew part [N/m]; empty without friction or other velocity dependence.
+    """
+
+    force: Array
+    symmetric: Array
+    skew: Array
+
+
 class StepContact:
     """Contact in one time step of a body with constants θ (k,).
+
+    Obstacles are treated as fixed in the derivatives. The candidates are stored, and searched again
+    when the state has changed too much.
 
     Attributes
     ----------
@@ -176,24 +199,15 @@ class StepContact:
 
     def linearise(
         self, xi: Array, nu: Array, rates: tuple[float, float]
-    ) -> tuple[Array, Array, Array]:
-        """Return the contact forces and their derivative.
+    ) -> LinearisedContact:
+        """Return the contact forces at ξ and ν, and their derivative by the unknown positions.
 
         Parameters
         ----------
         xi, nu : (1, 3n) arrays
             State [m] and velocity [m/s].
         rates : (float, float)
-            Derivatives of ξ and of ν by the unknown positions.
-
-        Returns
-        -------
-        (3n,) array
-            Forces [N].
-        (m,) array
-            Lower triangle of the symmetric part of the derivative by the unknown positions.
-        (m,) or (0,) array
-            Lower triangle of its skew part; empty without friction or other velocity dependence.
+            Derivatives of ξ and of ν [1/s] by the unknown positions.
         """
         force = np.zeros(xi.size)
         has_friction = any(
@@ -225,7 +239,7 @@ class StepContact:
                     weights=(counts[touch] * blocks).ravel(),
                     minlength=len(part),
                 )
-        return force, symmetric, skew
+        return LinearisedContact(force, symmetric, skew=skew)
 
     def _candidates(
         self, xi: Array, nu: Array

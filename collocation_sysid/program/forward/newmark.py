@@ -35,12 +35,14 @@ from ..observables import ReactionForces
 from .initial_equilibrium import initial_state
 from .newton_solver import (
     NewtonFailure,
+    NewtonLinearisation,
     NewtonOptions,
     NewtonSolver,
     NewtonSolvers,
     simulation_error,
 )
 
+# Called with the share of the work that is done, between 0 and 1.
 Progress = Callable[[float], None]
 
 
@@ -65,9 +67,41 @@ class _State:
     v: Array
     a: Array
     previous_histories: tuple[PreviousState, ...] = ()
-    contact_n: Array | None = (
-        None  # (3n,) mean over the step that led here, where there is contact
-    )
+    contact_n: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class NewmarkMotion:
+    """Motion simulated by Newmark's method.
+
+    Attributes
+    ----------
+    positions_m : (T, 3n) array
+        Positions at the samples [m].
+    velocities_m_s : (T, 3n) array
+        Velocities at the samples [m/s].
+    reactions : ReactionForces
+        Reaction forces on the sensed dofs at all steps, without derivatives.
+    """
+
+    positions_m: Array
+    velocities_m_s: Array
+    reactions: ReactionForces
+
+
+@dataclass(frozen=True, eq=False)
+class _PrescribedMotion:
+    """Motion of the p prescribed dofs at one time.
+
+    Attributes
+    ----------
+    positions_m, velocities_m_s, accelerations_m_s2 : (p,) arrays
+        Positions [m], velocities [m/s] and accelerations [m/s²], ascending by dof.
+    """
+
+    positions_m: Array
+    velocities_m_s: Array
+    accelerations_m_s2: Array
 
 
 @one_blas_thread()
@@ -78,7 +112,7 @@ def simulate_newmark(
     options: NewtonOptions | None,
     progress: Progress | None,
     sensed: Index,
-) -> tuple[Array, Array, ReactionForces]:
+) -> NewmarkMotion:
     """Simulate an experiment by Newmark's method.
 
     Parameters
@@ -95,15 +129,6 @@ def simulate_newmark(
         Called with the share of the samples done.
     sensed : (g,) array
         Dofs whose reaction forces are wanted.
-
-    Returns
-    -------
-    (T, 3n) array
-        Positions at the samples [m].
-    (T, 3n) array
-        Velocities at the samples [m/s].
-    ReactionForces
-        Reaction forces on the sensed dofs at all steps.
 
     Raises
     ------
@@ -144,7 +169,10 @@ def simulate_newmark(
     # Contact at a time is the mean over the steps before and after it.
     reactions_and_positions[0, 1:-1] -= (means_n[1:-1] + means_n[2:]) / 2
     reactions_and_positions[0, [0, -1]] -= means_n[[0, -1]]
-    return x, v, ReactionForces(*reactions_and_positions)
+    reactions, positions = reactions_and_positions
+    return NewmarkMotion(
+        x, v, reactions=ReactionForces(reactions, position_m=positions)
+    )
 
 
 class _Stepper:
@@ -163,7 +191,14 @@ class _Stepper:
         self.solvers = NewtonSolvers(experiment, options)
 
     def initial_state(self) -> _State:
-        """Return the initial state of the experiment."""
+        """Return the initial state of the experiment, with accelerations in balance with the
+        forces.
+
+        Raises
+        ------
+        SimulationError
+            If no stable equilibrium is found, where the experiment starts in one.
+        """
         time_s = float(self.experiment.t_s[0])
         solver = self._solver(time_s)
         x, v = initial_state(self.experiment, self._forces(time_s), solver)
@@ -187,12 +222,15 @@ class _Stepper:
         return self._balanced(state, time_s, dofs=solver.free)
 
     def advance(self, state: _State, target_s: float) -> _State:
-        """Return the state at `target_s`; where Newton's method fails, in shorter steps.
+        """Return the state at `target_s` [s]; where Newton's method fails, in steps that are
+        halved.
+
+        Loads and holding grasps are those of `target_s` throughout.
 
         Raises
         ------
-        SimulationError or NewtonFailure
-            If the shortest step fails.
+        SimulationError
+            If a step fails after `max_halvings` halvings.
         """
         step = target_s - state.t_s
         smallest = step * 0.5**self.options.max_halvings
@@ -217,7 +255,9 @@ class _Stepper:
     def reactions_and_positions(
         self, state: _State, dofs: Index
     ) -> tuple[Array, Array]:
-        """Return the reaction forces without contact on dofs [N], and their positions [m]."""
+        """Return the reaction forces without contact on dofs (g,) [N], and their positions (g,)
+        [m].
+        """
         if not len(dofs):
             return np.zeros(0), np.zeros(0)
         reaction = self._mass(state.t_s) * state.a - self._force(
@@ -245,8 +285,9 @@ class _Stepper:
     def _contact_n(
         self, x: Array, v: Array, load_s: float, step_s: float = 0.0
     ) -> Array:
-        """Return the contact forces (3n,) [N] at positions x and velocities v, (3n,) each, and the
-        time `load_s`; averaged over a step of `step_s` about this state, unless that is zero.
+        """Return the contact forces (3n,) [N] at positions x and velocities v, (3n,) each, under
+        the loads at the time `load_s`; averaged over a step of `step_s` [s] about this state,
+        unless that is zero. Contact as a complementarity problem is left out.
         """
         forces = self._forces(load_s, step_s)
         total_n = np.zeros_like(x)
@@ -287,7 +328,8 @@ class _Stepper:
         self, state: _State, load_s: float, dofs: NDArray[np.int64]
     ) -> _State:
         """Return the state with the accelerations of some dofs (indices) computed from the forces
-        on them, without contact, under the loads at the time `load_s`.
+        on them, without contact, under the loads at the time `load_s`; the other accelerations are
+        kept.
         """
         acceleration = state.a.copy()
         acceleration[dofs] = (
@@ -298,8 +340,13 @@ class _Stepper:
     def _step(
         self, solver: NewtonSolver, state: _State, end_s: float, load_s: float
     ) -> _State:
-        """Return the state after one step to `end_s`, with loads and grasps of the time
+        """Return the state after one step to `end_s` [s], with loads and grasps of the time
         `load_s`.
+
+        Raises
+        ------
+        NewtonFailure
+            If Newton's method does not converge.
         """
         h = end_s - state.t_s
         forces, touching = insert_previous_states(
@@ -309,7 +356,7 @@ class _Stepper:
         ).without_contact()
         contact = StepContact(touching, self.theta, pattern=forces.pattern)
         mass = forces.mass.inertia_kg[0]
-        x_prescribed, v_prescribed, a_prescribed = self._prescribed_motion(
+        prescribed = self._prescribed_motion(
             solver, end_s, step_s=h, holding_s=load_s
         )
         slope = 2.0 / h
@@ -320,8 +367,8 @@ class _Stepper:
             v = slope * x + known_v
             a = slope**2 * x + known_a
             # Finite differences of a grasp's motion ring under this rule; its own motion does not.
-            v[solver.is_prescribed] = v_prescribed
-            a[solver.is_prescribed] = a_prescribed
+            v[solver.is_prescribed] = prescribed.velocities_m_s
+            a[solver.is_prescribed] = prescribed.accelerations_m_s2
             return v, a
 
         def middle(x: Array) -> tuple[Array, Array]:
@@ -336,7 +383,7 @@ class _Stepper:
                 else balance
             )
 
-        def linearise(x: Array) -> tuple[Array, Array, Array]:
+        def linearise(x: Array) -> NewtonLinearisation:
             v, a = kinematics(x)
             at = forces.linearise(x, v)
             matrix = -(at.by_position[0] + slope * at.by_velocity[0])
@@ -346,30 +393,28 @@ class _Stepper:
                 skew = skew - slope * at.by_velocity_skew[0]
             balance = at.force[0] - mass * a
             if contact.acts:
-                contact_force, symmetric, askew = contact.linearise(
-                    *middle(x), (0.5, 1 / h)
-                )
-                balance = balance + 2 * contact_force
-                matrix -= 2 * symmetric
-                skew = skew - 2 * askew
-            return balance, matrix, skew
+                touching_at = contact.linearise(*middle(x), (0.5, 1 / h))
+                balance = balance + 2 * touching_at.force
+                matrix -= 2 * touching_at.symmetric
+                skew = skew - 2 * touching_at.skew
+            return NewtonLinearisation(balance, matrix, skew=skew)
 
         guess = state.x + h * state.v + 0.5 * h * h * state.a
         if state.contact_n is not None:
             guess += (
                 0.5 * h * h * state.contact_n / np.where(mass > 0, mass, np.inf)
             )
-        guess[solver.is_prescribed] = x_prescribed
+        guess[solver.is_prescribed] = prescribed.positions_m
         if not solver.has_no_inverted_element(guess):
             guess = state.x.copy()
-            guess[solver.is_prescribed] = x_prescribed
+            guess[solver.is_prescribed] = prescribed.positions_m
         x = solver.solve(guess, residual, linearise)
         v, a = kinematics(x)
         contact_n = None
         if contact.acts:
             xi, nu = middle(x)
             contact_n = self._contact_n(xi[0], nu[0], load_s=load_s, step_s=h)
-            # Held dofs have the acceleration of the grasp.
+            # Prescribed dofs have the acceleration of the grasp.
             free = solver.free
             a[free] -= (
                 2 * contact_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
@@ -392,9 +437,12 @@ class _Stepper:
         time_s: float,
         step_s: float,
         holding_s: float,
-    ) -> tuple[Array, Array, Array]:
-        """Return position, velocity and acceleration of the solver's prescribed dofs at `time_s`,
-        by central differences over `step_s`; grasps are those that hold at `holding_s`.
+    ) -> _PrescribedMotion:
+        """Return the motion of the solver's prescribed dofs at `time_s`, by central differences
+        over `step_s` [s]; grasps are those that hold at `holding_s`.
+
+        At the ends of a grasp's time, differences are one-sided and the acceleration is zero if
+        there is no later pose.
         """
         experiment = self.experiment
         nodes_m = self.experiment.body.nodes_m
@@ -402,7 +450,7 @@ class _Stepper:
         for grasp in experiment.grasps:
             if not grasp.is_active(holding_s):
                 continue
-            # What it does before it holds and after it has let go means nothing.
+            # Its poses before it holds and after it has let go do not matter.
             first = max(grasp.from_s, float(experiment.t_s[0]))
             last = min(grasp.until_s, float(experiment.t_s[-1]))
             times = np.clip(
@@ -423,4 +471,4 @@ class _Stepper:
         now, velocity, acceleration = motion.reshape(3, -1)[
             :, solver.is_prescribed
         ]
-        return now, velocity, acceleration
+        return _PrescribedMotion(now, velocity, accelerations_m_s2=acceleration)

@@ -25,6 +25,7 @@ from ..stopwatch import Stopwatch
 from .initial_equilibrium import initial_state
 from .newton_solver import (
     NewtonFailure,
+    NewtonLinearisation,
     NewtonOptions,
     NewtonSolver,
     NewtonSolvers,
@@ -32,6 +33,7 @@ from .newton_solver import (
     simulation_error,
 )
 
+# Called with the share of the work that is done, between 0 and 1.
 Progress = Callable[[float], None]
 
 
@@ -91,7 +93,8 @@ def continue_simulation(
     dynamics : Dynamics
         Discrete equations of motion at the parameters.
     known : (k, 3n) array, optional
-        First rows [m]; by default the start of the experiment is computed.
+        First rows [m], at least one and starting with velocity zero; by default the start of the
+        experiment is computed.
     options : NewtonOptions, optional
         Options of Newton's method.
     progress : callable, optional
@@ -99,14 +102,15 @@ def continue_simulation(
     stopwatch : Stopwatch, optional
         Accumulates the time spent.
     approximate_solution : (N, 3n) array, optional
-        Trajectory at other parameters, as the first guess of equilibria.
+        Trajectory at other parameters, as the first guess of equilibria; not used for the steps of
+        a motion.
 
     Returns
     -------
     (r, 3n) array
-        The rows computed, including `known`; all N if nothing failed.
+        The rows computed, including `known`; all N if nothing failed, and possibly none.
     SimulationError or None
-        Why the simulation stopped early.
+        Why the simulation stopped early; it is not raised.
     """
     if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
         failure = SimulationError(massless, float(dynamics.t_s[0]))
@@ -202,8 +206,8 @@ def continue_simulation(
 
 
 def extrapolate(x: Array, first_step: Array) -> Array:
-    """Return an extrapolation of the next row from rows x (k, 3n); with one row, by
-    `first_step` (3n,).
+    """Return an extrapolation (3n,) of the next row from rows x (k, 3n): quadratic from three or
+    more rows, linear from two; from one row, x_0 + `first_step` (3n,) [m].
     """
     if len(x) > 2:
         return 3 * (x[-1] - x[-2]) + x[-3]
@@ -212,7 +216,8 @@ def extrapolate(x: Array, first_step: Array) -> Array:
 
 def _extrapolate_static(x: Array, prescribed: Index, goal: Array) -> Array:
     """Return an extrapolation (3n,) of the next equilibrium from equilibria x (k, 3n): the last
-    increment, scaled by that of the prescribed dofs towards `goal` (prescribed,).
+    increment, scaled by that of the prescribed dofs towards `goal` (prescribed,); the last
+    equilibrium if there is only one.
     """
     if len(x) < 2:
         return x[-1]
@@ -236,8 +241,8 @@ class RowEquations:
     forces : (N, 3n) array
         Total forces at the evaluations before t [N].
     t : int
-        Index of the row.
-    left : sequence
+        Index of the row, at least 1.
+    previous : sequence of PreviousState
         History variables after row t − 1; empty if there are none.
     """
 
@@ -284,8 +289,8 @@ class RowEquations:
         self.known -= row.mass_kg * row.r * dynamics.start_velocity_m_s
 
     def with_load_step(self, share: float) -> RowEquations:
-        """Return the row with loads between those of the previous sample (share 0) and its own
-        (share 1); rows of a motion have their complete loads.
+        """Return a copy of the row with loads between those of the previous sample (share 0) and
+        its own (share 1); rows of a motion have their complete loads.
         """
         scaled = copy(self)
         if self.forces_before is not None:
@@ -315,10 +320,8 @@ class RowEquations:
         """Return the constraints c_t (3n,) [N] at positions x_t (3n,) [m]."""
         return self.residual_from(self.force(x), x)
 
-    def linearise(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return c_t (3n,) [N] at x_t = `x` (3n,) [m], and the lower triangles of the symmetric and
-        the skew part of −∂c_t/∂x_t.
-        """
+    def linearise(self, x: Array) -> NewtonLinearisation:
+        """Return c_t (3n,) [N] at x_t = `x` (3n,) [m], and its derivative by x_t."""
         states = self.states(x)
         row = self.row
         at = self.rest.linearise(*states)
@@ -327,14 +330,18 @@ class RowEquations:
         )
         skew = row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
         if not self.contact.acts:
-            return self.residual_from(at.force[0], x), matrix, skew
-        force, symmetric, askew = self.contact.linearise(
-            *states, (row.p[0], row.q[0])
+            return NewtonLinearisation(
+                self.residual_from(at.force[0], x), matrix, skew=skew
+            )
+        contact = self.contact.linearise(*states, (row.p[0], row.q[0]))
+        matrix -= row.w[0] * contact.symmetric
+        if contact.skew.size:
+            skew -= row.w[0] * contact.skew
+        return NewtonLinearisation(
+            self.residual_from(at.force[0] + contact.force, x),
+            matrix,
+            skew=skew,
         )
-        matrix -= row.w[0] * symmetric
-        if askew.size:
-            skew -= row.w[0] * askew
-        return self.residual_from(at.force[0] + force, x), matrix, skew
 
 
 def solve_row(
@@ -344,8 +351,8 @@ def solve_row(
     previous: Array,
     prescribed_m: Array,
 ) -> Array:
-    """Solve one row; where Newton's method fails, apply the grasps' displacement (and a static
-    load) in smaller increments.
+    """Return the solution x_t (3n,) [m] of one row; where Newton's method fails, the grasps'
+    displacement (and a static load) is applied in smaller increments.
 
     Static rows stay on the branch of stable equilibria.
 
@@ -360,7 +367,7 @@ def solve_row(
     previous : (3n,) array
         Positions of the row before [m].
     prescribed_m : (h,) array
-        Prescribed positions of the prescribed dofs [m].
+        Prescribed positions of the h prescribed dofs [m].
 
     Raises
     ------
@@ -372,7 +379,7 @@ def solve_row(
     def solve(guess: Array, share: float) -> Array:
         start = guess.copy()
         step = row.with_load_step(share)
-        # To the last digit at the end: bounds hold it there.
+        # Exact at the end, because bounds of the collocation program are.
         goal = (
             prescribed_m
             if share == 1

@@ -44,10 +44,10 @@ class MarkerResidual(MeasurementResidual):
     markers : Markers
         Measured tracks.
     is_initially_at_rest : bool
-        Whether the body rests in its first state before the first time; then a shifted marker is
-        predicted there, otherwise such samples are not compared.
+        Whether the body rests in its first state before the first time; then a marker of an earlier
+        time is predicted there, otherwise such samples are not compared.
     preceding_times : int
-        Number of the channel's times before the first sample.
+        Number of the observable's times before the first sample.
     """
 
     observable: PointPositions
@@ -117,7 +117,9 @@ class MarkerResidual(MeasurementResidual):
 
     @property
     def sample_rows(self) -> Index:
-        """Grid time (T,) of each sample."""
+        """Grid times of the observable: without `preceding_times`, the grid time (T,) of each
+        sample.
+        """
         return self.observable.rows
 
     @property
@@ -191,8 +193,8 @@ class MarkerResidual(MeasurementResidual):
         )
 
     def shifted(self, by_s: float) -> MarkerResidual:
-        """Return the model of samples taken `by_s` seconds later, at the same stencil; self if the
-        expression does not depend on time.
+        """Return the model of samples taken `by_s` seconds later, with the same stencil and
+        measurements; self if the expression does not depend on time.
         """
         if not self._full_expression.residual.depends_on_datum(1):
             return self
@@ -237,7 +239,9 @@ class MarkerResidual(MeasurementResidual):
     # Of positions -----------------------------------------------------------------------------
 
     def predict_samples(self, positions_m: Array, phi: Array) -> Array:
-        """Return predictions (T, M, 3) [m] from the body's positions (T, n, 3) at the samples."""
+        """Return predictions (T, M, 3) [m] at φ (k,) from the body's positions (T, n, 3) [m] at the
+        samples.
+        """
         plain = replace(
             self,
             observable=replace(
@@ -249,14 +253,15 @@ class MarkerResidual(MeasurementResidual):
         )
 
     def predict_positions(self, x: Array, phi: Array) -> Array:
-        """Return predictions (t, M, 3) [m] from the first grid positions x (rows, 3n), for
-        samples that they suffice for.
+        """Return predictions (t, M, 3) [m] at φ (k,) from the first grid positions x (rows, 3n)
+        [m], for the t samples that they suffice for.
         """
         return self.predict(self.observable.evaluate_positions(x, phi), phi)
 
     def squared_distances_m2(self, x: Array, phi: Array) -> Array:
-        """Return the squared distances [m²] of predictions from all samples that are present (P,),
-        at positions x (rows, 3n) and φ; samples after the last row are omitted.
+        """Return the squared distances [m²] of predictions at positions x (rows, 3n) and φ (k,)
+        from the P samples that are compared, flat, time by time; samples after the last row are
+        omitted.
         """
         predicted = self.predict_positions(x, phi)
         tracks = self.markers.positions_m[: len(predicted)]

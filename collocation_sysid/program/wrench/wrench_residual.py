@@ -98,12 +98,14 @@ class WrenchResidual(MeasurementResidual):
 
     @property
     def is_compared_by_component(self) -> NDArray[np.bool_]:
-        """Mask (S, 6) of the numbers that are compared."""
+        """Mask (S, 6) of the components (force, torque) that are compared."""
         return self.is_compared.reshape(-1, 6)
 
     @property
     def first_needed_s(self) -> float:
-        """Time [s] of the first sample with the largest possible shift of the clock."""
+        """Time [s] up to which the motion must be known for the first sample that is compared, with
+        the largest possible shift of the clock.
+        """
         return super().first_needed_s + self.observable.clock_limit_s
 
     def is_covered(self, known: int) -> NDArray[np.bool_]:
@@ -119,8 +121,9 @@ class WrenchResidual(MeasurementResidual):
         )
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
-        """Return the stencil of all samples: the grid times around each, among the first `known`,
-        shifted by the clock of φ, and their distances from it.
+        """Return the stencil of all samples: the grid times around each, among the first `known`
+        ones, at the clock shift of φ, and their distances from the sample without that shift [s].
+        Samples that are not covered are extrapolated.
         """
         clock = self.observable.parameter_indices(SENSOR_TIME)
         used = self._neighbour_count(known)
@@ -131,7 +134,9 @@ class WrenchResidual(MeasurementResidual):
         return RowStencil(_vector_indices(times), data.T[..., None])
 
     def all_stencils(self) -> Index:
-        """Return the indices (…, 1, v) of neighbouring times, for any shift of the clock."""
+        """Return the indices (…, 1, v) of all sequences of neighbouring times, one for each first
+        time and not for each sample.
+        """
         used = self._neighbour_count(self.observable.count)
         return _vector_indices(
             np.arange(self.observable.count - used + 1)[:, None]
@@ -185,13 +190,17 @@ class WrenchResidual(MeasurementResidual):
         )
 
     def on_grid(self, grid: ReactionGrid) -> WrenchResidual:
-        """Return the model with reaction forces at the times of another grid."""
+        """Return the model with reaction forces at the times of another grid, with a quadratic loss
+        and names without suffix.
+        """
         return WrenchResidual.from_sensor(
             replace(self.observable, reaction_grid=grid), self.wrench
         )
 
     def with_wrench(self, wrench: Wrench) -> WrenchResidual:
-        """Return the model of other samples, in their own frame."""
+        """Return the model of other samples, in their own frame and about their own point, with a
+        quadratic loss and names without suffix.
+        """
         observable = replace(
             self.observable, frame=wrench.frame, point_m=wrench.point_m
         )
@@ -201,8 +210,8 @@ class WrenchResidual(MeasurementResidual):
 def _is_covered(
     observable: GraspWrench, t_s: Array, known: int
 ) -> NDArray[np.bool_]:
-    """Return the mask (S,) of the samples at times (S,) that lie within the first `known` grid
-    times for any admissible shift of the clock; all false if none are known.
+    """Return the mask (S,) of the samples at times `t_s` (S,) [s] that lie within the first `known`
+    times of the observable for any admissible shift of the clock; all false if none are known.
     """
     if not known:
         return np.zeros(len(t_s), dtype=bool)
@@ -225,7 +234,8 @@ def wrench_residuals(
     nuisance: NuisanceMap,
     huber: float | None = None,
 ) -> tuple[WrenchResidual, ...]:
-    """Build the measurement models of all grasps of an experiment that have a force–torque sensor.
+    """Build the measurement models of all grasps of an experiment that have a force–torque sensor,
+    in the order of the grasps.
 
     Parameters
     ----------
