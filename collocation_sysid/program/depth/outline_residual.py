@@ -89,18 +89,18 @@ class OutlineResidual(DepthResidual):
         return outside_m / data[count] - inside_px
 
     def signed_distances_px(self, values: Array, phi: Array) -> Array:
-        """Return how far outline points (s, E) are outside of their edges [pixels]; NaN where there
-        is no edge.
+        """Return how far outline points (s, E) of the first s images are outside of their edges
+        [pixels]; NaN where there is no edge.
 
         Parameters
         ----------
         values : (n, e, 3) array
-            Positions of the surface nodes at the times of the observable [m].
+            Positions of the surface nodes at the first n times of the observable [m].
         phi : (k,) array
             Nuisance parameters in units of their priors.
         """
         return self.signed_distances_m(values, phi)
 
     def rough_residuals(self, x: Array, phi: Array) -> Array:
-        """Return no residual: before anything is fitted, distances to the points suffice."""
+        """Return an empty array: before anything is fitted, the distances to the points suffice."""
         return np.zeros(0)

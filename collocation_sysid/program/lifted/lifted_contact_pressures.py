@@ -26,7 +26,7 @@ from .lifted_force_histories import LiftedForceHistory
 
 @dataclass(frozen=True, eq=False)
 class LiftedContactPressure(LiftedForceHistory):
-    """Lifted pressure variables b of one obstacle of one experiment."""
+    """Lifted pressure variables b of one obstacle of one experiment; their lower bound is 0."""
 
     kind = "pressure"
     lower_bound = 0.0  # type: ignore[override]
@@ -119,8 +119,8 @@ class LiftedContactPressure(LiftedForceHistory):
     def jacobian_values(
         self, iterate: ExperimentIterate, z: Array
     ) -> tuple[Array, Array]:
-        """Return the scaled equations (count,) at an iterate and z, and the values of
-        `jacobian_entries`.
+        """Return the scaled equations (count,) at an iterate, and the values of `jacobian_entries`;
+        z is not used.
         """
         history = self._history_of(iterate)
         d = self._points.dofs

@@ -37,7 +37,7 @@ class LiftedForceHistory(LiftedVariables):
     Attributes
     ----------
     motion_history : int
-        Index of the history among those of the motion, `ExperimentIterate.histories_of_trajectory`.
+        Index of the history in `ExperimentIterate.histories`.
     force_index : int
         Index of the force, see `ForceHistory`.
     reactions : LiftedReactions or None
@@ -57,17 +57,17 @@ class LiftedForceHistory(LiftedVariables):
 
     @property
     def unit_m(self) -> float:
-        """Unit of the variables and of the equations [m]."""
+        """Unit of the variables and of the equations [m]: the mean edge length ℓ."""
         return self.segment.length_m
 
     @property
     def history_index(self) -> int:
-        """Index of the history among those of the motion."""
+        """Index of the history in `ExperimentIterate.histories`."""
         return self.motion_history
 
     @property
     def _points(self) -> ForcePoints:
-        """Points of the body at which the force acts."""
+        """Points of the body at which the force acts, in all I instances."""
         return self.segment.dynamics.forces.pointwise_term(self.force_index)[
             0
         ].points
@@ -83,8 +83,8 @@ class LiftedForceHistory(LiftedVariables):
         )
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled variables that satisfy the equations at the part's positions
-        and parameters.
+        """Return the scaled variables (count,) that satisfy the equations at the iterate's
+        positions and parameters; the iterate must not have lifted ones.
         """
         return (
             self._history_of(iterate).previous_state.before[:, 1:].ravel()
@@ -108,8 +108,8 @@ class LiftedForceHistory(LiftedVariables):
         )
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
-        """Return the scaled equations (count,) at an iterate and z: b minus its value by the
-        recursion.
+        """Return the scaled equations (count,): the variables in z minus their values by the
+        recursion from those that the iterate contains.
         """
         predicted = (
             self._history_of(iterate)
@@ -134,7 +134,7 @@ class LiftedForceHistory(LiftedVariables):
         )
 
     def _history_of(self, iterate: ExperimentIterate) -> ForceHistory:
-        """Return the force history of a part."""
+        """Return the force history at an iterate."""
         history = iterate.histories[self.history_index]
         assert isinstance(history, ForceHistory)
         return history

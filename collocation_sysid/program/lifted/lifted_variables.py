@@ -69,7 +69,7 @@ class LiftedVariables(ABC):
 
     @property
     def count(self) -> int:
-        """Number of variables, which is that of the equations."""
+        """Number of variables, which is that of the equations: the product of `shape`."""
         return int(np.prod(self.shape))
 
     @property
@@ -98,14 +98,16 @@ class LiftedVariables(ABC):
 
     @property
     def lower_bound(self) -> float:
-        """Lower bound of the variables."""
+        """Lower bound of the scaled variables; −∞ unless a subclass has one. There is no upper
+        bound.
+        """
         return -np.inf
 
     def with_lifted(
         self, iterate: ExperimentIterate, z: Array
     ) -> ExperimentIterate:
-        """Return the iterate with those quantities replaced that these variables of z determine;
-        the iterate itself if there are none.
+        """Return a copy of the iterate with those quantities replaced that these variables of z
+        determine; here the iterate itself, for groups that determine none.
         """
         return iterate
 
@@ -117,13 +119,15 @@ class LiftedVariables(ABC):
 
     @cached_property
     def patterns(self) -> tuple[ExpressionPattern, ...]:
-        """Expressions whose sum is the equations; row indices count from the group's first
-        equation.
+        """Expressions whose sum is the equations, with indices of rows from the group's first
+        equation on; empty for subclasses that override the methods below.
         """
         return ()
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
-        """Return the scaled equations (count,) at the iterate and z."""
+        """Return the scaled equations (count,) at the iterate and z,
+        zero where they are satisfied.
+        """
         return np.sum(
             [pattern.residuals(z, self.count) for pattern in self.patterns],
             axis=0,
@@ -131,7 +135,7 @@ class LiftedVariables(ABC):
 
     def jacobian_entries(self) -> tuple[Index, Index]:
         """Return rows in g and columns in z of the additional entries of ∂g/∂z, in the order of
-        their values.
+        their values; an entry may be repeated, and its values are summed.
         """
         rows, columns = concatenated_entries(
             pattern.jacobian_entries() for pattern in self.patterns
@@ -151,8 +155,8 @@ class LiftedVariables(ABC):
         return np.sum(values, axis=0), np.concatenate(slopes)
 
     def hessian_entries(self) -> tuple[Index, Index]:
-        """Return rows and columns of the additional entries of the Lagrangian's Hessian,
-        upper triangle.
+        """Return rows and columns in z of the additional entries of the Lagrangian's Hessian, upper
+        triangle; an entry may be repeated, and its values are summed.
         """
         return concatenated_entries(
             pattern.hessian_entries() for pattern in self.patterns
@@ -189,31 +193,41 @@ class LiftedVariables(ABC):
     # What the loss has of the variables ---------------------------------------------------------
 
     def loss_gradient(self, iterate: ExperimentIterate) -> Array:
-        """Return the gradient of the loss by these variables (count,)."""
+        """Return the gradient of the loss by these scaled variables (count,); here zero, for groups
+        on which the loss does not depend.
+        """
         return np.zeros(self.count)
 
     # What multipliers weigh ---------------------------------------------------------------------
 
     def residual_weights(self, multipliers: Array) -> Array | float:
-        """Return the derivative (N, 3n) of multipliers · equations by the residual c in
-        newtons [1/N]; 0 if there is none.
+        """Return the derivative (N, 3n) of multipliers · equations by the residual c in newtons
+        [1/N]; 0 if the equations do not contain it.
+
+        Parameters
+        ----------
+        multipliers : (constraints,) array
+            Multipliers of all constraints g.
         """
         return 0.0
 
     @property
     def history_index(self) -> int | None:
-        """Index of the history among those of the motion, or None if the group is no history."""
+        """Index of the history among those of the motion, or None if the group is no history, or
+        has no equations of motion.
+        """
         return None
 
     def weighted_history(
         self, iterate: ExperimentIterate, multipliers: Array
     ) -> WeightedHistory:
-        """Return the history, and the weights of each h_k in multipliers · equations.
+        """Return the history of the iterate, and the weights of each h_k in multipliers ·
+        equations.
 
         Raises
         ------
         NotImplementedError
-            If the group is no history.
+            If the group is no history (`history_index` is None).
         """
         raise NotImplementedError
 
@@ -226,7 +240,9 @@ class LiftedVariables(ABC):
 def concatenated_entries(
     groups: Iterable[tuple[Index, Index]],
 ) -> tuple[Index, Index]:
-    """Concatenate rows, and columns, of several groups of entries; no group gives empty arrays."""
+    """Concatenate the rows, and the columns, of several groups of entries; without groups both are
+    empty.
+    """
     none = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     rows, columns = zip(none, *groups, strict=True)
     return np.concatenate(rows), np.concatenate(columns)
