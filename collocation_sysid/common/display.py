@@ -76,7 +76,9 @@ class Line:
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """The sentence as pieces, each with a style of its own."""
+        """The sentence as pieces, each with a style of its own; a
+        text is one piece without style.
+        """
         return (Span(self.text),) if isinstance(self.text, str) else self.text
 
 
@@ -332,7 +334,9 @@ class UnbrokenWords:
     def __rich_console__(
         self, console: Console, options: ConsoleOptions
     ) -> RenderResult:
-        """Yield the lines of the text for rich."""
+        """Yield the lines of the text, wrapped between words to the
+        width of the console, for rich.
+        """
         for line in self.text.split(allow_blank=True):
             breaks = [0]
             for word in re.finditer(r"\S+", line.plain):

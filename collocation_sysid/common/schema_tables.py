@@ -120,7 +120,9 @@ def used_keys(section: Section, *names: str) -> list[str]:
 
 
 def require_one(section: Section, *names: str) -> None:
-    """Raise ValueError unless the section states exactly one of the keys."""
+    """Raise ValueError unless the section states exactly one of the keys `names`; a key is stated
+    if its value is not None.
+    """
     there = used_keys(section, *names)
     if len(there) != 1:
         which = " and ".join(there) or f"no {' or '.join(names)}"

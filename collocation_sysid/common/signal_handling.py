@@ -87,8 +87,8 @@ INTERRUPTS = Interrupts()
 
 
 def _end_quietly() -> None:
-    """Restore the default action of Ctrl-C, if this process is the command line and nothing else
-    was set.
+    """Restore the default action of Ctrl-C (the process ends without a traceback), if this process
+    is the command line and the handler is Python's own; otherwise change nothing.
     """
     handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     command = os.path.splitext(os.path.basename(sys.argv[0]))[0]

@@ -136,7 +136,18 @@ def _adapters(kind: type[Options]) -> dict[str, TypeAdapter[Any]]:
 
 
 def _refusal(name: str, value: Any, fault: Mapping[str, Any]) -> InputError:
-    """Return the error for an invalid value; it names the entry if the value is a table."""
+    """Return the error for an invalid value of the field `name`, whose location it is; it names the
+    entry if the value is a table.
+
+    Parameters
+    ----------
+    name : str
+        Name of the field.
+    value : object
+        Its value.
+    fault : mapping
+        One entry of pydantic's `ValidationError.errors()`.
+    """
     for part in fault["loc"]:
         if isinstance(value, Mapping) and part in value:
             name = f"{name}.{part}"

@@ -73,7 +73,7 @@ def hashes_of(contents: Mapping[str, Path]) -> dict[str, str]:
 
 
 def list_as_text(hashes: Mapping[str, str]) -> str:
-    """Return the content of a list file from hashes by name."""
+    """Return the content of a list file (JSON, names in alphabetical order) from hashes by name."""
     return (
         json.dumps({"written": dict(sorted(hashes.items()))}, indent=1) + "\n"
     )
@@ -120,10 +120,11 @@ def is_written_here(file: Path, folder: Path | None = None) -> bool:
 
 
 def foreign_files(folder: Path) -> Iterator[Path]:
-    """Yield files and links below a folder that are not on its list, or were changed since.
+    """Yield, in the order of their names, files and links below a folder that are not on its list,
+    or were changed since; all files if it has no list.
 
     Links are not followed. A list in a subfolder, such as that of an export in a run folder, is
-    valid for the files of that subfolder.
+    valid for the files of that subfolder. Lists and drafts (`IGNORED_NAME`) are not yielded.
     """
     lists: dict[Path, dict[str, str]] = {}
     for file in _files(folder):

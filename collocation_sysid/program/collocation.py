@@ -247,7 +247,7 @@ class Collocation:
 
     @property
     def nphi(self) -> int:
-        """Number of nuisance parameters φ of all experiments; shared ones count once."""
+        """Number of nuisance parameters φ of all fitted experiments; shared ones count once."""
         return (
             int(np.concatenate(self.parameter_indices).max(initial=self.nq - 1))
             + 1
@@ -279,13 +279,15 @@ class Collocation:
 
     @property
     def lifted_nonzeros(self) -> tuple[int, int]:
-        """Numbers of entries of lifted variables in the Jacobian and in the Hessian."""
+        """Numbers of additional entries due to lifted variables in the Jacobian, and in the upper
+        triangle of the Hessian.
+        """
         both = [each.entry_counts for each in self.lifted]
         return sum(each for each, _ in both), sum(each for _, each in both)
 
     @property
     def measurement_count(self) -> int:
-        """Number of scalar measurements that are compared."""
+        """Number of scalar measurements that are compared, of all fitted experiments."""
         return sum(
             int(reading.is_compared.sum())
             for segment in self.transcriptions
@@ -334,8 +336,8 @@ class Collocation:
         return np.concatenate([p[: self.nq], *scaled, p[self.nq :]])
 
     def unpack(self, z: Array) -> tuple[Array, list[Array]]:
-        """Return the parameters p (nq + nphi,) and the positions (N, 3n) of each experiment
-        [m] from z.
+        """Return the parameters p (nq + nphi,) and the positions (N, 3n) of each fitted experiment
+        [m] from z; lifted variables are ignored.
         """
         return self.parameters_from(z), [
             z[segment.columns].reshape(segment.grid_times, segment.dof_count)
@@ -551,8 +553,8 @@ class Collocation:
         )
 
     def _combine_parameters(self, q: Array, phis: Sequence[Array]) -> Array:
-        """Return p (nq + nphi,) from q (nq,) and the φ of each experiment; shared entries are those
-        of the first experiment.
+        """Return p (nq + nphi,) from q (nq,) and the φ (k,) of each fitted experiment; of shared
+        entries, the value in the first experiment.
         """
         p = np.concatenate([q, np.zeros(self.nphi)])
         for segment, phi in reversed(
@@ -563,7 +565,9 @@ class Collocation:
 
     @property
     def reach_p(self) -> Array:
-        """Scale of p: the change of each entry that a trust region of radius one allows."""
+        """Scale (nq + nphi,) of p: the change of each entry that a trust region of radius one
+        allows, which is one for q.
+        """
         return self._combine_parameters(
             np.ones(self.nq),
             [s.nuisance.step_limits for s in self.transcriptions],
@@ -726,8 +730,8 @@ class Collocation:
         ), values
 
     def jacobian(self, z: Array) -> sp.csc_array:
-        """Return ∂g/∂z as a sparse matrix; history variables that are eliminated are
-        treated as constant.
+        """Return ∂g/∂z (constraints, variables) as a sparse matrix; history variables that are
+        eliminated are treated as constant.
         """
         indptr, indices = self.jacobian_structure
         shape = (self.constraint_count, self.variable_count)
@@ -745,8 +749,8 @@ class Collocation:
         )
 
     def jacobian_vjp(self, z: Array, multipliers: Array) -> Array:
-        """Return the vector–Jacobian product (∂g/∂z)ᵀ multipliers (variables,), including the
-        dependence through eliminated history variables.
+        """Return the vector–Jacobian product (∂g/∂z)ᵀ multipliers (variables,) at z, for
+        multipliers (constraints,), including the dependence through eliminated history variables.
         """
         slope = self.jacobian(z).T @ multipliers
         for part in self.iterates(z) if self.has_eliminated_histories else ():
@@ -1001,7 +1005,9 @@ class Collocation:
         return float(np.sqrt(squares / max(1.0, samples)))
 
     def parameter_values(self, z: Array) -> dict[str, float]:
-        """Return the shared parameters of z by the user's names, in SI units."""
+        """Return the shared parameters q of z by the user's names,
+        as physical values in SI units.
+        """
         return self.parameters.values(z[: self.nq])
 
 

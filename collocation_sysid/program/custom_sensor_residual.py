@@ -125,15 +125,19 @@ class CustomSensorResidual(MeasurementResidual):
     def with_samples(
         self, known_s: Array, t_s: Array, measurements: Array, **changes: Any
     ) -> CustomSensorResidual:
-        """Return the model of other samples, see `MeasurementResidual.with_samples`."""
+        """Return the model of other samples, whose observable is known at `known_s`; arguments as
+        in `MeasurementResidual.with_samples`.
+        """
         return super().with_samples(
             known_s, t_s, measurements, observable_s=known_s, **changes
         )
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all samples: indices of the neighbouring times, and the data of the
-        expression.
+        """Stencil of all samples.
+
+        Its data are the distances of the neighbouring times from the sample, and the time of the
+        sample [s]. A sample beyond the known times uses the nearest ones.
         """
         used = min(
             STATIC_NEIGHBOURS if self.is_static else NEIGHBOURS,

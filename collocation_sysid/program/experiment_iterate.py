@@ -62,7 +62,7 @@ class ExperimentIterate:
 
     @cached_property
     def equations(self) -> EquationsAtParameters:
-        """Equations of motion at q and φ."""
+        """Equations of motion at q and φ, see `Transcription.equations_at`."""
         return self.segment.equations_at(self.q, self.phi)
 
     @cached_property
@@ -82,7 +82,9 @@ class ExperimentIterate:
 
     @cached_property
     def motion(self) -> ObservedMotion:
-        """Positions and reaction forces for the observables."""
+        """Motion without changes, as observables use it; its reaction forces are computed on first
+        use.
+        """
         return self.observation.motion(self.x, self.histories)
 
     @cached_property
@@ -99,13 +101,15 @@ class ExperimentIterate:
 
     @property
     def depth_residuals(self) -> list[tuple[DepthResidual, Array]]:
-        """Measurement models of the depth cameras, each with its observables."""
+        """Measurement models of the depth cameras, each with the values (n, e, 3) of its
+        observable: positions of the surface nodes [m].
+        """
         return self.surface_residuals[: len(self.segment.depths)]
 
     @property
     def surface_residuals(self) -> list[tuple[DepthResidual, Array]]:
-        """Measurement models of the depth cameras, then of the outlines, each with its
-        observables.
+        """Measurement models of the depth cameras, then of the outlines, each with the values (n,
+        e, 3) of its observable.
         """
         readings = (*self.segment.depths, *self.segment.outlines)
         return [
@@ -141,7 +145,9 @@ class ExperimentIterate:
 
     @cached_property
     def loss_gradients(self) -> list[tuple[Array, Array]]:
-        """Gradient of the loss of each measurement by its observables (n, e, 3) and by φ (k,)."""
+        """Gradient of the loss of each measurement by the values of its observable (n, e, 3) and,
+        at constant values, by φ (k,).
+        """
         pairs = zip(self.segment.residuals, self.observables, strict=True)
         return [
             reading.loss_gradient(observation, self.phi)

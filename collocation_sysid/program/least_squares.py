@@ -91,8 +91,8 @@ class SquareRootInformation:
     def _with_augmented_rows(
         self, rows: Array, count: int
     ) -> SquareRootInformation:
-        """Return the problem with rows of derivatives and residuals at p = 0, which count
-        as `count` rows.
+        """Return the problem with rows (k, P + 1) of derivatives and residuals at p = 0, which
+        count as `count` rows; self if `count` is 0.
         """
         if not count:
             return self
@@ -103,12 +103,12 @@ class SquareRootInformation:
 
     @property
     def jacobian(self) -> Array:
-        """Derivatives S by p, as the triangle represents them."""
+        """Derivatives S (k, P) by p, as the triangle represents them, k ≤ P + 1."""
         return self.triangle[:, :-1]
 
     @property
     def residual(self) -> Array:
-        """Residuals at p = 0, as the triangle represents them."""
+        """Residuals r (k,) at p = 0, as the triangle represents them, k ≤ P + 1."""
         return self.triangle[:, -1]
 
     @property
@@ -122,7 +122,7 @@ class SquareRootInformation:
         return self.jacobian.T @ self.residual
 
     def loss(self, p: Array) -> float:
-        """Return the sum of squares at p."""
+        """Return the sum of squares ‖S p + r‖² at p (P,)."""
         residual = self.triangle @ np.append(p, 1.0)
         return float(residual @ residual)
 

@@ -40,7 +40,9 @@ class LocalLoss:
 
     @cached_property
     def structure(self) -> tuple[Index, Index]:
-        """Rows and columns among (x, φ) of the entries, upper triangle, sorted by column."""
+        """Rows and columns among (x, φ) of the possible entries, upper triangle, sorted by column,
+        each once.
+        """
         none = np.zeros(self.nuisance_count)
         codes = [np.zeros(0, dtype=np.int64)]
         for reading, points in self.residuals:
@@ -110,7 +112,7 @@ class LocalLoss:
         self, x: Array, phi: Array, has_observation_curvature: bool
     ) -> Array:
         """Return the values of the entries of `structure` at x (N, 3n) and φ (k,), with or without
-        the curvature of the observables.
+        the curvature of the observations.
         """
         codes = self._codes(*self.structure)
         values = np.zeros(len(codes))

@@ -310,8 +310,8 @@ class MeasurementResidual(ABC):
 
     @cached_property
     def pooled_groups(self) -> PooledResiduals:
-        """Groups that statistics use: those of the measurement, unless a subclass combines
-        neighbours.
+        """Groups that statistics use: those of the measurement, without places, unless a subclass
+        combines neighbours.
         """
         return PooledResiduals(
             self.names, self.sigmas, is_compared=self.is_compared
@@ -733,12 +733,14 @@ class MeasurementResidual(ABC):
 
     @property
     def is_quadratic(self) -> bool:
-        """Whether second derivatives of the loss by the observable are constant."""
+        """Whether the loss is a quadratic function of the observable and φ, so that its second
+        derivatives are constant.
+        """
         return self._full_expression.is_quadratic
 
     @cached_property
     def _full_expression(self) -> ResidualExpression:
-        """Generated functions for the stencil of all times."""
+        """Generated functions for the stencil of all times of the observable."""
         window = self.stencil(
             np.zeros(self.nuisance.size), self.observable.count
         )

@@ -186,7 +186,7 @@ class MotionJacobian:
 
     @cached_property
     def _released_grasps(self) -> ReleasedGrasps:
-        """Corrections where grasps begin or end."""
+        """Corrections where grasps that hold for a part of the time begin or end."""
         scale = self.length_m / self.force_n
         return ReleasedGrasps.from_dynamics(
             self.dynamics,
@@ -393,8 +393,21 @@ def _dropped_forces(
     place: Index,
     scale: float,
 ) -> list[_DroppedForce]:
-    """Return the entries of forces that act while a dof is prescribed, in later rows where
-    it is free.
+    """Return the entries of forces that act while a dof is prescribed for a part of the time, in
+    later rows where it is free.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Equations of motion.
+    band : BlockBand
+        Structure of the Jacobian.
+    pattern : SymmetricPattern
+        Sparsity pattern of the blocks.
+    place : (3n,) array
+        Index of each dof's row within a grid time; −1 where it has none.
+    scale : float
+        Factor of the rows, `length_m` / `force_n`.
     """
     tables = dynamics.tables
     step_s = dynamics.step_s

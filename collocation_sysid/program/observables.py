@@ -222,8 +222,8 @@ class PointPositions:
         )
 
     def evaluate(self, motion: ObservedMotion, phi: Array) -> Array:
-        """Return the positions (R, e, 3) of the points in a motion [m], at those times that
-        the motion covers.
+        """Return the positions (R, e, 3) of the points in a motion [m] at φ (k,), at those R of the
+        observable's times that the motion covers.
         """
         return self.evaluate_positions(motion.x, phi)
 
@@ -267,7 +267,8 @@ class PointPositions:
         columns: Index,
         changes: Array,
     ) -> ObservableDerivatives:
-        """Return the derivatives of the values by parameters.
+        """Return the derivatives of the values by parameters, those of the motion and the points'
+        own coordinates.
 
         Parameters
         ----------
@@ -276,7 +277,7 @@ class PointPositions:
         shape_functions : tuple
             Result of `shape_functions` at φ.
         columns : (c,) array of int
-            Parameters.
+            Indices of the parameters of the changes.
         changes : (R, 3e, c) array
             Derivatives of the points by these parameters through the positions x.
         """

@@ -82,8 +82,8 @@ class Observation:
     def _reactions_at(
         self, x: Array, histories: Sequence[AnyHistory] = ()
     ) -> ReactionForces:
-        """Return the reaction forces on the sensed dofs at positions x (rows, 3n) [m]; internal
-        variables are computed from x where `histories` is empty.
+        """Return the reaction forces on the sensed dofs, without changes, at positions x (rows, 3n)
+        [m]; history variables are computed from x where `histories` is empty.
         """
         dynamics = self.equations.dynamics.truncated_to(len(x))
         dofs = self.segment.sensed_dofs
@@ -140,8 +140,14 @@ class Observation:
     def response_of_array(
         self, changes_m: Array, grasp_forces: GraspForces
     ) -> ObservableResponse:
-        """Return the changes of the observables, computed at once from changes (rows, 3n, m) [m] of
-        the first rows of x and from changes of the grasp forces.
+        """Return the changes of the observables, computed at once.
+
+        Parameters
+        ----------
+        changes_m : (rows, 3n, m) array
+            Changes of the first rows of x [m]; observed rows beyond them are left out.
+        grasp_forces : GraspForces
+            Forces on the sensed dofs with their changes; stored.
         """
         changes = []
         _, dofs, count = changes_m.shape

@@ -300,9 +300,8 @@ class StreamingModel:
 
     @cached_property
     def neighbouring_samples(self) -> int:
-        """Number of samples before and after one that its evaluation needs.
-
-        0 if no clock is estimated.
+        """Number of samples before, and after, one marker sample that its evaluation needs; 0 if no
+        clock is estimated.
         """
         return (
             NEIGHBOURS // 2 if len(self.segment.nuisance.clock_indices) else 0
@@ -310,8 +309,8 @@ class StreamingModel:
 
     @cached_property
     def marker_model(self) -> MarkerResidual:
-        """Sensor model of one marker sample, in the middle of its neighbours, measured at the
-        origin.
+        """Sensor model of one marker sample, in the middle of its neighbouring samples, measured at
+        the origin, with a quadratic loss.
         """
         neighbours = self.neighbouring_samples
         markers = self.segment.experiment.markers
@@ -332,7 +331,9 @@ class StreamingModel:
 
     @cached_property
     def instruments(self) -> tuple[StreamInstrument, ...]:
-        """Custom sensors, then the sensors of grasps."""
+        """Custom sensors, then the sensors of grasps, each in its order; their samples are those of
+        the still recording.
+        """
         instruments = []
         place = len(self.experiment.markers.names)
         step_s = self.segment.dynamics.step_s
@@ -385,7 +386,9 @@ class StreamingModel:
 
     @cached_property
     def wrench_sensors(self) -> tuple[Sensor, ...]:
-        """Wrenches of grasps that sensors observe, each with the index of its grasp."""
+        """Wrenches of grasps that sensors observe, each with the index of its grasp, from 0: those
+        of force–torque sensors, then of custom sensors.
+        """
         channels = [reading.observable for reading in self.segment.residuals]
         grasps = [id(grasp) for grasp in self.segment.experiment.grasps]
         wrenches = (
@@ -413,7 +416,9 @@ class StreamingModel:
 
     @cached_property
     def first_poses(self) -> Poses:
-        """Poses of all grasps at the start of the problem's recording."""
+        """Poses of all grasps at the start of the problem's
+        recording, (rotation, position) each.
+        """
         return _first_poses(self.experiment)
 
     def all_poses(self, moved: Poses) -> Poses:

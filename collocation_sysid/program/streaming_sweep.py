@@ -377,7 +377,9 @@ class StreamingSweep:
 
     @property
     def state(self) -> SweepState:
-        """Copy of the state on which the next row depends."""
+        """State on which the next row depends; its arrays are copied, except the columns of the
+        last rows.
+        """
         return SweepState(
             row=self.row,
             end=self.end,
@@ -624,11 +626,15 @@ class StreamingSweep:
         return solved, None
 
     def _store_rows(self, columns: Sequence[Array]) -> list[StoredRow]:
-        """Return the last rows for later passes, from their columns (3n, 1 + m), which
-        `_solve_rows` returns.
+        """Return the last rows for later passes.
 
         The reactions are corrected, and observed quantities of these rows are appended to those
         stored, in place.
+
+        Parameters
+        ----------
+        columns : sequence of (3n, 1 + m) arrays
+            Columns of the last rows that have been counted, which `_solve_rows` returns.
         """
         rows = slice(self.end - len(columns), self.end)
         all_columns = np.array(columns)
@@ -829,8 +835,9 @@ class StreamingSweep:
         Parameters
         ----------
         reading : Sample
+            The sample.
         rows : int
-            Number of rows that have been computed since the sample became available.
+            Number of rows that have been computed since the row after which it is evaluated.
         """
         model = self.model
         neighbours = self.model.neighbouring_samples

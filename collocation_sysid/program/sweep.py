@@ -195,7 +195,9 @@ class PrescribedColumns:
         return self.columns.shape[-1]
 
     def write_into(self, t: int, solution: Array) -> None:
-        """Write the prescribed rows of grid time t into `solution` (3n, c), in place."""
+        """Write the rows of the dofs that are prescribed at grid time t into `solution` (3n, c), in
+        place; other rows are kept.
+        """
         prescribed = self.is_prescribed[t]
         solution[self.dofs[prescribed]] = self.columns[t, prescribed]
 
@@ -288,8 +290,8 @@ class SweepColumns:
     def from_prescribed(
         cls, sweep: Sweep, equations: EquationsAtParameters, changes_m: Array
     ) -> SweepColumns:
-        """Build the columns of prescribed changes `changes_m` (N, g, c) of the grasped dofs
-        [m], without parameters.
+        """Build the columns of prescribed changes `changes_m` (N, g, c) of the grasped dofs [m],
+        those of `equations.prescribed`, at constant parameters.
         """
         grasped = PrescribedColumns.from_columns(
             sweep, equations.prescribed.dofs, changes_m
@@ -601,7 +603,9 @@ class Sweep:
 
     @property
     def _step_bytes(self) -> int:
-        """Memory of one time step: element results and one factor [bytes]."""
+        """Memory of one time step: element results and one factor [bytes], the latter of an
+        unsymmetric matrix if the body's is.
+        """
         solver = self.factoriser
         values = (
             solver.unsymmetric_factor_size
@@ -980,12 +984,13 @@ class ForwardSubstitution:
         Parameters
         ----------
         grasp_forces : GraspForces
+            Row t is overwritten.
         step : FactorisedStep
             Row t.
         force : (3n, c) array
-            Changes of the force at fixed positions.
+            Changes of the force at fixed positions [N].
         solution : (3n, c) array
-            Changes of x_t.
+            Changes of x_t [m].
         """
         row = step.row
         dofs = self.solver.sensed

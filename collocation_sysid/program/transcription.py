@@ -170,8 +170,8 @@ class Transcription:
 
     @cached_property
     def dynamics(self) -> Dynamics:
-        """Discrete equations of motion with the inputs as stated in the experiment, before
-        any estimate.
+        """Discrete equations of motion with the inputs as stated in the experiment, before any
+        estimate; the constants of the body are not set.
         """
         return with_inputs(
             Dynamics.from_experiment(
@@ -201,7 +201,7 @@ class Transcription:
 
     @cached_property
     def sensors(self) -> tuple[WrenchResidual, ...]:
-        """Measurement models of the grasps' force–torque sensors."""
+        """Measurement models of the grasps' force–torque sensors, in the order of the grasps."""
         return wrench_residuals(
             self.experiment,
             ReactionGrid.from_dynamics(self.dynamics),
@@ -211,7 +211,7 @@ class Transcription:
 
     @cached_property
     def custom_sensors(self) -> tuple[CustomSensorResidual, ...]:
-        """Measurement models of the custom sensors."""
+        """Measurement models of the custom sensors, in their order."""
         grid = ReactionGrid.from_dynamics(self.dynamics)
         return custom_sensor_residuals(
             self.experiment,
@@ -469,8 +469,8 @@ class Transcription:
     def _with_marker_places(
         self, phi: Array, place_coordinates: Array
     ) -> Array:
-        """Return φ (k,) with other coordinates of the estimated marker places, from
-        `place_coordinates` (M, k').
+        """Return a copy of φ (k,) with other coordinates of the estimated marker places, from
+        `place_coordinates` (M, k') of all markers.
         """
         updated = phi.copy()
         estimated = self.association.estimated
@@ -554,7 +554,7 @@ class Transcription:
 
     @property
     def columns(self) -> slice:
-        """Slice of its positions in z."""
+        """Slice of its scaled positions in z, grid time by grid time."""
         return slice(
             self.offsets.position, self.offsets.position + self.variable_count
         )
@@ -566,7 +566,7 @@ class Transcription:
 
     @property
     def parameter_indices(self) -> Index:
-        """Indices of its (q, φ) in p."""
+        """Indices (nq + k,) of its (q, φ) in p."""
         return np.concatenate(
             [np.arange(self.nq), self.nuisance_indices.indices]
         )
@@ -678,7 +678,7 @@ class Transcription:
 
     @property
     def has_histories(self) -> bool:
-        """Whether its body or a force on it has history variables."""
+        """Whether its body (viscoelastic memory) or a force on it has history variables."""
         return self.body.has_memory or bool(
             self.dynamics.forces.terms_with_internal_variables
         )
@@ -802,7 +802,9 @@ class Transcription:
         return self.select_rows(rows)
 
     def select_rows(self, values: NDArray[T]) -> NDArray[T]:
-        """Select from values (N, 3n) those that belong to constraints, (constraints,)."""
+        """Return a copy of those of values (N, 3n) that belong to constraints, (constraints,), grid
+        time by grid time.
+        """
         return values[self.dynamics.first_row :, self.constrained_dofs].ravel()
 
     @cached_property
@@ -839,7 +841,9 @@ class Transcription:
 
     @property
     def jacobian(self) -> BlockBand:
-        """Sparsity structure of ∂c/∂x by columns; row indices count within the segment."""
+        """Sparsity structure of ∂c/∂x by columns; row indices count from the first constraint of
+        this experiment.
+        """
         return self.motion_rows.structure
 
     def constraints_and_jacobian(
@@ -1310,7 +1314,8 @@ class Transcription:
 def _state_factors(
     p: Array, q: Array, p_second: Array, q_second: Array
 ) -> tuple[Array, Array]:
-    """Coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v in the block of two positions.
+    """Return the coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v in the block of two positions, in the second
+    derivative of a potential φ of one evaluation.
 
     Parameters
     ----------

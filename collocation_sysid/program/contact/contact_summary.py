@@ -161,8 +161,8 @@ def friction_summaries(
 def contact_summaries_of_parts(
     iterates: Iterable[ExperimentIterate],
 ) -> Iterator[ContactSummary]:
-    """Yield the contact summaries of each obstacle of each experiment, at the positions of its
-    iterate.
+    """Yield the contact summaries of each obstacle of each experiment, experiment by experiment, at
+    the positions of its iterate.
     """
     for part in iterates:
         t_s = part.equations.dynamics.t_s[: len(part.x)]

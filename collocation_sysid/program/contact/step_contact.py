@@ -61,8 +61,8 @@ class ContactCandidates:
     def from_indices(
         law: ContactLaw, pattern: SymmetricPattern, chosen: bytes
     ) -> ContactCandidates:
-        """Build the candidates of an obstacle; the last few are cached, because successive steps
-        are similar.
+        """Build the candidates of an obstacle; the last 64 are cached by their arguments, because
+        successive steps are similar.
 
         Parameters
         ----------
@@ -71,7 +71,7 @@ class ContactCandidates:
         pattern : SymmetricPattern
             Pattern of the matrices.
         chosen : bytes
-            Indices of the points, an array of int64 as bytes.
+            Indices of the points among all contact points, an array of int64 as bytes.
         """
         some = np.frombuffer(chosen, dtype=np.int64)
         points = law.surface.points
@@ -189,7 +189,9 @@ class StepContact:
         self._half_s = max((each.step_s for each in contacts), default=0.0) / 2
 
     def force(self, xi: Array, nu: Array) -> Array:
-        """Return the contact forces (3n,) [N] at ξ and ν, each (1, 3n)."""
+        """Return the contact forces (3n,) [N] at ξ [m] and ν [m/s], each (1, 3n); zero without
+        contact.
+        """
         force = np.zeros(xi.size)
         for candidates, u, data in self._candidates(xi[0], nu[0]):
             force += candidates.assemble(

@@ -236,7 +236,7 @@ def _iterate_alignment(
 
 
 def _cross_product_matrices(vectors: Array) -> Array:
-    """Return the matrices (P, 3, 3) of cross products with vectors (P, 3)."""
+    """Return the skew matrices (P, 3, 3) with M w = v × w for vectors v (P, 3)."""
     x, y, z = vectors.T
     none = np.zeros_like(x)
     return np.stack([[none, -z, y], [z, none, -x], [-y, x, none]]).transpose(

@@ -95,15 +95,17 @@ class DepthCameraModel:
 
     @cached_property
     def parameter_indices(self) -> Index:
-        """Indices in φ of the camera's nuisance parameters."""
+        """Indices in φ of the camera's nuisance parameters, of all kinds in `OF_CAMERA`; empty if
+        none is estimated.
+        """
         return self.nuisance.indices_of_rows(
             *OF_CAMERA, component=self.camera_index
         )
 
     @cached_property
     def poses(self) -> tuple[Array, Array]:
-        """Rotations (S, 3, 3) and translations (S, 3) [m] from the camera's frame to the
-        world, at each image.
+        """Stated rotations (S, 3, 3) and translations (S, 3) [m] from the camera's frame to the
+        world, at each of S images, without estimated errors.
         """
         return self.depth.camera.pose_at(self.depth.sample_times_s)
 

@@ -92,7 +92,7 @@ class SurfaceComparison:
     def from_fit(
         cls, residual: DepthResidual, x: Array, values: Array, phi: Array
     ) -> SurfaceComparison:
-        """Compare the points with the correspondences of a fit.
+        """Return the comparison with the correspondences of a fit, which are not renewed.
 
         Parameters
         ----------
@@ -116,12 +116,13 @@ class SurfaceComparison:
     def from_motion(
         cls, residual: DepthResidual, t_s: Array, positions_m: Array, phi: Array
     ) -> SurfaceComparison:
-        """Associate the points with a motion and compare them.
+        """Associate the points with a motion and compare them; images after its end are compared
+        with its last positions.
 
         Parameters
         ----------
         residual : DepthResidual
-            Measurement model of the camera.
+            Measurement model of the camera; its correspondences are not used.
         t_s : (T,) array
             Times of the motion [s].
         positions_m : (T, n, 3) array

@@ -163,7 +163,12 @@ class DepthResidual(MeasurementResidual):
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all images: indices of the surface nodes, and the data of the expression."""
+        """Stencil of all images: indices of the surface nodes, and the data of the expression.
+
+        The data are, in this order: distances of the neighbouring times from the image [s], shape
+        functions, normal in the world and in the camera's frame, translation of the camera along
+        the normal [m], measured point [m] and ray in the camera's frame.
+        """
         pairs = self.correspondences_in_use
         times = self._neighbour_times
         samples, points = pairs.is_compared.shape
@@ -340,7 +345,9 @@ class DepthResidual(MeasurementResidual):
 
     @cached_property
     def pooled_groups(self) -> PooledResiduals:
-        """Patches of the surface, in groups of three."""
+        """Patches of the surface, in groups of three, with σ of a single point; a patch is compared
+        in images in which it has points, and its place is the mean of its points in all images.
+        """
         means, counts = self._pooling
         name = self.names[0]
         count = counts.shape[1] // GROUP
@@ -393,7 +400,7 @@ class DepthResidual(MeasurementResidual):
 
     def surface_shapes(self, x: Array, phi: Array) -> Array:
         """Return the surface nodes (s, n, 3) [m] at the times of those first s images for which the
-        first rows x (rows, 3n) suffice, with the clock shift of φ.
+        first rows x (rows, 3n) [m] suffice, with the clock shift of φ (k,); s may be 0.
         """
         clock_shift = self.correspondences.camera.clock_shift_s(phi)
         known = int((self._neighbour_times[:, -1] < len(x)).sum())

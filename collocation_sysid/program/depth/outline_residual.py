@@ -34,7 +34,7 @@ class OutlineResidual(DepthResidual):
     @classmethod
     def from_depth(cls, depth: DepthResidual) -> OutlineResidual:
         """Return the measurement model of the outlines for the camera, images and correspondences
-        of a depth measurement model.
+        of a depth measurement model, with its Huber threshold.
         """
         used = depth.correspondences.outline.is_compared
         samples, points = used.shape
@@ -67,7 +67,9 @@ class OutlineResidual(DepthResidual):
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all images as for depth, with the width of a pixel as last datum."""
+        """Stencil of all images as for depth, with the width of a pixel [m] as last datum; one
+        where there is no edge.
+        """
         places, data = super()._stencil
         width_m = np.where(
             self.correspondences_in_use.is_compared,

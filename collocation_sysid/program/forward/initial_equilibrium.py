@@ -170,12 +170,23 @@ def _without_contact(forces: Forces, shape: Array) -> Array:
 def _partial_displacement(
     experiment: Experiment, displaced_m: Array, time_s: float, share: float
 ) -> Array:
-    """Return positions (n, 3) with the grasps moved by a share of their displacement from the
-    carried body [m].
+    """Return a copy of positions with the grasps that hold moved by a share of their displacement
+    from the carried body.
 
     Each grasp rotates about the middle of its nodes, which moves along a line, so that no grasp is
     squeezed or sheared at large rotations. Obstacles have their final rotation already. Other nodes
     keep their positions.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    displaced_m : (n, 3) array
+        Positions of the carried body, at share 0 [m].
+    time_s : float
+        Time whose poses are reached at share 1 [s].
+    share : float
+        Share of the displacement, from 0 to 1.
     """
     positions = displaced_m.copy()
     for grasp in experiment.grasps:

@@ -275,8 +275,8 @@ class _Stepper:
         return forces.total(state.x, state.v)[0]
 
     def _forces(self, load_s: float, step_s: float = 0.0) -> Forces:
-        """Return the forces under the loads at a time; contact is averaged over a step of
-        `step_s` if it is not zero.
+        """Return the forces under the loads at the time `load_s` [s]; contact is averaged over a
+        step of `step_s` [s], or evaluated at the state if that is zero.
         """
         return Forces.from_experiment(
             self.experiment, load_s, self.theta, step_s=step_s
@@ -305,7 +305,7 @@ class _Stepper:
         )
 
     def _mass(self, time_s: float) -> Array:
-        """Return the masses (3n,) at a time [kg]."""
+        """Return the masses (3n,) of all dofs at a time [kg]."""
         return (
             Weight.from_experiment(self.experiment, time_s)
             .with_theta(self.theta)

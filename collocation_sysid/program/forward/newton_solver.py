@@ -382,7 +382,9 @@ class NewtonSolver:
 
     @cached_property
     def _retraction(self) -> Retraction:
-        """Retraction that applies increments towards an equilibrium."""
+        """Retraction that applies increments towards an equilibrium and displaces the prescribed
+        dofs exactly; computed on first use.
+        """
         prescribed = np.zeros(self.pattern.size, dtype=bool)
         prescribed[self.is_prescribed] = True
         return Retraction(self.body, prescribed.reshape(-1, 3))
@@ -439,14 +441,18 @@ class NewtonSolver:
         return bool(self.body.volume_ratios(x).min() > 0)
 
     def _require_upright(self, x: Array) -> None:
-        """Raise NewtonFailure if an element is inverted at x (3n,)."""
+        """Raise NewtonFailure if an element is inverted (det F ≤ 0 at a quadrature point) at x
+        (3n,) [m].
+        """
         if not self.has_no_inverted_element(x):
             raise NewtonFailure(
                 x, "an element is inverted before the first iteration"
             )
 
     def worst_element(self, x: Array) -> int:
-        """Return the index of the element with the smallest det F at x (3n,)."""
+        """Return the index of the element with the smallest det F at any of its quadrature points
+        at x (3n,) [m].
+        """
         return int(self.body.volume_ratios(x)[0].min(axis=1).argmin())
 
 

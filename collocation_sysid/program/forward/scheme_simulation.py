@@ -93,8 +93,7 @@ def continue_simulation(
     dynamics : Dynamics
         Discrete equations of motion at the parameters.
     known : (k, 3n) array, optional
-        First rows [m], at least one and starting with velocity zero; by default the start of the
-        experiment is computed.
+        First rows [m], at least one; by default the start of the experiment is computed.
     options : NewtonOptions, optional
         Options of Newton's method.
     progress : callable, optional

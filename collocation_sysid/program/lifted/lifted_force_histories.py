@@ -52,7 +52,7 @@ class LiftedForceHistory(LiftedVariables):
 
     @property
     def first_evaluation(self) -> int:
-        """Index of the evaluation that the first variables belong to."""
+        """Index of the evaluation that the first variables belong to, 1."""
         return 1
 
     @property
@@ -94,8 +94,8 @@ class LiftedForceHistory(LiftedVariables):
     def with_lifted(
         self, iterate: ExperimentIterate, z: Array
     ) -> ExperimentIterate:
-        """Return the iterate with b (n, N, I) taken from z; b is zero before the first
-        evaluation.
+        """Return a copy of the iterate with the history variables b (n, N, I) [m] of this force
+        taken from z; b is zero at evaluation 0.
         """
         later = z[self.columns].reshape(self.shape) * self.segment.length_m
         before = np.concatenate([np.zeros_like(later[:, :1]), later], axis=1)
@@ -123,10 +123,18 @@ class LiftedForceHistory(LiftedVariables):
     ) -> WeightedHistory:
         """Return the history and its weights in the Lagrangian.
 
+        Parameters
+        ----------
+        iterate : ExperimentIterate
+            The experiment at the variables.
+        multipliers : array
+            Multipliers of all constraints g.
+
         Returns
         -------
         (ForceHistory, (n, N, I) array)
-            The history, and μ such that multipliers · equations contains Σ μ_k h_k.
+            The history, and μ such that multipliers · equations contains Σ μ_k h_k; zero at the
+            last evaluation.
         """
         mu = -multipliers[self.rows].reshape(self.shape) / self.segment.length_m
         return self._history_of(iterate), np.concatenate(
@@ -322,7 +330,8 @@ class LiftedForceHistory(LiftedVariables):
         multipliers: Array,
         weights: RowWeights,
     ) -> Array:
-        """Return the values of `hessian_entries`; arguments as in
+        """Return the values of `hessian_entries`: second derivatives with b of multipliers · g,
+        including the forces in the equations of motion; arguments as in
         `LiftedVariables.hessian_values`.
         """
         history, mu = self.weighted_history(iterate, multipliers)

@@ -146,8 +146,8 @@ class LiftedMemory(LiftedVariables):
     def with_lifted(
         self, iterate: ExperimentIterate, z: Array
     ) -> ExperimentIterate:
-        """Return the iterate with the history variables (N, width) [Pa] taken from z; those of the
-        first evaluation are zero.
+        """Return a copy of the iterate with the history variables (N, width) [Pa] of the body taken
+        from z; those of the first evaluation are zero.
         """
         later = z[self.columns].reshape(self.shape) * self.unit_pa
         memory = np.concatenate([np.zeros((1, self.shape[1])), later])
@@ -169,7 +169,9 @@ class LiftedMemory(LiftedVariables):
 
     @property
     def history_index(self) -> int:
-        """Index of the history, 0: that of the body is the first."""
+        """Index of the history in `ExperimentIterate.histories`, 0:
+        that of the body is the first.
+        """
         return 0
 
     def weighted_history(
@@ -177,10 +179,18 @@ class LiftedMemory(LiftedVariables):
     ) -> WeightedHistory:
         """Return the history and its weights in the Lagrangian.
 
+        Parameters
+        ----------
+        iterate : ExperimentIterate
+            The experiment at the variables.
+        multipliers : array
+            Multipliers of all constraints g.
+
         Returns
         -------
         (MemoryHistory, (N, width) array)
-            The history, and μ such that multipliers · r = −Σ μ_k (m_k − d_k m_{k−1} − a_k S_k).
+            The history, and μ such that multipliers · r = −Σ μ_k (m_k − d_k m_{k−1} − a_k S_k);
+            zero at the last evaluation.
         """
         return _body_history(iterate), self._history_weights(multipliers)
 
@@ -405,8 +415,8 @@ class LiftedMemory(LiftedVariables):
     def _parameter_derivatives(
         self, history: MemoryHistory, theta_q: Array
     ) -> Array:
-        """Return the derivatives (nq, N − 1, width) of the scaled equations r by q; `theta_q` (k,
-        nq) are those of the constants.
+        """Return the derivatives (nq, N − 1, width) of the scaled equations r by q, from the
+        derivatives `theta_q` (k, nq) of the k constants θ by q.
         """
         memory = history.memory
         derivatives = np.empty((theta_q.shape[1], *self.shape))

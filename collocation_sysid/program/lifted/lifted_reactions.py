@@ -95,7 +95,9 @@ class LiftedReactions(LiftedVariables):
         )
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled reaction forces (count,) that follow from positions and parameters."""
+        """Return the scaled reaction forces (count,) that follow from the positions and parameters
+        of the iterate.
+        """
         return self._scaled(iterate.motion.reactions.reaction)
 
     def _scaled(self, newtons: Array) -> Array:

@@ -65,7 +65,9 @@ class LiftedVariables(ABC):
     @property
     @abstractmethod
     def shape(self) -> tuple[int, ...]:
-        """Shape of the array of variables, and of that of the equations."""
+        """Shape of the array of variables, and of that of the equations; the last index is the
+        fastest in z and in g.
+        """
 
     @property
     def count(self) -> int:
@@ -145,8 +147,8 @@ class LiftedVariables(ABC):
     def jacobian_values(
         self, iterate: ExperimentIterate, z: Array
     ) -> tuple[Array, Array]:
-        """Return the scaled equations (count,) at an iterate and z, and the values of
-        `jacobian_entries`.
+        """Return the scaled equations (count,) at the iterate and z, and the values of
+        `jacobian_entries`: derivatives by scaled variables.
         """
         evaluated = [
             pattern.jacobian_values(z, self.count) for pattern in self.patterns
@@ -213,8 +215,8 @@ class LiftedVariables(ABC):
 
     @property
     def history_index(self) -> int | None:
-        """Index of the history among those of the motion, or None if the group is no history, or
-        has no equations of motion.
+        """Index of the history in `ExperimentIterate.histories`, or None if the group is no
+        history.
         """
         return None
 
@@ -233,7 +235,9 @@ class LiftedVariables(ABC):
 
     @property
     def entry_counts(self) -> tuple[int, int]:
-        """Numbers of additional entries of the Jacobian and of the Hessian."""
+        """Numbers of additional entries of the Jacobian, and of the
+        upper triangle of the Hessian.
+        """
         return len(self.jacobian_entries()[0]), len(self.hessian_entries()[0])
 
 

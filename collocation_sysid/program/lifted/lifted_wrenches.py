@@ -114,7 +114,9 @@ class LiftedWrench(LiftedVariables):
         return slice(self.columns.stop - self._wrench_size, self.columns.stop)
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled W and Y (count,) that follow from the iterate's motion."""
+        """Return the scaled W and, with a low-pass, Y (count,) that follow from the iterate's
+        motion.
+        """
         own = [
             self.observable.evaluate_unfiltered(
                 iterate.motion.reactions, iterate.phi
@@ -206,7 +208,9 @@ class LiftedWrench(LiftedVariables):
     # Loss ---------------------------------------------------------------------------------------
 
     def loss_gradient(self, iterate: ExperimentIterate) -> Array:
-        """Return the gradient of the loss by the scaled variables (count,)."""
+        """Return the gradient of the loss by the scaled variables (count,); zero for W if there is
+        a low-pass.
+        """
         own = np.zeros(self.count)
         by_observables, _ = iterate.loss_gradients[self.residual_index]
         own[self.count - self._wrench_size :] = (
@@ -224,7 +228,9 @@ class LiftedWrench(LiftedVariables):
 
     @cached_property
     def _loss_entries(self) -> tuple[Index, Index]:
-        """Rows and columns among (Y, φ) of the Hessian of the loss, upper triangle."""
+        """Rows and columns among (Y, φ) of the Hessian of the loss by (scaled Y, φ), upper
+        triangle, sorted by column.
+        """
         return self.residual.hessian_structure(self._unit_derivatives)
 
     def hessian_entries(self) -> tuple[Index, Index]:

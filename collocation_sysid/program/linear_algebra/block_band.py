@@ -155,17 +155,19 @@ class BlockBand:
 
         Parameters
         ----------
-        times : array
+        times : (T,) array
             Column times t.
         offset : int
             Row block minus column block.
         rows, columns : (e,) arrays
-            Entries within the block.
+            Entries within the block, the same at all times.
 
         Raises
         ------
         IndexError
             If an entry is not in the block.
+        ValueError
+            If there are no blocks at this offset at one of the times.
         """
         result = np.empty((len(times), len(rows)), dtype=np.int64)
         for slab in self._slabs.values():
@@ -265,7 +267,9 @@ class _ColumnBlock:
         )
 
     def row_indices(self, row_starts: Index, t: int) -> Index:
-        """Return the row in the matrix of every entry, for column block t."""
+        """Return the row in the matrix of every entry (entries,), in sorted order, for column block
+        t.
+        """
         base = np.array([row_starts[t + b.offset] for b in self.blocks] + [0])
         result = np.empty(self.entry_count, dtype=np.int64)
         result[self.sorted_positions] = base[self.block_indices] + self.rows
@@ -290,6 +294,8 @@ class _ColumnBlock:
         ------
         IndexError
             For entries that the block does not have.
+        ValueError
+            If there is no block at this offset.
         """
         k = [b.offset for b in self.blocks].index(offset)
         block = self.blocks[k]

@@ -356,12 +356,16 @@ class Factoriser:
 
     @property
     def unsymmetric_factor_size(self) -> int:
-        """Number of floating-point numbers in the factor of an unsymmetric matrix."""
+        """Number of floating-point numbers in the factor of an unsymmetric matrix: twice that of a
+        symmetric one within a skyline, otherwise the same.
+        """
         return (2 if self.skyline else 1) * self.factor_size
 
     @cached_property
     def skyline(self) -> SkylineFactorisation | None:
-        """Skyline factorisation for narrow bands; None for others."""
+        """Skyline factorisation for bands up to `NARROW` wide; None for wider ones, other methods,
+        and without native code.
+        """
         if not self.is_banded or self.half_bandwidth > NARROW:
             return None
         return make_skyline(self._size, *self._ranks, self._free_entries)
@@ -515,8 +519,10 @@ class Factoriser:
         self, values: Array, skew: Array, buffer: FactorMemory | None
     ) -> Factor | None:
         """Return the factor within the skyline of a matrix with lower triangles `values` and
-        `skew`, or None if there is no skyline or the matrix needs row exchanges. The factor is
-        written to `buffer` if that is given.
+        `skew`, or None if there is no skyline, or the matrix is not positive definite or needs row
+        exchanges.
+
+        The factor is written to `buffer`, or to new memory for None.
         """
         skyline = self.skyline
         if skyline is None:
@@ -583,20 +589,20 @@ class Factoriser:
     def _superlu(
         self, values: Array, pivot_below: float, skew: Array = NONE
     ) -> SuperLU:
-        """Factorise by SuperLU.
+        """Return the factorisation by SuperLU.
 
         Parameters
         ----------
-        values : array
+        values : (m,) array
             Lower triangle of the symmetric part.
         pivot_below : float
             Threshold for row exchanges, from 0 (none) to 1 (partial pivoting).
-        skew : array
+        skew : (m,) or (0,) array
             Lower triangle of the skew part; empty for none.
 
         Raises
         ------
-        LinAlgError
+        numpy.linalg.LinAlgError
             If the matrix is singular.
         """
         entries = values[self._full_source]
@@ -622,7 +628,9 @@ def _has_positive_pivots(lu: SuperLU) -> bool:
 def _cached_analysis(
     pattern: SymmetricPattern, free: bytes, choice: Choice
 ) -> Factoriser:
-    """Return the analysis of a pattern; `free` are the bytes of an array of int64."""
+    """Return the analysis of a pattern, of which the last eight are cached; `free` are the bytes of
+    an array of int64.
+    """
     return Factoriser(
         pattern, np.frombuffer(free, dtype=np.int64), choice=choice
     )

@@ -123,8 +123,8 @@ class SparseAssembly:
         return self.indptr, self.indices
 
     def positions_of(self, positions: Index) -> Index:
-        """Return the positions of values of the initial structure, given by their positions
-        there.
+        """Return the positions among all values of values of the initial structure, given by their
+        positions there.
         """
         return (
             positions
@@ -192,13 +192,13 @@ def _locate(
         Column pointers and row indices.
     height : int
         Number of rows of the complete matrix.
-    codes : array
+    codes : (c,) array
         Column · height + row of the entries, ascending.
 
     Returns
     -------
-    (array, array of bool)
-        Number of entries of the structure before each, and whether it is absent.
+    ((c,) array, (c,) array of bool)
+        Number of entries of the structure before each, and whether it is absent from the structure.
     """
     indptr, indices = structure
     if not len(codes) or codes[0] >= (len(indptr) - 1) * height:

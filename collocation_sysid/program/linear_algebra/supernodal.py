@@ -142,7 +142,14 @@ class Pardiso:
         right: Array | None = None,
         result: Array | None = None,
     ) -> int:
-        """Call one phase of PARDISO and return its error code.
+        """Call one phase of PARDISO and return its error code, 0 or `NOT_POSITIVE`.
+
+        Parameters
+        ----------
+        phase : int
+            The phase, such as `FACTORISE`.
+        right, result : (n,) or (n, m) arrays, optional
+            Right-hand sides, and their solutions, which are overwritten; for `SOLVE` alone.
 
         Raises
         ------
@@ -191,7 +198,9 @@ class Pardiso:
 
 
 def _pointer(array: NDArray[Any] | None) -> ctypes.c_void_p | None:
-    """Return a pointer to the data of an array, or None."""
+    """Return a pointer to the data of an array, which must be kept alive by the caller; None for
+    None.
+    """
     return None if array is None else ctypes.c_void_p(array.ctypes.data)
 
 

@@ -191,7 +191,7 @@ class MarkerAssociation:
 
     def places_m(self, phi: Array) -> Array:
         """Return the places (M, 3) on the undeformed body [m] for coordinates `phi` (M, k) in prior
-        standard deviations along `axes`.
+        standard deviations along `axes`, linear about the centre; exact places do not move.
         """
         moved = np.einsum(
             "mik,mk->mi", self.axes, phi - self.centre_coordinates
@@ -201,6 +201,9 @@ class MarkerAssociation:
     def shape_functions(self, phi: Array) -> tuple[Index, ShapeFunctions]:
         """Return the nodes (M, npe) of each marker's element, and their shape functions at its
         place with derivatives by the k coordinates of the place.
+
+        The element is that of the association, also if the place is outside; exact places have
+        their stated nodes and weights.
 
         Parameters
         ----------

@@ -136,7 +136,7 @@ class MarkerResidual(MeasurementResidual):
 
     @property
     def _sample_indices(self) -> Index:
-        """Index (T,) of each sample among the channel's times."""
+        """Index (T,) of each sample among the observable's times."""
         return self.preceding_times + np.arange(len(self.t_s))
 
     @cached_property
@@ -150,8 +150,8 @@ class MarkerResidual(MeasurementResidual):
 
     @cached_property
     def _first_neighbour(self) -> Index:
-        """Index (T,) of the first sample that each one is interpolated from; negative
-        before the start.
+        """Index (T,) of the first of the observable's times from which each sample is interpolated;
+        negative before the start, where the body rests in its first state.
         """
         first = (
             self._sample_indices
@@ -170,8 +170,8 @@ class MarkerResidual(MeasurementResidual):
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all samples: indices of the neighbouring places, and the data of the
-        expression.
+        """Stencil of all samples; its data are the position of the sample among its neighbours, in
+        samples, and the sample's time [s].
         """
         count = len(self.markers.names)
         place = np.array(

@@ -90,12 +90,16 @@ class DeclaredMotion:
         )
 
     def to_world(self, points_m: Array) -> Array:
-        """Return points (..., T, M, 3) of the grasp's frame in the world [m]."""
+        """Return points (..., T, M, 3) [m] of the grasp's frame in the world, with the pose of each
+        time [m].
+        """
         turned = np.einsum("tij,...tmj->...tmi", self.rotations, points_m)
         return turned + self.translations_m[:, None]
 
     def to_grasp_frame(self, points_m: Array) -> Array:
-        """Return points (T, M, 3) of the world in the grasp's frame [m]."""
+        """Return points (T, M, 3) [m] of the world in the grasp's frame, with the pose of each time
+        [m].
+        """
         return np.einsum(
             "tji,tmj->tmi",
             self.rotations,
@@ -239,8 +243,8 @@ class ModalResponse:
         )
 
     def _frequencies(self, scale: float) -> Array:
-        """Return the angular frequencies (S, K) [rad/s] of the assumed stiffnesses for a
-        mesh scale.
+        """Return the angular frequencies (`STIFFNESSES`, K) [rad/s] of the assumed stiffnesses,
+        ascending, for a mesh scale.
         """
         softest = np.sqrt(
             STANDARD_GRAVITY_M_S2 / (SOFTEST_SAG * scale * self.size_m)

@@ -75,8 +75,8 @@ def find_instabilities(
 
 
 def _instability(iterate: ExperimentIterate) -> Instability | None:
-    """Return the instability of one experiment's motion, or None if all examined states are
-    stable.
+    """Return the instability of one experiment's motion, or None if all examined states (up to
+    `STATES` samples) are stable.
     """
     experiment = iterate.segment.experiment
     last = len(experiment.t_s) - 1
@@ -198,8 +198,8 @@ def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
 
 
 def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
-    """Return directions (n, k) with the smallest eigenvalues of a matrix; if the iteration stops
-    early, those that have converged and the start vector.
+    """Return vectors (n, `DIRECTIONS`) with the smallest eigenvalues of a symmetric matrix; if the
+    iteration stops early, those that have converged and the start vector.
     """
     start = np.random.default_rng(0).normal(size=len(matrix.diagonal()))
     options = {
@@ -215,7 +215,7 @@ def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
 
 
 def _exponents(stiffness: Array, damping: Array) -> NDArray[np.complex128]:
-    """Return all s of s² + D s + K for dense matrices."""
+    """Return all 2n complex s with det(s² + D s + K) = 0, for dense matrices (n, n)."""
     size = len(stiffness)
     chain = np.block(
         [[np.zeros((size, size)), np.eye(size)], [-stiffness, -damping]]

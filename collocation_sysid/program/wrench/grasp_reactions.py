@@ -84,7 +84,7 @@ class StreamedWrench(GraspWrench):
 
     def poses_at(self, rows: Index) -> tuple[Array, Array]:
         """Return rotations (k, 3, 3) and translations (k, 3) [m] at k of the n time steps, given by
-        index (k,).
+        index (k,) from 0.
         """
         return self.rotations[1 + rows], self.shifts[1 + rows]
 

@@ -77,7 +77,9 @@ class ReactionGrid:
 
     @classmethod
     def from_dynamics(cls, dynamics: Dynamics) -> ReactionGrid:
-        """Build the grid of discrete equations of motion."""
+        """Build the grid of discrete equations of motion, whose rows determine reaction forces as
+        `centred_rows` states.
+        """
         return cls(
             dynamics.t_s,
             *centred_rows(dynamics),
@@ -176,7 +178,7 @@ class GraspWrench:
 
     @property
     def rows(self) -> Index:
-        """All grid times, because accelerations are differences of positions."""
+        """Indices of all grid times, because accelerations are differences of positions."""
         return np.arange(len(self.reaction_grid.t_s))
 
     def operator(self, phi: Array) -> sp.csr_array:
@@ -322,7 +324,9 @@ class GraspWrench:
 
     @cached_property
     def tool_parameters(self) -> Index:
-        """Indices in φ of mass and centre of the tool and of gravity; empty without a tool."""
+        """Indices in φ of mass and centre of the tool and of gravity, as far as they are estimated;
+        empty if the tool's mass is not.
+        """
         if not len(mass := self.parameter_indices(TOOL_MASS)):
             return mass
         centre = self.parameter_indices(TOOL_CENTRE)
@@ -423,8 +427,8 @@ class GraspWrench:
     def filter_wrench(
         self, value: Array, phi: Array
     ) -> RecursionTrajectory | None:
-        """Return the low-pass filtered W (n, 6) as a recursion with derivatives; None without a
-        low-pass or without times.
+        """Return the low-pass filtered W (n, 6) at φ (k,) as a recursion with derivatives; None
+        without a low-pass or without times.
         """
         if not len(self.low_pass_parameters) or not len(value):
             return None
@@ -447,8 +451,8 @@ class GraspWrench:
     # As channels are --------------------------------------------------------------------------
 
     def evaluate(self, motion: ObservedMotion, phi: Array) -> Array:
-        """Return the measured wrench Y = L W (n, 2, 3) [N, N m] of a motion at φ: force and torque,
-        with the low-pass L if there is one.
+        """Return the measured wrench Y = L W (n, 2, 3), force [N] and torque [N m], of a motion at
+        φ, at the n times whose reaction forces the motion covers.
         """
         value = self.evaluate_unfiltered(motion.reactions, phi)
         evolution = self.filter_wrench(value, phi)

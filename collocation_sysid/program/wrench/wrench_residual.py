@@ -63,6 +63,8 @@ class WrenchResidual(MeasurementResidual):
     ) -> WrenchResidual:
         """Build the measurement model of a sensor.
 
+        Samples are compared only where the observable covers them for any shift of the clock.
+
         Parameters
         ----------
         observable : GraspWrench
@@ -115,7 +117,9 @@ class WrenchResidual(MeasurementResidual):
         return _is_covered(self.observable, self.t_s, known=known)
 
     def _neighbour_count(self, known: int) -> int:
-        """Return the number of grid times that a sample is interpolated from."""
+        """Return the number of grid times from which a sample is interpolated, if `known` are
+        known: at most four, and two for equilibria.
+        """
         return min(
             2 if self.observable.reaction_grid.is_static else NEIGHBOURS, known
         )
@@ -144,7 +148,8 @@ class WrenchResidual(MeasurementResidual):
         )
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the prediction (6,).
+        """Return the prediction (6,) [N, N m], interpolated in time, with the tare added to the
+        components that are measured.
 
         Parameters
         ----------
@@ -173,8 +178,8 @@ class WrenchResidual(MeasurementResidual):
     def predict_reactions(
         self, known_reactions: ReactionForces, phi: Array
     ) -> Array:
-        """Return the prediction (S, 6) from reaction forces [N, N m]; NaN for samples
-        outside the known times.
+        """Return the prediction (S, 6) [N, N m] at φ (k,) from reaction forces at the observable's
+        times; NaN for samples outside these times.
         """
 
         def reactions() -> ReactionForces:
@@ -266,7 +271,9 @@ def wrench_residuals(
 
 
 def without_grasp_sensors(experiment: Experiment) -> Experiment:
-    """Return the experiment without force–torque sensors and custom sensors of grasps."""
+    """Return the experiment without force–torque sensors and without custom sensors of grasps;
+    custom sensors of points are kept.
+    """
     grasps = [replace(grasp, wrench=None) for grasp in experiment.grasps]
     readings = [gauge for gauge in experiment.readings if gauge.grasp is None]
     return replace(experiment, grasps=grasps, readings=readings)
