@@ -595,16 +595,16 @@ def _markdown_span(span: Span) -> str:
     """
     text = span.text.strip()
     if not text or span.style not in ("strong", "code"):
-        return _with_outer_spaces(span.text, escape_markdown(text))
+        return _spaced_like(span.text, escape_markdown(text))
     if span.style == "strong":
-        return _with_outer_spaces(span.text, f"**{escape_markdown(text)}**")
+        return _spaced_like(span.text, f"**{escape_markdown(text)}**")
     fence = _longer_than_any("`", text)
     pad = " " if "`" in text else ""
     code = " ".join(printable(text).split())
-    return _with_outer_spaces(span.text, f"{fence}{pad}{code}{pad}{fence}")
+    return _spaced_like(span.text, f"{fence}{pad}{code}{pad}{fence}")
 
 
-def _with_outer_spaces(text: str, shown: str) -> str:
+def _spaced_like(text: str, shown: str) -> str:
     """Return `shown` with one space before and after it where `text` begins and ends with white
     space.
     """

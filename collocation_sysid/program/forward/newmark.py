@@ -175,8 +175,135 @@ def simulate_newmark(
     )
 
 
+class _StepEquations:
+    """Equations of motion of one Newmark step as functions of the positions at its end.
+
+    Attributes
+    ----------
+    contact : StepContact
+        Contact in the step.
+    mass_kg : (3n,) array
+        Masses of the dofs [kg].
+
+    Parameters
+    ----------
+    state : _State
+        State at the begin of the step.
+    step_s : float
+        Length of the step [s].
+    forces : Forces
+        Forces at the end of the step, without contact.
+    contact : StepContact
+        Contact in the step.
+    prescribed_dofs : (p,) array
+        Prescribed dofs.
+    prescribed : _PrescribedMotion
+        Their motion at the end of the step.
+    """
+
+    def __init__(
+        self,
+        state: _State,
+        step_s: float,
+        forces: Forces,
+        contact: StepContact,
+        prescribed_dofs: Index,
+        prescribed: _PrescribedMotion,
+    ) -> None:
+        self.contact = contact
+        self.mass_kg = forces.mass.inertia_kg[0]
+        self._state = state
+        self._step_s = step_s
+        self._forces = forces
+        self._prescribed_dofs = prescribed_dofs
+        self._prescribed = prescribed
+        # Derivative of the velocity at the end by the position at the end.
+        slope = 2.0 / step_s
+        self._slope = slope
+        self._known_v = -slope * state.x - state.v
+        self._known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
+
+    def extrapolation(self) -> Array:
+        """Return a guess (3n,) of the positions at the end [m], at constant acceleration including
+        that of the previous contact.
+        """
+        state = self._state
+        h = self._step_s
+        mass = self.mass_kg
+        guess = state.x + h * state.v + 0.5 * h * h * state.a
+        if state.contact_n is not None:
+            guess += (
+                0.5 * h * h * state.contact_n / np.where(mass > 0, mass, np.inf)
+            )
+        return self.with_prescribed_positions(guess)
+
+    def with_prescribed_positions(self, x: Array) -> Array:
+        """Return a copy of positions x (3n,) [m] with the prescribed dofs at their positions at the
+        end of the step.
+        """
+        moved = x.copy()
+        moved[self._prescribed_dofs] = self._prescribed.positions_m
+        return moved
+
+    def kinematics(self, x: Array) -> tuple[Array, Array]:
+        """Return velocities [m/s] and accelerations [m/s²], (3n,) each, at the end of the step at
+        positions x (3n,) [m]; the accelerations include those due to contact.
+        """
+        v = self._slope * x + self._known_v
+        a = self._slope**2 * x + self._known_a
+        # Finite differences of a grasp's motion ring under this rule; its own motion does not.
+        v[self._prescribed_dofs] = self._prescribed.velocities_m_s
+        a[self._prescribed_dofs] = self._prescribed.accelerations_m_s2
+        return v, a
+
+    def middle_state(self, x: Array) -> tuple[Array, Array]:
+        """Return the mean position ξ [m] and velocity ν [m/s] of the step, (1, 3n) each, if it ends
+        at x (3n,) [m].
+        """
+        before = self._state.x
+        return (before + x)[None] / 2, (x - before)[None] / self._step_s
+
+    def residual(self, x: Array) -> Array:
+        """Return the force balance F + 2 C − M a (3n,) [N] at the end positions x (3n,) [m]."""
+        v, a = self.kinematics(x)
+        balance = self._forces.total(x, v)[0] - self.mass_kg * a
+        if not self.contact.acts:
+            return balance
+        return balance + 2 * self.contact.force(*self.middle_state(x))
+
+    def linearise(self, x: Array) -> NewtonLinearisation:
+        """Return the force balance (3n,) [N] at x (3n,) [m], and its derivative by x."""
+        v, a = self.kinematics(x)
+        slope = self._slope
+        at = self._forces.linearise(x, v)
+        matrix = -(at.by_position[0] + slope * at.by_velocity[0])
+        matrix[self._forces.pattern.diagonal] += slope**2 * self.mass_kg
+        skew = -at.by_position_skew[0]
+        if at.by_velocity_skew.size:
+            skew = skew - slope * at.by_velocity_skew[0]
+        balance = at.force[0] - self.mass_kg * a
+        if self.contact.acts:
+            contact = self.contact.linearise(
+                *self.middle_state(x), (0.5, 1 / self._step_s)
+            )
+            balance = balance + 2 * contact.force
+            matrix -= 2 * contact.symmetric
+            skew = skew - 2 * contact.skew
+        return NewtonLinearisation(balance, matrix, skew=skew)
+
+
 class _Stepper:
-    """Newmark steps of one experiment."""
+    """Newmark steps of one experiment.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    theta : (k,) array
+        Constants of the body.
+    options : NewtonOptions or None
+        Options of Newton's method; None means defaults.
+    """
 
     def __init__(
         self,
@@ -354,65 +481,25 @@ class _Stepper:
             state.previous_histories,
             interval_s=h,
         ).without_contact()
-        contact = StepContact(touching, self.theta, pattern=forces.pattern)
-        mass = forces.mass.inertia_kg[0]
-        prescribed = self._prescribed_motion(
-            solver, end_s, step_s=h, holding_s=load_s
+        equations = _StepEquations(
+            state,
+            h,
+            forces=forces,
+            contact=StepContact(touching, self.theta, pattern=forces.pattern),
+            prescribed_dofs=solver.is_prescribed,
+            prescribed=self._prescribed_motion(
+                solver, end_s, step_s=h, holding_s=load_s
+            ),
         )
-        slope = 2.0 / h
-        known_v = -slope * state.x - state.v
-        known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
-
-        def kinematics(x: Array) -> tuple[Array, Array]:
-            v = slope * x + known_v
-            a = slope**2 * x + known_a
-            # Finite differences of a grasp's motion ring under this rule; its own motion does not.
-            v[solver.is_prescribed] = prescribed.velocities_m_s
-            a[solver.is_prescribed] = prescribed.accelerations_m_s2
-            return v, a
-
-        def middle(x: Array) -> tuple[Array, Array]:
-            return (state.x + x)[None] / 2, (x - state.x)[None] / h
-
-        def residual(x: Array) -> Array:
-            v, a = kinematics(x)
-            balance = forces.total(x, v)[0] - mass * a
-            return (
-                balance + 2 * contact.force(*middle(x))
-                if contact.acts
-                else balance
-            )
-
-        def linearise(x: Array) -> NewtonLinearisation:
-            v, a = kinematics(x)
-            at = forces.linearise(x, v)
-            matrix = -(at.by_position[0] + slope * at.by_velocity[0])
-            matrix[forces.pattern.diagonal] += slope**2 * mass
-            skew = -at.by_position_skew[0]
-            if at.by_velocity_skew.size:
-                skew = skew - slope * at.by_velocity_skew[0]
-            balance = at.force[0] - mass * a
-            if contact.acts:
-                touching_at = contact.linearise(*middle(x), (0.5, 1 / h))
-                balance = balance + 2 * touching_at.force
-                matrix -= 2 * touching_at.symmetric
-                skew = skew - 2 * touching_at.skew
-            return NewtonLinearisation(balance, matrix, skew=skew)
-
-        guess = state.x + h * state.v + 0.5 * h * h * state.a
-        if state.contact_n is not None:
-            guess += (
-                0.5 * h * h * state.contact_n / np.where(mass > 0, mass, np.inf)
-            )
-        guess[solver.is_prescribed] = prescribed.positions_m
+        guess = equations.extrapolation()
         if not solver.has_no_inverted_element(guess):
-            guess = state.x.copy()
-            guess[solver.is_prescribed] = prescribed.positions_m
-        x = solver.solve(guess, residual, linearise)
-        v, a = kinematics(x)
+            guess = equations.with_prescribed_positions(state.x)
+        x = solver.solve(guess, equations.residual, equations.linearise)
+        v, a = equations.kinematics(x)
         contact_n = None
-        if contact.acts:
-            xi, nu = middle(x)
+        if equations.contact.acts:
+            mass = equations.mass_kg
+            xi, nu = equations.middle_state(x)
             contact_n = self._contact_n(xi[0], nu[0], load_s=load_s, step_s=h)
             # Prescribed dofs have the acceleration of the grasp.
             free = solver.free

@@ -111,57 +111,33 @@ def continue_simulation(
     SimulationError or None
         Why the simulation stopped early; it is not raised.
     """
-    if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
-        failure = SimulationError(massless, float(dynamics.t_s[0]))
-        return np.zeros(
-            (0, dynamics.body.pattern.size)
-        ) if known is None else known, failure
-    if (
-        unreachable := dynamics.body.rest_shape_failure(dynamics.theta)
-    ) is not None:
-        failure = RestShapeError(unreachable)
-        return np.zeros(
-            (0, dynamics.body.pattern.size)
-        ) if known is None else known, failure
+    x = np.zeros((dynamics.row_count, dynamics.body.pattern.size))
+    failure = _body_failure(dynamics)
+    if failure is not None:
+        return x[:0] if known is None else known, failure
     solvers = NewtonSolvers(experiment, options, stopwatch=stopwatch)
     is_prescribed = ~np.isnan(dynamics.prescribed_m)
-    x = np.zeros((dynamics.row_count, dynamics.body.pattern.size))
     v0 = np.zeros(x.shape[1])
     if known is None:
+        guess = (
+            None if approximate_solution is None else approximate_solution[0]
+        )
         try:
-            at_start = dynamics.forces.at_times(slice(1))
-            start_guess = (
-                None
-                if approximate_solution is None
-                else approximate_solution[0]
-            )
-            solver = solvers.for_prescribed(is_prescribed[0])
-            goals_m = dynamics.prescribed_m[0]
             x[0], v0 = initial_state(
                 experiment,
-                at_start,
-                solver=solver,
-                guess=start_guess,
-                prescribed_m=goals_m,
+                dynamics.forces.at_times(slice(1)),
+                solver=solvers.for_prescribed(is_prescribed[0]),
+                guess=guess,
+                prescribed_m=dynamics.prescribed_m[0],
             )
         except SimulationError as failure:
             return x[:0], failure
         known = x[:1]
     done = len(known)
     x[:done] = known
-    forces = np.zeros_like(x)  # total force at every evaluation so far
-    xi, nu = dynamics.evaluation_states(x)
-    first = dynamics.first_row
-    known_evaluations = done - dynamics.first_row
-    histories = dynamics.histories(x[:done])
+    # Total force at every evaluation so far.
+    forces, previous_histories = _forces_and_histories(dynamics, x, done)
     intervals = dynamics.interval_to_next_s
-    if known_evaluations > 0:
-        known_rows = slice(first, done)
-        forces[known_rows] = dynamics.forces_with_histories(
-            histories, known_rows
-        ).total(xi[:known_evaluations], nu[:known_evaluations])
-    dynamics.zero_prescribed_forces(forces)
-    previous_histories = tuple(history.final_state for history in histories)
     for t in range(done, dynamics.row_count):
         row = RowEquations(
             dynamics, x, forces=forces, t=t, previous=previous_histories
@@ -179,14 +155,12 @@ def continue_simulation(
                 solver, row, guess=guess, previous=x[t - 1], prescribed_m=goal
             )
         except NewtonFailure as failure:
-            time_s = float(dynamics.t_s[t])
-            static = dynamics.is_static
             return x[:t], simulation_error(
                 solver,
                 failure,
-                time_s=time_s,
+                time_s=float(dynamics.t_s[t]),
                 what=f"the step at row {t}",
-                static=static,
+                static=dynamics.is_static,
             )
         forces[t] = row.force(x[t])
         forces[t, dynamics.is_temporarily_prescribed[t]] = 0
@@ -202,6 +176,53 @@ def continue_simulation(
         if progress:
             progress(t / (dynamics.row_count - 1))
     return x, None
+
+
+def _body_failure(dynamics: Dynamics) -> SimulationError | None:
+    """Return the error for constants with which the body cannot be simulated at all, because a node
+    has no mass or there is no stress-free shape; None if there is no such reason.
+    """
+    massless = dynamics.body.mass_problem(dynamics.theta)
+    if massless is not None:
+        return SimulationError(massless, float(dynamics.t_s[0]))
+    unreachable = dynamics.body.rest_shape_failure(dynamics.theta)
+    if unreachable is not None:
+        return RestShapeError(unreachable)
+    return None
+
+
+def _forces_and_histories(
+    dynamics: Dynamics, x: Array, row_count: int
+) -> tuple[Array, tuple[PreviousState, ...]]:
+    """Return the forces at the evaluations of known rows, and the history variables after them.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Equations of motion.
+    x : (N, 3n) array
+        Positions [m], of which the first `row_count` rows are known.
+    row_count : int
+        Number of known rows, at least one.
+
+    Returns
+    -------
+    (N, 3n) array
+        Total forces [N]; zero before the first equation of motion, in rows that are not known, and
+        at dofs while a grasp that holds for a part of the time prescribes them.
+    tuple of PreviousState
+        One entry for each history; empty without any.
+    """
+    forces = np.zeros_like(x)
+    histories = dynamics.histories(x[:row_count])
+    evaluations = row_count - dynamics.first_row
+    if evaluations > 0:
+        xi, nu = dynamics.evaluation_states(x)
+        rows = slice(dynamics.first_row, row_count)
+        known_forces = dynamics.forces_with_histories(histories, rows)
+        forces[rows] = known_forces.total(xi[:evaluations], nu[:evaluations])
+    dynamics.zero_prescribed_forces(forces)
+    return forces, tuple(history.final_state for history in histories)
 
 
 def extrapolate(x: Array, first_step: Array) -> Array:
