@@ -405,14 +405,17 @@ def with_wrenches(
 
     Raises
     ------
-    StopIteration
-        If there are fewer arrays than sensors; further ones are ignored.
+    ValueError
+        If the number of arrays is not that of the sensors.
     """
-    samples = iter(wrenches)
-    grasps = []
-    for grasp in experiment.grasps:
-        sensor = grasp.wrench and replace(grasp.wrench, values=next(samples))
-        grasps.append(replace(grasp, wrench=sensor))
+    instrumented = [
+        k for k, g in enumerate(experiment.grasps) if g.wrench is not None
+    ]
+    grasps = [*experiment.grasps]
+    for k, values in zip(instrumented, wrenches, strict=True):
+        sensor = grasps[k].wrench
+        assert sensor is not None
+        grasps[k] = replace(grasps[k], wrench=replace(sensor, values=values))
     return replace(experiment, grasps=grasps)
 
 
