@@ -669,7 +669,7 @@ class Collocation:
         return SparseAssembly.from_groups(
             structure,
             (self.constraint_count, self.variable_count),
-            of_phi + further,
+            groups=of_phi + further,
         )
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
@@ -758,7 +758,9 @@ class Collocation:
             weights = segment.lagrangian_weights(
                 multipliers[segment.rows]
             ).forces
-            by_x, by_p = segment.history_vjp(part.x, part.equations, weights)
+            by_x, by_p = segment.history_vjp(
+                part.x, part.equations, weights=weights
+            )
             slope[segment.columns] += segment.length_m * by_x.ravel()
             slope[segment.dynamic_columns(self.phi_columns.start)] += by_p
         return slope
@@ -795,7 +797,9 @@ class Collocation:
         further += [each.hessian_entries() for each in self.lifted]
         structure = np.concatenate(indptr), np.concatenate(indices)
         return SparseAssembly.from_groups(
-            structure, (self.variable_count, self.variable_count), further
+            structure,
+            (self.variable_count, self.variable_count),
+            groups=further,
         )
 
     @cached_property

@@ -129,7 +129,11 @@ class CustomSensorResidual(MeasurementResidual):
         in `MeasurementResidual.with_samples`.
         """
         return super().with_samples(
-            known_s, t_s, measurements, observable_s=known_s, **changes
+            known_s,
+            t_s,
+            measurements=measurements,
+            observable_s=known_s,
+            **changes,
         )
 
     @cached_property
@@ -331,7 +335,9 @@ def observed_points(
     placement = place_markers(
         points, body.nodes.points_m, body=body, names=names
     )
-    chart = MarkerAssociation.from_exact_places(body, placement, points)
+    chart = MarkerAssociation.from_exact_places(
+        body, placement, points_m=points
+    )
     return PointPositions(
         np.arange(rows),
         chart,

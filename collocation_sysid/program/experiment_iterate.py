@@ -171,7 +171,7 @@ class ExperimentIterate:
             by_p[nq:] += by_phi
             if k not in self.lifted_observables:
                 products = reading.observable.vjp(
-                    self.motion, phi, by_observables
+                    self.motion, phi, by_values=by_observables
                 )
                 by_x = by_x + products.by_x
                 by_p[nq:] = by_p[nq:] + products.by_phi

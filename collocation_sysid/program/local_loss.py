@@ -46,7 +46,9 @@ class LocalLoss:
         none = np.zeros(self.nuisance_count)
         codes = [np.zeros(0, dtype=np.int64)]
         for reading, points in self.residuals:
-            slopes = points.derivative_matrix(None, none, self.position_count)
+            slopes = points.derivative_matrix(
+                None, none, position_count=self.position_count
+            )
             codes.append(self._codes(*reading.hessian_structure(slopes)))
         unique_codes = np.unique(np.concatenate(codes))
         return unique_codes % self._height, unique_codes // self._height
@@ -135,7 +137,9 @@ class LocalLoss:
             yield reading.hessian(
                 values,
                 phi,
-                points.derivative_matrix(x, phi, self.position_count),
+                points.derivative_matrix(
+                    x, phi, position_count=self.position_count
+                ),
                 has_observation_curvature,
             )
             if has_observation_curvature and not points.is_linear:

@@ -880,7 +880,7 @@ def _congruence(slopes: sp.csr_array, blocks: Array) -> SparseEntries:
         np.asarray(index, dtype=np.int64) for index in upper.coords
     )
     return SparseEntries(
-        rows, columns, np.asarray(upper.data, dtype=np.float64)
+        rows, columns, values=np.asarray(upper.data, dtype=np.float64)
     )
 
 

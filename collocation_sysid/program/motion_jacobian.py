@@ -236,7 +236,7 @@ class MotionJacobian:
         self._released_grasps.correct(
             values,
             forces.by_position,
-            forces.by_velocity,
+            by_velocity=forces.by_velocity,
             skew=skew,
             rate_skew=of_rates,
         )
@@ -347,7 +347,7 @@ class ReleasedGrasps:
                 dynamics, band, pattern=pattern, place=place, scale=scale
             )
         )
-        return cls(dropped, zeros, np.concatenate([nothing, *ones]))
+        return cls(dropped, zeros, ones=np.concatenate([nothing, *ones]))
 
     def correct(
         self,

@@ -98,7 +98,13 @@ class ObservableDerivatives(NamedTuple):
         observable whose points have no parameters of their own.
         """
         none = np.zeros(0, dtype=np.int64)
-        return cls(columns, by, none, none.reshape(0, 0), by[:, :0, :, :0])
+        return cls(
+            columns,
+            by,
+            entities=none,
+            own_parameters=none.reshape(0, 0),
+            by_own=by[:, :0, :, :0],
+        )
 
 
 class VectorJacobianProduct(NamedTuple):
@@ -321,7 +327,7 @@ class PointPositions:
                 ),
             )
             by_phi[self.coordinate_parameters[here]] = own
-        return VectorJacobianProduct(by_x, None, by_phi)
+        return VectorJacobianProduct(by_x, None, by_phi=by_phi)
 
     def frame_changes(
         self,
@@ -472,7 +478,7 @@ class PointPositions:
         return SparseEntries(
             np.concatenate([rows.ravel(), column[upper[0], upper[1]]]),
             np.concatenate([columns.ravel(), column[upper[0], upper[2]]]),
-            np.concatenate([value.ravel(), by_coordinates[upper]]),
+            values=np.concatenate([value.ravel(), by_coordinates[upper]]),
         )
 
 

@@ -246,7 +246,7 @@ class Observation:
         if by_p:
             first = 0 if step is None else 1
             by[..., first:] += self.equations.inertia_derivatives(
-                slice(len(x)), acceleration, dofs
+                slice(len(x)), acceleration, dofs=dofs
             )
         if step is None:
             return ReactionForces(
@@ -370,7 +370,9 @@ class Observation:
         )
         if setting.mass_depends_on_parameters:
             acceleration = dynamics.acceleration(x)[:, dofs]
-            own = setting.inertia_derivatives(slice(None), acceleration, dofs)
+            own = setting.inertia_derivatives(
+                slice(None), acceleration, dofs=dofs
+            )
             by_p += np.einsum("tg,tgp->p", weights, own)
         rows = Submatrix(dynamics.pattern, dofs)
         state = np.zeros_like(x)
@@ -389,5 +391,7 @@ class Observation:
         by_x += dynamics.combine_transposed(t.q, rate) / dynamics.step_s
         inertia = dynamics.combine_transposed(t.s, self._mass_kg * weights)
         by_x[:, dofs] += inertia / dynamics.step_s**2
-        through_histories, own = segment.history_vjp(x, setting, force_weights)
+        through_histories, own = segment.history_vjp(
+            x, setting, weights=force_weights
+        )
         return by_x + through_histories, by_p + own

@@ -295,7 +295,9 @@ class StreamingModel:
         ) / self.transformation_derivatives(transformed_values)
         empty = SquareRootInformation.empty(self.parameter_count)
         return empty.with_rows(
-            np.concatenate([residual, from_guess]), rows, transformed_values
+            np.concatenate([residual, from_guess]),
+            rows,
+            parameters=transformed_values,
         )
 
     @cached_property
@@ -324,8 +326,8 @@ class StreamingModel:
         return MarkerResidual.from_markers(
             origin,
             rows,
-            segment.nuisance,
-            segment.association,
+            nuisance=segment.nuisance,
+            association=segment.association,
             preceding_times=neighbours,
         )
 
@@ -359,7 +361,9 @@ class StreamingModel:
                 reading = replace(reading, observable=points_of_sensor)
                 observable = slice(place, place + points_of_sensor.vector_count)
                 place += points_of_sensor.vector_count
-            instruments.append(StreamInstrument(reading, stencil, observable))
+            instruments.append(
+                StreamInstrument(reading, stencil, observable=observable)
+            )
         return tuple(instruments)
 
     @cached_property

@@ -316,7 +316,7 @@ class StreamingSweep:
         point_columns = self._at_points(columns_of_rows)
         point_columns[..., 1:] *= self.rates[moving]
         stored_rows = [
-            StoredRow(self.transformed, w[:, 0], k.columns)
+            StoredRow(self.transformed, w[:, 0], columns=k.columns)
             for w, k in zip(columns_of_rows, stored, strict=True)
         ]
         all_wrenches = np.array(
@@ -347,7 +347,7 @@ class StreamingSweep:
         grasped = None
         if self.segment.nuisance.affects_grasps:
             grasped = PrescribedColumns.from_columns(
-                self.solver, self.grasped, self.prescribed_columns
+                self.solver, self.grasped, columns=self.prescribed_columns
             )
         self.columns = SweepColumns(
             self.setting, self.count, has_step=True, prescribed=grasped
@@ -547,7 +547,7 @@ class StreamingSweep:
         total = stencils.w[rows, known] @ force
         residual = (total - self.mass_kg * acceleration)[:, free]
         return at, self.columns.right_hand_sides(
-            rows, at, acceleration, residual, free
+            rows, at, acceleration=acceleration, residual=residual, free=free
         )
 
     def _stencil_row(self, t: int) -> StencilRow:
@@ -589,7 +589,7 @@ class StreamingSweep:
             by_velocity = at.by_velocity[k]
             by_position_skew = at.by_position_skew[k]
             by_velocity_skew = at.by_velocity_skew[k]
-            block = row.block(by_position, by_velocity, solver.pattern)
+            block = row.block(by_position, by_velocity, pattern=solver.pattern)
             skew_block = row.skew_block(by_position_skew, by_velocity_skew)
             solved.append(row_columns)
             try:
@@ -606,7 +606,7 @@ class StreamingSweep:
                     skew=by_position_skew,
                     rate_skew=by_velocity_skew,
                 )
-                forward.solve_step(step, right, force, row_columns)
+                forward.solve_step(step, right, force=force, out=row_columns)
             except np.linalg.LinAlgError:
                 return solved, np.nan
             length = float(np.abs(row_columns[:, 0]).max(initial=0.0))
@@ -768,7 +768,7 @@ class StreamingSweep:
             ):
                 slope /= self.rates
                 residuals[k] = LinearisedResidual(
-                    residual - slope @ self.transformed, slope, of
+                    residual - slope @ self.transformed, slope, instrument=of
                 )
         return [each for each in residuals if each is not None]
 
@@ -804,7 +804,9 @@ class StreamingSweep:
             begins_s + step_s * np.array(rows) for rows in (needed_rows, at)
         )
         sensor = reading.with_samples(
-            known_s, t_s, np.array([sample.values for sample, _ in pairs])
+            known_s,
+            t_s,
+            measurements=np.array([sample.values for sample, _ in pairs]),
         )
         if isinstance(observable, slice):
             columns = self.moving
@@ -854,7 +856,10 @@ class StreamingSweep:
         point_columns = point_columns[:, : 3 * len(self.shape_functions[0])]
         values = point_columns[..., 0].reshape(len(point_columns), -1, 3)
         slopes = markers.observable.derivatives_from(
-            x, self.shape_functions, self.moving, point_columns[..., 1:]
+            x,
+            self.shape_functions,
+            columns=self.moving,
+            changes=point_columns[..., 1:],
         )
         since_s = (self.row - 1 - back) / model.substeps * model.interval_s
         markers = markers.shifted(since_s)
@@ -925,5 +930,5 @@ class StreamingSweep:
             residual, slopes, huber=self.model.collocation.huber
         )
         return known.with_rows(
-            rows[is_present], slopes[is_present], self.transformed
+            rows[is_present], slopes[is_present], parameters=self.transformed
         )

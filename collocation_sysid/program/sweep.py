@@ -185,7 +185,7 @@ class PrescribedColumns:
         return cls(
             dofs,
             columns,
-            sweep.dynamics.is_temporarily_prescribed[:, dofs]
+            is_prescribed=sweep.dynamics.is_temporarily_prescribed[:, dofs]
             | ~np.isin(dofs, sweep.free),
         )
 
@@ -280,7 +280,7 @@ class SweepColumns:
             if x is not None:
                 columns[..., 0] = np.nan_to_num(goals - x[:, prescribed.dofs])
             grasped = PrescribedColumns.from_columns(
-                sweep, prescribed.dofs, columns
+                sweep, prescribed.dofs, columns=columns
             )
         return cls(
             equations, first + count, has_step=x is not None, prescribed=grasped
@@ -294,7 +294,7 @@ class SweepColumns:
         those of `equations.prescribed`, at constant parameters.
         """
         grasped = PrescribedColumns.from_columns(
-            sweep, equations.prescribed.dofs, changes_m
+            sweep, equations.prescribed.dofs, columns=changes_m
         )
         return cls(
             equations,
@@ -330,7 +330,7 @@ class SweepColumns:
                 rows, linearisation.by_theta
             )
             right[..., first:] -= self.equations.inertia_derivatives(
-                rows, acceleration[:, free], free
+                rows, acceleration[:, free], dofs=free
             )
         return right, force
 
@@ -427,7 +427,7 @@ class Sweep:
         SimulationError
             If the equations of a time step are singular or not finite.
         """
-        sweep_columns = SweepColumns.by_parameters(self, equations, x)
+        sweep_columns = SweepColumns.by_parameters(self, equations, x=x)
         columns = np.zeros((*x.shape, sweep_columns.count))
         grasp_forces = GraspForces.zeros(
             len(x), len(self.sensed), sweep_columns.count
@@ -446,7 +446,7 @@ class Sweep:
             march.indefinite = known.indefinite_count
             grasp_forces.copy_first_rows(known.grasp_forces)
         for _ in march.iterate_rows(
-            x, 0 if known is None else len(known.step), columns
+            x, 0 if known is None else len(known.step), out=columns
         ):
             pass
         return Tangent(
@@ -730,7 +730,7 @@ class Sweep:
             values = rows[k].block(
                 linearisation.by_position[k],
                 linearisation.by_velocity[k],
-                pattern,
+                pattern=pattern,
             )
             skew = rows[k].skew_block(
                 linearisation.by_position_skew[k],
@@ -752,7 +752,7 @@ class Sweep:
             count = len(linearisation.force)
             threads = self.body.threads
             return self.factoriser.factorise_each(
-                matrix, count, threads, buffers
+                matrix, count, threads=threads, buffers=buffers
             )
         except np.linalg.LinAlgError as error:
             raise SimulationError(
@@ -859,7 +859,7 @@ class ForwardSubstitution:
         known = self._known or [None] * len(histories)
         pairs = zip(histories, known, strict=True)
         self.internal_states = [
-            each.forward_columns(columns.input_derivatives, done, own)
+            each.forward_columns(columns.input_derivatives, done, known=own)
             for each, own in pairs
         ]
         for t in range(done, first):  # the start is given

@@ -614,7 +614,7 @@ class Transcription:
         forces = at_last.linearise(at_rest, np.zeros_like(at_rest))
         last = StencilRow.from_dynamics(dynamics, dynamics.row_count - 1)
         block = last.block(
-            forces.by_position[0], forces.by_velocity[0], pattern
+            forces.by_position[0], forces.by_velocity[0], pattern=pattern
         )
         stiffness = np.abs(block[pattern.diagonal[self.free_dofs]]).mean()
         return self.length_m * float(stiffness)
@@ -888,7 +888,7 @@ class Transcription:
         if equations.mass_depends_on_parameters:
             all_rows = slice(None)
             by_p -= equations.inertia_derivatives(
-                all_rows, dynamics.acceleration(x), all_rows
+                all_rows, dynamics.acceleration(x), dofs=all_rows
             )
         by_p /= self.force_n
         dynamics.zero_prescribed_forces(by_p)
@@ -1167,7 +1167,7 @@ class Transcription:
         if skew.size:
             self._skew_hessian.fill(values, skew, skew, self.body.threads)
         by_x, twice = equations.weighted_second_derivatives(
-            x, curvature, weights.rows
+            x, curvature, row_weights=weights.rows
         )
         of_q = self.length_m * by_x[..., : self.nq]
         values[band.top_positions] = of_q.reshape(band.top_positions.shape)

@@ -265,7 +265,9 @@ class StepContact:
                 )
                 if len(chosen):
                     candidates = ContactCandidates.from_indices(
-                        each.law_of_contact, self._pattern, chosen.tobytes()
+                        each.law_of_contact,
+                        self._pattern,
+                        chosen=chosen.tobytes(),
                     )
                     self._candidates_of_contacts.append((each, candidates))
         for contact, candidates in self._candidates_of_contacts:

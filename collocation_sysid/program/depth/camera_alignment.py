@@ -232,7 +232,7 @@ def _iterate_alignment(
         )[0]
         rotation = Rotation.from_rotvec(step[:3]) * rotation
         translation_m = translation_m + step[3:]
-    return _AlignedPose(rotation, translation_m, mismatch)
+    return _AlignedPose(rotation, translation_m, mismatch=mismatch)
 
 
 def _cross_product_matrices(vectors: Array) -> Array:

@@ -77,7 +77,13 @@ class DepthCameraModel:
             experiment.body.nodes_m.mean(axis=0) - translations[0]
         ) @ rotations[0]
         size_m = float(np.linalg.norm(np.ptp(experiment.body.nodes_m, axis=0)))
-        return cls(depth, camera_index, nuisance, pivot_m, size_m)
+        return cls(
+            depth,
+            camera_index,
+            nuisance=nuisance,
+            pivot_m=pivot_m,
+            size_m=size_m,
+        )
 
     @cached_property
     def depth_expressions(self) -> dict[tuple[int, int], Any]:

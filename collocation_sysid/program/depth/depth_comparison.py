@@ -108,8 +108,8 @@ class SurfaceComparison:
         return cls(
             residual.correspondences,
             residual.surface_shapes(x, phi),
-            residual.signed_distances_m(values, phi),
-            phi,
+            signed_distances_m=residual.signed_distances_m(values, phi),
+            phi=phi,
         )
 
     @classmethod
@@ -145,7 +145,10 @@ class SurfaceComparison:
             view, body, shapes_m=shapes_m, phi=phi, gate_m=reach_m, settled=True
         )
         return cls(
-            sighting, shapes_m, sighting.signed_distances_m(shapes_m, phi), phi
+            sighting,
+            shapes_m,
+            signed_distances_m=sighting.signed_distances_m(shapes_m, phi),
+            phi=phi,
         )
 
     @cached_property

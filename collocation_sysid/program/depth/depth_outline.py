@@ -267,7 +267,7 @@ def _outline_points(
     """
     eye_m = camera_in.eye_m(phi, sample)
     camera = camera_in.depth.camera
-    own_m = camera_in.to_camera_m(phi, shape_m, sample)
+    own_m = camera_in.to_camera_m(phi, shape_m, sample=sample)
     if eye_m is None or (own_m[:, 2] <= 0).any():
         return None
     facing = surface.is_facing(shape_m, eye_m)
@@ -310,7 +310,7 @@ def _outline_points(
         / np.maximum(length_px, 1e-9)[:, None]
     )
     centres = pixels[corners[edge]].mean(axis=1)
-    at_m = camera_in.to_camera_m(phi, points_m, sample)
+    at_m = camera_in.to_camera_m(phi, points_m, sample=sample)
     places_px = camera.distorted_pixels(at_m)
     inwards = np.sum(normals * (places_px - centres), axis=1) < 0
     outwards = np.where(inwards[:, None], -normals, normals)

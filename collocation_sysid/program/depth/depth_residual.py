@@ -105,7 +105,7 @@ class DepthResidual(MeasurementResidual):
             node_count=len(correspondences.body.nodes_m),
         )
         chart = MarkerAssociation.from_exact_places(
-            correspondences.body, placement, points_m
+            correspondences.body, placement, points_m=points_m
         )
         samples, points = correspondences.is_compared.shape
         return cls(
@@ -234,7 +234,10 @@ class DepthResidual(MeasurementResidual):
             [shapes, correspondences.shapes_m[len(shapes) :]]
         )
         return SurfaceCorrespondences.from_alignment(
-            correspondences.camera, correspondences.body, all_shapes, phi
+            correspondences.camera,
+            correspondences.body,
+            shapes_m=all_shapes,
+            phi=phi,
         )
 
     @property
@@ -271,7 +274,7 @@ class DepthResidual(MeasurementResidual):
         times = ca.vertsplit(offsets)
         in_time = ca.vertcat(*lagrange_weights(clock_shift, times))
         surface = values_in @ ca.kron(in_time, weights)
-        corrected = view.corrected_expression(point, ray, values)
+        corrected = view.corrected_expression(point, ray, values=values)
         return (
             ca.dot(normal, surface)
             - ca.dot(in_camera, corrected)

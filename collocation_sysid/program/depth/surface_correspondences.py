@@ -183,7 +183,7 @@ class SurfaceCorrespondences:
         own["outline"] = Outline.from_shapes(
             camera, skin, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
         )
-        return cls(camera, body, skin, **own, **arrays)
+        return cls(camera, body, surface=skin, **own, **arrays)
 
     @classmethod
     def from_alignment(
@@ -211,7 +211,7 @@ class SurfaceCorrespondences:
         turn, shift_m = align_camera(
             camera, skin, x=shapes_m[first], image=first
         )
-        moved = camera.with_pose(phi, turn, shift_m)
+        moved = camera.with_pose(phi, turn, shift_m=shift_m)
         is_implausible = (
             np.abs(moved[camera.parameter_indices]).max(initial=0.0) > FARTHEST
         )
@@ -278,7 +278,7 @@ class SurfaceCorrespondences:
         """
         view = self.camera
         is_facing = self.surface.is_facing(
-            x, self.camera.eye_m(phi, 0), GRAZING
+            x, self.camera.eye_m(phi, 0), minimum_cosine=GRAZING
         )
         middles = x[self.surface.plane_triangles[is_facing]].mean(axis=1)
         distances_m, _ = KDTree(view.world_points(phi, 0)).query(middles)
@@ -410,7 +410,9 @@ def _match_image(
         measured = cloud[indices, 3:] @ camera.poses[0][sample].T
         has_similar_normal = np.sum(normals * measured, axis=1) >= GRAZING
     if settled:
-        is_visible = ~surface.is_hidden(x, eye_m, feet, FRONT * depth.spacing_m)
+        is_visible = ~surface.is_hidden(
+            x, eye_m, points_m=feet, front_m=FRONT * depth.spacing_m
+        )
     is_within_gate = distance <= gate_m
     remaining = np.cumprod(
         [
@@ -474,7 +476,9 @@ def _nearest_facing(
         return _NearestPoints(
             in_box[:0], in_box[:0], barycentric=np.zeros((0, 3))
         )
-    faces, barycentric = surface.nearest_points(x, world[in_box], facing)
+    faces, barycentric = surface.nearest_points(
+        x, world[in_box], candidates=facing
+    )
     return _NearestPoints(in_box, faces, barycentric=barycentric)
 
 
@@ -495,7 +499,7 @@ def initial_correspondences(
         nothing = np.zeros(nuisance.size)
         sightings.append(
             SurfaceCorrespondences.from_alignment(
-                view, experiment.body, shapes_m, nothing
+                view, experiment.body, shapes_m=shapes_m, phi=nothing
             )
         )
     return tuple(sightings)

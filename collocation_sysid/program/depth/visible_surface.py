@@ -105,7 +105,7 @@ class VisibleSurface:
         nodes, faces = np.unique(
             body.nodes.nodes_of_faces(triangles), return_inverse=True
         )
-        return cls(nodes, faces.reshape(len(triangles), -1), chosen)
+        return cls(nodes, faces.reshape(len(triangles), -1), is_selected=chosen)
 
     def initial_positions_m(
         self, experiment: Experiment, depth: Depth

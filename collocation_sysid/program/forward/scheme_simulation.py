@@ -136,7 +136,9 @@ def continue_simulation(
     done = len(known)
     x[:done] = known
     # Total force at every evaluation so far.
-    forces, previous_histories = _forces_and_histories(dynamics, x, done)
+    forces, previous_histories = _forces_and_histories(
+        dynamics, x, row_count=done
+    )
     intervals = dynamics.interval_to_next_s
     for t in range(done, dynamics.row_count):
         row = RowEquations(
@@ -346,7 +348,7 @@ class RowEquations:
         row = self.row
         at = self.rest.linearise(*states)
         matrix = row.block(
-            at.by_position[0], at.by_velocity[0], self.rest.pattern
+            at.by_position[0], at.by_velocity[0], pattern=self.rest.pattern
         )
         skew = row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
         if not self.contact.acts:

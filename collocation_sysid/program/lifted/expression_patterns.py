@@ -123,8 +123,8 @@ class ExpressionPattern:
         return cls(
             expression,
             one_dimensional(data, len(data)),
-            concatenated(inputs),
-            concatenated([rows]),
+            inputs=concatenated(inputs),
+            rows=concatenated([rows]),
         )
 
     @classmethod

@@ -125,7 +125,7 @@ class LiftedMemory(LiftedVariables):
         theta = segment.constants.theta(segment.parameters.guess_q)
         rest = body.nodes_m.reshape(1, -1)
         memory = body.memory
-        change = np.abs(body.stresses.stress_jvp(rest, rest, theta)[0])
+        change = np.abs(body.stresses.stress_jvp(rest, rest, theta=theta)[0])
         normal = [
             change[b.points][: (b.points.stop - b.points.start) // 2]
             for b in memory.branches

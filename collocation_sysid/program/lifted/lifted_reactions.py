@@ -167,7 +167,7 @@ class LiftedReactions(LiftedVariables):
         by_p = dynamics.combine(dynamics.tables.w, by_p)
         acceleration = dynamics.acceleration(iterate.x)[:, self.sensed_dofs]
         by_p -= setting.inertia_derivatives(
-            slice(None), acceleration, self.sensed_dofs
+            slice(None), acceleration, dofs=self.sensed_dofs
         )
         force = np.zeros(acceleration.shape)
         force[first:] = iterate.forces.force[:, self.sensed_dofs]

@@ -122,7 +122,7 @@ class BlockBand:
                 b for b, here in zip(blocks, present, strict=True) if here
             ]
             self._slabs[present] = _ColumnBlock.from_blocks(
-                columns, chosen, top_rows
+                columns, chosen, top=top_rows
             )
         kinds = [self._slabs[tuple(present)] for present in exists]
         starts = np.concatenate(
@@ -173,7 +173,7 @@ class BlockBand:
         for slab in self._slabs.values():
             here = np.array([self._kinds[t] is slab for t in times], dtype=bool)
             if here.any():
-                places = slab.locate(offset, rows, columns)
+                places = slab.locate(offset, rows, columns=columns)
                 result[here] = self.starts[times[here], None] + places
         return result
 
@@ -257,13 +257,13 @@ class _ColumnBlock:
         return cls(
             columns,
             top,
-            blocks,
-            len(order),
-            ends,
-            place[: top * columns].reshape(columns, top),
-            place,
-            level,
-            rows,
+            blocks=blocks,
+            entry_count=len(order),
+            column_ends=ends,
+            top_positions=place[: top * columns].reshape(columns, top),
+            sorted_positions=place,
+            block_indices=level,
+            rows=rows,
         )
 
     def row_indices(self, row_starts: Index, t: int) -> Index:

@@ -107,11 +107,11 @@ class SparseAssembly:
         return cls(
             np.concatenate([[0], np.cumsum(counts)]),
             all_indices,
-            None
+            initial_positions=None
             if is_initial[: len(indices)].all()
             else np.flatnonzero(is_initial),
-            tuple(own[each] for each in group_indices),
-            tuple(
+            group_positions=tuple(own[each] for each in group_indices),
+            has_duplicates=tuple(
                 bool(np.bincount(each, minlength=1).max() > 1)
                 for each in group_indices
             ),

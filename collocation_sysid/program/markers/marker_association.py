@@ -121,15 +121,15 @@ class MarkerAssociation:
         chart = cls(
             body,
             sigma_m,
-            points,
-            markers.on_surface,
-            placement.nodes,
-            placement.weights,
-            np.zeros(len(points), dtype=np.int64),
-            points,
-            np.zeros((len(points), 3, k)),
-            np.full((len(points), 2, 3), np.nan),
-            np.zeros(len(points), dtype=np.int64),
+            prior_places_m=points,
+            on_surface=markers.on_surface,
+            nodes=placement.nodes,
+            weights=placement.weights,
+            cells=np.zeros(len(points), dtype=np.int64),
+            centre_places_m=points,
+            axes=np.zeros((len(points), 3, k)),
+            crossed_edges=np.full((len(points), 2, 3), np.nan),
+            crossing_counts=np.zeros(len(points), dtype=np.int64),
             correspondences=initial_correspondences(experiment),
         )
         return chart.centred_at(points)
@@ -234,7 +234,7 @@ class MarkerAssociation:
                 gradients,
                 gradients,
             )
-        return nodes, ShapeFunctions(weights, slopes, curvatures)
+        return nodes, ShapeFunctions(weights, slopes, hessians=curvatures)
 
     @cached_property
     def _shape(self) -> LocatedBody:

@@ -227,14 +227,16 @@ class MarkerResidual(MeasurementResidual):
         reading = values[:, 0]
         if len(self.nuisance.clock_indices):
             late = (
-                self.nuisance.marker_delay_s(phi, own, t_s)
+                self.nuisance.marker_delay_s(phi, own, t_s=t_s)
                 / self.nuisance.interval_s
             )
             places = [ca.SX(k) for k in range(self._neighbour_count)]
             reading = values @ ca.vertcat(
                 *lagrange_weights(place + late, places)
             )
-        return self.nuisance.marker_measurement(reading, phi, own, t_s)
+        return self.nuisance.marker_measurement(
+            reading, phi, places=own, t_s=t_s
+        )
 
     # Of positions -----------------------------------------------------------------------------
 

@@ -86,7 +86,12 @@ class DeclaredMotion:
         name = f"'{experiment.name}'"
         gravity_m_s2 = experiment.gravity_m_s2
         return cls(
-            t_s, rotations, translations, tracks, gravity_m_s2, name=name
+            t_s,
+            rotations,
+            translations_m=translations,
+            tracks_m=tracks,
+            gravity_m_s2=gravity_m_s2,
+            name=name,
         )
 
     def to_world(self, points_m: Array) -> Array:
@@ -199,11 +204,11 @@ class ModalResponse:
         return cls(
             markers.predict_positions(body.nodes_m),
             omega / omega[:1],
-            markers.predict_positions(modes.shapes),
-            weighted.sum(axis=1),
-            np.einsum("kni,nj->kij", weighted, body.nodes_m),
-            float(np.linalg.norm(np.ptp(body.nodes_m, axis=0))),
-            experiment.start == "equilibrium",
+            shapes=markers.predict_positions(modes.shapes),
+            translation_loads=weighted.sum(axis=1),
+            rotation_loads=np.einsum("kni,nj->kij", weighted, body.nodes_m),
+            size_m=float(np.linalg.norm(np.ptp(body.nodes_m, axis=0))),
+            is_initially_at_rest=experiment.start == "equilibrium",
         )
 
     def predict(self, declared: DeclaredMotion) -> Array:

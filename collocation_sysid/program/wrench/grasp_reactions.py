@@ -133,8 +133,8 @@ class GraspReactions:
         return cls(
             GraspForces.zeros(rows, dofs, columns),
             moved,
-            rotations,
-            rotations[..., 0].copy(),
+            rotations=rotations,
+            shifts=rotations[..., 0].copy(),
         )
 
     @property
@@ -264,14 +264,14 @@ class GraspReactions:
         by = mass_kg[:, None] * np.tensordot(
             of_x, position_slopes, 1
         ) - np.tensordot(of_force, slopes, 1)
-        by += setting.inertia_derivatives(0, acceleration, dofs)
+        by += setting.inertia_derivatives(0, acceleration, dofs=dofs)
         pose_rows = slice(at[0] - 1, at[-1] + 2)
         channels = [
             StreamedWrench.from_poses(
                 channel,
                 self.rotations[pose_rows, grasp],
-                self.shifts[pose_rows, grasp],
-                dynamics.step_s,
+                shifts=self.shifts[pose_rows, grasp],
+                step_s=dynamics.step_s,
             )
             for channel, grasp in sensors
         ]

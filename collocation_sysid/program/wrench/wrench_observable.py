@@ -92,7 +92,7 @@ class ReactionGrid:
         """Build the grid of reaction forces that are known at given times (N,) [s] themselves,
         without delay.
         """
-        return cls(t_s, np.ones(len(t_s), dtype=bool), 0, 0)
+        return cls(t_s, np.ones(len(t_s), dtype=bool), delay_steps=0, reach=0)
 
     @property
     def step_s(self) -> float:
@@ -434,7 +434,10 @@ class GraspWrench:
             return None
         data = self.low_pass_data[:, : len(value), None]
         return RecursionTrajectory.from_signal(
-            LOW_PASS, phi[self.low_pass_parameters], data, value[None]
+            LOW_PASS,
+            phi[self.low_pass_parameters],
+            data=data,
+            signal=value[None],
         )
 
     @cached_property
@@ -549,7 +552,7 @@ class GraspWrench:
         by_x[np.ix_(k, self.sensed_dofs[self.node_dofs])] = np.einsum(
             "ka,kag->kg", by_w, of_place
         )
-        return VectorJacobianProduct(by_x, by_reaction, by_phi)
+        return VectorJacobianProduct(by_x, by_reaction, by_phi=by_phi)
 
     def frame_changes(
         self,
@@ -612,9 +615,9 @@ def _moment(u: ca.SX, data: ca.SX) -> ca.SX:
     of `MOMENT`; components that the grasp does not prescribe have no force.
     """
     place, reaction = ca.vertsplit(u, 3)
-    axes, point, reaction_force = ca.vertsplit(data, [0, 9, 12, 15])
+    axes, point, is_prescribed = ca.vertsplit(data, [0, 9, 12, 15])
     axes = ca.reshape(axes, 3, 3)
-    force = reaction_force * reaction
+    force = is_prescribed * reaction
     return ca.vertcat(axes @ force, axes @ ca.cross(place - point, force))
 
 
