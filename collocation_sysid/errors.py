@@ -11,8 +11,12 @@ from typing import Any
 
 
 def hint_at(name: str, known: Iterable[str]) -> str:
-    """Return "; did you mean …?" for a misspelt or abbreviated name; "" if no known name is
-    similar.
+    """Return "; did you mean 'NAME'?" with the known name that a misspelt or abbreviated name most
+    likely means; "" if there is none.
+
+    The first known name that begins with `name` is preferred (if `name` has two letters or more),
+    then the most similar one (`difflib.get_close_matches`). Known names of one or two letters are
+    never suggested.
     """
     names = [
         other for other in known if len(other) > 2
@@ -35,7 +39,7 @@ _MARKS = (
     )
     | dict.fromkeys((*range(0xD800, 0xE000), 0xFFFE, 0xFFFF), 0xFFFD)
 )
-# Longest message, and longest quotation of a file in it [characters].
+# Longest message [characters]: a screen of text, so that quoted input cannot flood a terminal.
 LONGEST = 1500
 # Longest quotation of a file in a message [characters]: most of a line of a terminal.
 LONGEST_EXCERPT = 60
@@ -43,23 +47,33 @@ _ENDLESS_WORD = re.compile(r"(\S{60})\S{340,}")
 
 
 def printable(text: str) -> str:
-    """Return the text with visible marks for control characters and for those XML cannot hold."""
+    """Return the text with visible marks in place of control characters.
+
+    ASCII control characters except tab and line feed become their symbols (U+2400 + code); further
+    controls, bidirectional overrides, surrogates and other characters that XML or UTF-8 cannot hold
+    become U+FFFD.
+    """
     return text.translate(_MARKS)
 
 
 def excerpt(text: str, longest: int = LONGEST_EXCERPT) -> str:
-    """Return the text, cut to `longest_displacement_m` letters."""
+    """Return the text, cut to `longest` characters; the last of them is then "…"."""
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
 def listed(names: Iterable[str]) -> str:
-    """Return names as part of a sentence: "a, b and c"."""
+    """Return names as part of a sentence: "a, b and c"; one name alone, and "" without names."""
     *others, last = [*names] or [""]
     return f"{', '.join(others)} and {last}" if others else last
 
 
 class InputError(ValueError):
     """Invalid input by the user; the message states what was found, where, and what was expected.
+
+    The text of the exception is "source: where: message", without the parts that are missing. It is
+    one line: line feeds become "␊", control characters visible marks (`printable`), words of 400
+    characters or more are cut to 60, and the whole to `LONGEST` characters. The attributes
+    `message`, `source` and `where` keep the arguments unchanged.
 
     Parameters
     ----------
@@ -92,7 +106,9 @@ class InputError(ValueError):
     def located(
         self, source: str | Path | None = None, where: str | None = None
     ) -> InputError:
-        """Return a copy of the error with file and key filled in where they are missing."""
+        """Return a copy of the error with `source` and `where` filled in where they are missing;
+        those that the error has already are kept.
+        """
         return InputError(
             self.message, self.source or source, where=self.where or where
         )
@@ -105,16 +121,18 @@ def require_among(
     where: str | None = None,
     count: str = "one",
 ) -> None:
-    """Raise an error if a name is not among the known ones.
+    """Raise an error unless `name` is one of the known ones.
 
     Parameters
     ----------
     name : str
+        The name to be checked.
     known : iterable of str
-    source, where
+        Valid names, in the order in which the message lists them.
+    source, where : str or None
         File and key for the message, see `InputError`.
     count : str
-        Number of names expected, for the message.
+        Word for the number of names expected, used in the message alone: "expected one of …".
 
     Raises
     ------
@@ -133,7 +151,14 @@ def require_among(
 def located(
     source: str | Path | None = None, where: str | None = None
 ) -> Iterator[None]:
-    """Add file and key to input errors raised in the context, where they are missing."""
+    """Add file and key to `InputError`s raised in the context, where they are missing; other
+    exceptions pass unchanged.
+
+    Raises
+    ------
+    InputError
+        In place of the one that was raised, see `InputError.located`.
+    """
     try:
         yield
     except InputError as error:

@@ -32,14 +32,16 @@ _HEADERS: dict[
 
 
 def load_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Read the arrays of a .npz by name, without objects.
+    """Read all arrays of a .npz by name; arrays of Python objects are refused.
+
+    The size that each header states is checked before memory is allocated, see `_require_size`.
 
     Raises
     ------
     InputError
         If an array is larger than its file or this machine allows. The path is not named.
     ValueError, OSError, zipfile.BadZipFile
-        If the file is no archive of arrays.
+        If the file is no archive of arrays, or holds objects.
     """
     with zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
@@ -57,14 +59,14 @@ def load_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
 
 
 def load_array(path: str | Path) -> NDArray[Any]:
-    """Read the array of a .npy file, which holds no objects.
+    """Read the array of a .npy file; an array of Python objects is refused.
 
     Raises
     ------
     InputError
         If the array is larger than its file or this machine allows. The path is not named.
     ValueError, OSError
-        If the file holds no array.
+        If the file holds no array, or holds objects.
     """
     size = Path(path).stat().st_size
     with Path(path).open("rb") as content:
@@ -75,7 +77,30 @@ def load_array(path: str | Path) -> NDArray[Any]:
 def _require_size(
     content: IO[bytes], size: int, compressed: int, name: str
 ) -> None:
-    """Refuse an array that its header states too large; `size` and `compressed` are in bytes."""
+    """Refuse an array if its header states more than is plausible.
+
+    It is refused if it is larger than its content; and, above `SMALL_BYTES`, if it is compressed
+    more than `LARGEST_COMPRESSION`-fold or takes more than `MEMORY_SHARE` of this machine's memory
+    (if known). An array in version 3 of the format is not checked.
+
+    Parameters
+    ----------
+    content : binary file
+        Positioned at the beginning of the array; its header is consumed.
+    size : int
+        Bytes of the array's content, decompressed, including the header.
+    compressed : int
+        Bytes that it takes in the file.
+    name : str
+        Name for the message; "" for the only array of a file.
+
+    Raises
+    ------
+    InputError
+        If the array is refused.
+    ValueError
+        If the content does not begin with the header of an array.
+    """
     version = npy.read_magic(content)
     if version not in _HEADERS:  # for names of columns that are not Latin
         return

@@ -17,7 +17,11 @@ CONNECT_WITHIN_S = 15
 
 @contextmanager
 def connected(scheduler: Any) -> Iterator[Any]:
-    """Connect to a scheduler and yield the client, which is closed afterwards.
+    """Connect to a scheduler and yield the client, which is closed at the end of the block.
+
+    While the block runs, an error of closing is ignored if the block has failed, so that the first
+    error is the one reported. From then on messages of `distributed.client` below the level
+    "critical" are not logged.
 
     Parameters
     ----------
@@ -55,7 +59,7 @@ def connected(scheduler: Any) -> Iterator[Any]:
 
 
 def distributed() -> Any:
-    """Import and return dask.distributed.
+    """Import and return the module `distributed` of dask.distributed.
 
     Raises
     ------

@@ -14,8 +14,13 @@ from ..errors import printable
 
 
 class PlainConsole(Console):
-    """Rich console without markup, in which control characters of texts are replaced by visible
-    marks.
+    """Rich console that shows texts as they are: no markup, no emoji codes, no highlighting, and
+    visible marks in place of control characters (`printable`).
+
+    Parameters
+    ----------
+    **options
+        Further options of `rich.console.Console`.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -24,7 +29,9 @@ class PlainConsole(Console):
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
-        """Return rich's segments with visible marks in place of control characters."""
+        """Yield rich's segments with visible marks in place of control characters; rich's own
+        control segments are unchanged.
+        """
         for segment in super().render(renderable, options):
             yield (
                 segment
@@ -36,6 +43,21 @@ class PlainConsole(Console):
 class Watched:
     """Progress display: updated in place on a terminal, one line per step elsewhere, none if
     `quiet`.
+
+    Use it as a context manager: in-place updates are displayed within the block and removed at its
+    end.
+
+    Attributes
+    ----------
+    console : Console
+        Where it is displayed.
+    quiet : bool
+        Whether nothing is displayed at all.
+
+    Parameters
+    ----------
+    live : bool
+        If false, do not update in place, also on a terminal.
     """
 
     def __init__(
@@ -60,13 +82,15 @@ class Watched:
             self._live.stop()
 
     def update(self, shown: RenderableType, line: str = "") -> None:
-        """Display `shown` in place; without a live display, print `line` if it is not empty."""
+        """Display `shown` in place; without a live display, print `line` if it is not empty and the
+        display is not quiet.
+        """
         if self._live is not None:
             self._live.update(shown)
         elif line:
             self.line(line)
 
     def line(self, text: str) -> None:
-        """Print a line that stays; nothing if the display is quiet."""
+        """Print a line that stays, without wrapping; nothing if the display is quiet."""
         if not self.quiet:
             self.console.print(Text(text), soft_wrap=True)

@@ -1,8 +1,8 @@
 """Declaration of classes that users state in Python or in a problem file.
 
-`declaration` makes a frozen dataclass whose fields are converted and checked on construction;
-`legend_handles` declares the conversion of a field and the form that it has in a problem file. A
-field without a converter is checked against that form.
+`declaration` makes a frozen dataclass whose fields are converted and checked on construction; `key`
+declares the conversion of a field and the form that it has in a problem file. A field without a
+converter is checked against that form.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ class Key:
     form : type
         Type of the value in the file; a form that allows None uses the default of the field.
     read : callable, optional
-        Conversion from the value in the file to the field; for a file, from its path to times and
-        values of a table.
+        Conversion from the value in the file to the field; None: the value itself. For a key that
+        names a file, from its path to times and values of a table.
     constant : str, optional
-        For a key that names a file with a table: the field whose key states a constant instead.
+        For a key that names a file with a table: the field whose key states a constant instead;
+        None for all other keys.
     """
 
     name: str
@@ -67,9 +68,10 @@ def key(
     form : type or Key, optional
         Form in the file; a `Key` if its name differs from the field's. None: not a key of the file.
     converter : callable, optional
-        Applied to values other than None.
+        Applied on construction to values other than None. None: the value is checked against `form`
+        if there is one, and otherwise kept as it is.
     read : callable, optional
-        Conversion from the value in the file to the field.
+        Conversion from the value in the file to the field; a `Key` as `form` has its own instead.
     **field_options
         See `dataclasses.field`.
     """
@@ -83,11 +85,18 @@ def key(
     frozen_default=True, eq_default=False, field_specifiers=(key, field)
 )
 def declaration(kind: type[T]) -> type[T]:
-    """Return the class as a frozen dataclass that converts its fields before ``__post_init__``.
+    """Return the class as a frozen dataclass, compared by identity, that converts its fields before
+    ``__post_init__``.
 
-    Messages begin with the `description` of an instance if it has one; otherwise they contain its
-    `description_name`,
-    or the name of the class.
+    On construction, each field other than None is replaced by its converted value (see `key`), then
+    the class's own ``__post_init__`` is called. The location of `InputError`s is the `description`
+    of the instance if it has one; otherwise messages name its `description_name` or, by default,
+    the class.
+
+    Raises
+    ------
+    InputError
+        On construction of an instance, if a value does not have the form of its field.
     """
     check = getattr(kind, "__post_init__", lambda self: None)
 
@@ -109,8 +118,13 @@ def declaration(kind: type[T]) -> type[T]:
 
 
 def _converted(field: Field[Any], instance: Any, value: Any) -> Any:
-    """Return the converted value of a field; without a converter, the default or a value of its
-    form.
+    """Return the value of a field by its converter; without one, the value if it equals the default
+    or, validated, if it has the field's form.
+
+    Raises
+    ------
+    InputError
+        If it does not have the form; converters raise their own errors.
     """
     if (converter := field.metadata["converter"]) is not None:
         return converter(value)
@@ -145,11 +159,14 @@ def _converted(field: Field[Any], instance: Any, value: Any) -> Any:
 
 @cache
 def _adapter(form: Any) -> TypeAdapter[Any]:
+    """Return the validator of a form, cached."""
     return TypeAdapter(form)
 
 
 def keys_of(kind: type) -> Iterator[tuple[str, Key]]:
-    """Yield the name of each field that a problem file may state, with its key."""
+    """Yield the name of each field that a problem file may state with its key, in the order of the
+    fields.
+    """
     for each in fields(kind):
         form = each.metadata.get("form")
         if isinstance(form, Key):
@@ -159,7 +176,11 @@ def keys_of(kind: type) -> Iterator[tuple[str, Key]]:
 
 
 def attributes(kind: type) -> dict[str, tuple[str, str]]:
-    """Return type and description of each documented field or option of a class, by name."""
+    """Return type and description of each documented field or parameter of a class, by name.
+
+    They are read from the "Attributes" or "Parameters" section of its docstring and of those of its
+    bases; the class itself prevails. Both are single lines of text.
+    """
     descriptions: dict[str, tuple[str, str]] = {}
     for base in reversed(kind.__mro__):
         text = inspect.cleandoc(base.__doc__ or "")
@@ -176,7 +197,9 @@ def attributes(kind: type) -> dict[str, tuple[str, str]]:
 
 
 def documented(kind: type) -> dict[str, str]:
-    """Return the descriptions of the fields of a class, or of the options of a method, by name."""
+    """Return the descriptions of the fields of a dataclass, by name in their order; fields without
+    a description are left out.
+    """
     descriptions = attributes(kind)
     return {
         each.name: descriptions[each.name][1]

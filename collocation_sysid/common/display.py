@@ -1,7 +1,8 @@
 """Plain description of output (sentences, tables, pictures, sections) and its rendering.
 
 The same description is rendered for terminals, HTML and Markdown, and written as JSON by
-`tree.update_as_json`. Styles are words: good, check, doubtful, strong, quiet, code.
+`serialisation.as_json`. Styles are words, separated by spaces: good, check, doubtful, strong,
+quiet, code. A word without a colour in `COLOURS` has no effect in terminals and is a class in HTML.
 """
 
 from __future__ import annotations
@@ -75,7 +76,9 @@ class Line:
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """The sentence as pieces, each with a style of its own."""
+        """The sentence as pieces, each with a style of its own; a
+        text is one piece without style.
+        """
         return (Span(self.text),) if isinstance(self.text, str) else self.text
 
 
@@ -93,15 +96,24 @@ class Table:
     Attributes
     ----------
     title : str
+        Title above the table; "" for none.
     heads : tuple of str
         Column headings; empty for none.
     rows : tuple of tuple of str
+        Cells of each row.
     names, texts : int
-        Number of name columns at the beginning, and of text columns at the end.
-    faint : tuple of int
-        Indices of rows that are shown with less emphasis.
-    note_column : int
-        Number of columns at the end that are omitted in terminals.
+        Number of name columns at the beginning, and of text columns at the end; None means 0.
+    faint : tuple of int, optional
+        Indices of rows that are shown with less emphasis in HTML.
+    style : str, optional
+        Style of the cells in terminals.
+    note_column : int, optional
+        Number of columns at the end that are omitted in terminals; None means 0.
+
+    Raises
+    ------
+    ValueError
+        If rows and headings do not have the same length.
     """
 
     title: str
@@ -123,14 +135,16 @@ class Table:
             )
 
     def is_number(self, column: int) -> bool:
-        """Return whether a column contains numbers."""
+        """Return whether the column with this index contains numbers: neither one of the `names`
+        nor one of the `texts`.
+        """
         columns = len(self.heads) or max(map(len, self.rows), default=0)
         return self.names <= column < columns - (self.texts or 0)
 
 
 @dataclass(frozen=True)
 class Cards:
-    """The most important numbers; each item has name, value and remark."""
+    """The most important numbers; each item is (name, value, remark)."""
 
     items: tuple[tuple[str, str, str], ...]
 
@@ -153,7 +167,19 @@ class Listing:
 
 @dataclass(frozen=True)
 class TitledParts:
-    """Group of parts with a title and optionally a style."""
+    """Group of parts with a title and optionally a style.
+
+    Attributes
+    ----------
+    title : str
+        Heading; "" for none. HTML shows it only without a style.
+    parts : tuple of Shown
+        Content.
+    level : int
+        Level of the heading, 1 for the highest.
+    style : str
+        Class of the enclosing element in HTML; "" for none.
+    """
 
     title: str
     parts: tuple[Shown, ...]
@@ -165,7 +191,7 @@ Shown = str | Line | Items | Table | Cards | Picture | Listing | TitledParts
 
 
 def flattened_parts(parts: Iterable[Shown]) -> Iterator[Shown]:
-    """Yield the parts of all sections without their titles, for terminals."""
+    """Yield the parts of all sections, also nested ones, without their titles."""
     for part in parts:
         yield from (
             flattened_parts(part.parts)
@@ -175,24 +201,30 @@ def flattened_parts(parts: Iterable[Shown]) -> Iterator[Shown]:
 
 
 def own_pictures(folder: Path) -> list[Path]:
-    """Return the PNG files of a folder, sorted; links that lead out of the folder are ignored."""
+    """Return the PNG files of a folder, sorted by path; links that lead out of the folder are left
+    out.
+    """
     return sorted(file for file in folder.glob("*.png") if is_own(folder, file))
 
 
 def short(value: float) -> str:
-    """Return a number with two digits, without a power of ten from 100 on."""
+    """Return a number with two significant digits; from 99.5 on as a whole number."""
     return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
 def number(value: float | None, digits: int = 5) -> str:
-    """Return a number with at most `digits` digits; a dash for None, NaN and infinity."""
+    """Return a number with at most `digits` significant digits; a dash for None, NaN and infinity.
+    Exponents have no leading zero.
+    """
     if value is None or not isfinite(value):
         return "–"
     return f"{value:.{digits}g}".replace("e-0", "e-").replace("e+0", "e")
 
 
 def millimetres(metres: float | None) -> str:
-    """Return a length [m] in millimetres with three digits; a dash for None and NaN."""
+    """Return a length [m] in millimetres with three significant digits and its unit; a dash for
+    None, NaN and infinity.
+    """
     return (
         "–"
         if metres is None or not isfinite(metres)
@@ -201,7 +233,9 @@ def millimetres(metres: float | None) -> str:
 
 
 def duration(time_s: float | None) -> str:
-    """Return a rounded duration with its unit; "an unknown time" for None."""
+    """Return a duration [s] rounded to one or two digits, with the unit h, min (from two of them
+    on) or s; "an unknown time" for None.
+    """
     if time_s is None:
         return "an unknown time"
     for unit, seconds in (("h", 3600), ("min", 60)):
@@ -211,7 +245,9 @@ def duration(time_s: float | None) -> str:
 
 
 def labelled(title: str, rows: dict[str, str]) -> Table:
-    """Return a table of two columns: names and texts."""
+    """Return a table without headings of two columns, names and texts; names are indented by two
+    spaces.
+    """
     return Table(
         title,
         (),
@@ -224,9 +260,10 @@ def labelled(title: str, rows: dict[str, str]) -> Table:
 
 
 def on_terminal(parts: Shown | Iterable[Shown]) -> RenderableType:
-    """Return parts as a rich renderable: text is wrapped between words, and no word is broken.
+    """Return a part, or several below one another, as a rich renderable.
 
-    Longer words go beyond the terminal's edge where they are printed with ``crop=False``.
+    Text is wrapped between words, and no word is broken. Longer words go beyond the terminal's edge
+    where they are printed with ``crop=False``.
     """
     if isinstance(parts, Shown):
         return _on_terminal(parts)
@@ -234,7 +271,9 @@ def on_terminal(parts: Shown | Iterable[Shown]) -> RenderableType:
 
 
 def plain_text(parts: Shown | Iterable[Shown], width: int = WIDE) -> str:
-    """Return parts as plain text without colours; each row of a table is one line."""
+    """Return parts as plain text without colours, `width` characters wide, without trailing spaces;
+    each row of a table is one line.
+    """
     file = StringIO()
     # Without these options rich would display the text in a Jupyter notebook, instead of writing
     # it to the file, and FORCE_COLOR would add colours.
@@ -250,6 +289,7 @@ def plain_text(parts: Shown | Iterable[Shown], width: int = WIDE) -> str:
 
 
 def _on_terminal(part: Shown) -> RenderableType:
+    """Return one part as a rich renderable; pictures are shown as caption and path."""
     match part:
         case str():
             return _text(part)
@@ -276,10 +316,12 @@ def _on_terminal(part: Shown) -> RenderableType:
 
 
 def _titled(title: str, *parts: RenderableType) -> RenderableType:
+    """Return renderables below one another, below a bold title if it is not ""."""
     return Group(_text(title, "bold"), *parts) if title else Group(*parts)
 
 
 def _text(text: str, style: str = "") -> UnbrokenWords:
+    """Return a text in a style of rich as a renderable without broken words."""
     return UnbrokenWords(Text(text, style=style))
 
 
@@ -292,7 +334,9 @@ class UnbrokenWords:
     def __rich_console__(
         self, console: Console, options: ConsoleOptions
     ) -> RenderResult:
-        """Yield the lines of the text for rich."""
+        """Yield the lines of the text, wrapped between words to the
+        width of the console, for rich.
+        """
         for line in self.text.split(allow_blank=True):
             breaks = [0]
             for word in re.finditer(r"\S+", line.plain):
@@ -308,24 +352,37 @@ class UnbrokenWords:
 
 
 def _colour(style: str) -> str:
+    """Return rich's style for the words of a style; unknown words have none."""
     return " ".join(COLOURS.get(word, "") for word in style.split())
 
 
 @dataclass(frozen=True)
 class TerminalTable:
-    """A table as rich shows it; off a terminal, where others read lines, no head or row has two."""
+    """Table for rich: on a terminal, long headings and cells may take several lines; elsewhere each
+    heading and row takes one.
+    """
 
     table: Table
 
     def __rich_console__(
         self, console: Console, options: ConsoleOptions
     ) -> RenderResult:
-        """Yield the table as one of rich."""
+        """Yield the table as one of rich, in the form that suits the console."""
         yield _rich_table(self.table, parted=console.is_terminal)
 
 
 def _rich_table(table: Table, *, parted: bool) -> RichTable:
-    # Rows that speak for themselves are nearer to what they say.
+    """Return a table as rich's, without its last `note_column` columns.
+
+    Parameters
+    ----------
+    table : Table
+        The table; its title is not shown.
+    parted : bool
+        If true, headings may be broken: those of numbers at hyphens if there are more than `MANY`
+        columns, other ones at their first dot. If false, line feeds in cells become "; ".
+    """
+    # Without headings, names are set close to their texts.
     shown = (
         RichTable(box=None, pad_edge=False)
         if table.heads
@@ -371,7 +428,13 @@ def _rich_table(table: Table, *, parted: bool) -> RichTable:
 
 
 def as_html(part: Shown) -> str:
-    """Return a part as HTML; text is escaped."""
+    """Return a part as HTML; text is escaped, and pictures are embedded.
+
+    Raises
+    ------
+    OSError
+        If the file of a picture cannot be read.
+    """
     match part:
         case str():
             return f"<p>{escape(part)}</p>\n"
@@ -421,10 +484,14 @@ def escape(text: str) -> str:
 
 
 def _class(style: str) -> str:
+    """Return the HTML attribute class=… for a style, with a leading space; "" for no style."""
     return f' class="{escape(style)}"' if style else ""
 
 
 def _span(span: Span) -> str:
+    """Return a piece of a sentence as HTML: a link, strong or code element, a span with a class, or
+    plain text.
+    """
     text = escape(span.text)
     if span.to:
         return f'<a href="{escape(span.to)}">{text}</a>'
@@ -434,6 +501,9 @@ def _span(span: Span) -> str:
 
 
 def _html_rows(table: Table) -> str:
+    """Return headings and rows of a table as HTML; without headings, the first cell of each row is
+    its heading.
+    """
     head = "".join(
         f"<th{_class('n' if table.is_number(k) else '')}>{escape(each)}</th>"
         for k, each in enumerate(table.heads)
@@ -455,11 +525,14 @@ def _html_rows(table: Table) -> str:
 
 
 def as_markdown(parts: Sequence[Shown]) -> str:
-    """For a paper's appendix or an issue; pictures are links to their files."""
+    """Return parts as Markdown, for a paper's appendix or an issue; pictures are links to their
+    file names, and cards and lists are items.
+    """
     return "\n\n".join(filter(None, map(_markdown, parts))) + "\n"
 
 
 def _markdown(part: Shown) -> str:
+    """Return one part as Markdown; "" for a titled group without title and parts."""
     match part:
         case str():
             return escape_markdown(part)
@@ -509,31 +582,40 @@ def _markdown(part: Shown) -> str:
 
 
 def escape_markdown(text: str) -> str:
-    """Text as one line of Markdown that a reader shows as it is: no markup, HTML or links."""
+    """Return a text as one line of Markdown that is displayed as it is: no markup, HTML or links;
+    white space becomes single spaces.
+    """
     line = MARKUP.sub(r"\\\g<0>", " ".join(printable(text).split()))
     return NUMBER_AT_START.sub(r"\1\\", MARKUP_AT_START.sub(r"\\\g<0>", line))
 
 
 def _markdown_span(span: Span) -> str:
+    """Return a piece of a sentence as Markdown: bold for "strong", code for "code", else plain;
+    targets of links are omitted.
+    """
     text = span.text.strip()
     if not text or span.style not in ("strong", "code"):
-        return _enclosing_ticks(span.text, escape_markdown(text))
+        return _spaced_like(span.text, escape_markdown(text))
     if span.style == "strong":
-        return _enclosing_ticks(span.text, f"**{escape_markdown(text)}**")
+        return _spaced_like(span.text, f"**{escape_markdown(text)}**")
     fence = _longer_than_any("`", text)
     pad = " " if "`" in text else ""
     code = " ".join(printable(text).split())
-    return _enclosing_ticks(span.text, f"{fence}{pad}{code}{pad}{fence}")
+    return _spaced_like(span.text, f"{fence}{pad}{code}{pad}{fence}")
 
 
-def _enclosing_ticks(text: str, shown: str) -> str:
-    """Keep the spaces with which a piece of a sentence begins and ends."""
+def _spaced_like(text: str, shown: str) -> str:
+    """Return `shown` with one space before and after it where `text` begins and ends with white
+    space.
+    """
     before = " " if text[:1].isspace() else ""
     after = " " if text[-1:].isspace() else ""
     return f"{before}{shown}{after}"
 
 
 def _longer_than_any(fence: str, text: str) -> str:
-    """Return a fence of backticks that the text does not have."""
+    """Return a fence of backticks that is longer than any sequence of backticks in the text, at
+    least `fence`.
+    """
     longest = max(map(len, BACKTICKS.findall(text)), default=0)
     return fence if longest < len(fence) else "`" * (longest + 1)

@@ -1,4 +1,6 @@
-"""Files and folders as they are read and written: regular, possible, whole or not there at all."""
+"""Reading and writing of files and folders: regular files alone, and files that are written
+completely or not at all.
+"""
 
 from __future__ import annotations
 
@@ -36,15 +38,23 @@ DAMAGE = (
 # Longest reason of an error of another library in a message [characters]: about two lines.
 LONGEST_REASON = 200
 RESULT_FILE = "result.json"
-# The form of result.json and summary.json.
+# Version of the form of result.json and summary.json.
 SCHEMA = 4
+# Remedy for a damaged file, at the end of a message.
 AGAIN = "; run what wrote it again"
 
 
 def require_regular(path: str | Path, where: str | None = None) -> None:
     """Refuse a pipe, socket or device, which a reader would wait for or never reach the end of.
 
-    What is not there, or is a folder, is left to the reader.
+    A path that does not exist or is a folder is accepted: it is left to the reader.
+
+    Parameters
+    ----------
+    path : str or Path
+        The path; links are followed.
+    where : str, optional
+        Key for the message.
 
     Raises
     ------
@@ -63,7 +73,9 @@ def require_regular(path: str | Path, where: str | None = None) -> None:
 
 
 def is_own(folder: Path, file: Path) -> bool:
-    """Whether this is a regular file of the folder, not one elsewhere that a link leads to."""
+    """Return whether a path is a regular file within the folder after links are followed; false if
+    it does not exist, or is a link to a file elsewhere.
+    """
     try:
         return file.is_file() and file.resolve().is_relative_to(
             folder.resolve()
@@ -73,7 +85,8 @@ def is_own(folder: Path, file: Path) -> bool:
 
 
 def require_own(file: Path) -> None:
-    """Refuse what is there and yet no regular file of its own folder.
+    """Refuse a pipe, socket or device, and a link to a file in another folder; a missing file is
+    accepted.
 
     Raises
     ------
@@ -89,7 +102,8 @@ def require_own(file: Path) -> None:
 
 
 def require_run_folder(path: Path) -> None:
-    """Refuse a file where a run folder is expected, such as the result.json of a run.
+    """Refuse a file where a run folder is expected, such as the result.json of a run; folders and
+    missing paths are accepted.
 
     Raises
     ------
@@ -105,25 +119,29 @@ def require_run_folder(path: Path) -> None:
 def _file_instead_of_folder(
     path: Path, what: str, expected_file: str
 ) -> InputError:
-    """Return the error for a file where `what` is expected, a folder with `expected_file`."""
+    """Return the error for a file where `what` is expected; it suggests the folder of the file if
+    that has a file `expected_file`.
+    """
     is_within = (path.parent / expected_file).is_file()
     likely = f", likely {path.parent}" if is_within else ""
     return InputError(f"this is a file; expected {what}{likely}", path)
 
 
 def read_json(file: Path, what: str) -> dict[str, Any]:
-    """The object in a JSON file of a folder.
+    """Return the object in a JSON file of a folder that this program wrote.
 
     Parameters
     ----------
     file : Path
+        The file.
     what : str
-        What its folder is, such as "a run folder".
+        Description of its folder for messages, such as "a run folder".
 
     Raises
     ------
     InputError
-        If it is not there, is damaged, or was written by another version.
+        If the file does not exist, is a link to elsewhere, is damaged, holds no object, or its
+        "schema" is not `SCHEMA`.
     """
     require_own(file)
     try:
@@ -152,12 +170,23 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
 
 @contextmanager
 def damage_refused(folder: Path, files: str, remedy: str) -> Iterator[None]:
-    """Make one refusal of whatever the files of a folder make go wrong in its readers.
+    """Convert exceptions that damaged files cause in their readers (`DAMAGE`) into an `InputError`;
+    other ones, also `OSError`, pass.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder that the message names.
+    files : str
+        Names of the files, for the message.
+    remedy : str
+        Remedy at the end of the message.
 
     Raises
     ------
     InputError
-        Naming the folder, its `files`, the reason and the `remedy`.
+        Naming the folder, its `files`, the reason and the `remedy`; an `InputError` of the block
+        itself passes unchanged.
     """
     try:
         yield
@@ -170,22 +199,28 @@ def damage_refused(folder: Path, files: str, remedy: str) -> Iterator[None]:
 
 
 def safe_name(text: str) -> str:
-    """A file's name for a text, with underscores in place of what could lead elsewhere."""
+    """Return the text as a file name: each sequence of characters other than letters, digits, "_",
+    "." and "-" becomes one underscore.
+    """
     return re.sub(r"[^\w.-]+", "_", text)
 
 
 @contextmanager
 def replaced_file(path: str | Path) -> Iterator[Path]:
-    """Give a file of the same ending beside `path` to write, and name it `path` at the end.
+    """Yield the path of a draft with the same ending beside `path`, which replaces `path` at the
+    end of the block.
 
-    So nobody ever sees half of it, and what was there is kept until then. A link is replaced and
-    not followed; into a device or a pipe, where nothing can be replaced, is written directly. In a
-    folder with a list of its files, see `written_files`, the file is added to the list.
+    So nobody ever sees an incomplete file, and the previous content is kept until then; it is kept
+    for good if the block raises, and the draft is removed. Missing parent folders are created. A
+    link is replaced and not followed. If `path` is a device, a pipe or a folder, `path` itself is
+    yielded and nothing is replaced. In a folder with a list of its files, see `written_files`, the
+    file is added to the list.
 
     Raises
     ------
     InputError
-        Naming the path, where the disk is full or it cannot be written in.
+        Naming the path, if the disk is full or the path cannot be written; and for an `OSError` of
+        the block.
     """
     target = Path(path)
     draft = target.with_name(
@@ -206,14 +241,17 @@ def replaced_file(path: str | Path) -> Iterator[Path]:
 
 
 def write_text_file(path: str | Path, text: str) -> None:
-    """Write a text as UTF-8 by `replaced_file`."""
+    """Write a text as UTF-8 by `replaced_file`, whose errors it raises."""
     with replaced_file(path) as draft:
         draft.write_text(text, encoding="utf-8")
 
 
 @contextmanager
 def naming(target: Path, draft: Path) -> Iterator[None]:
-    """Let what goes wrong while a draft is written name what the draft is to be.
+    """Convert errors raised while a draft is written into errors that name its target.
+
+    An `OSError` becomes an `InputError`; an `InputError` about the draft gets the target as source;
+    all others pass.
 
     Raises
     ------
@@ -232,7 +270,7 @@ def naming(target: Path, draft: Path) -> Iterator[None]:
 
 
 def reason(error: BaseException) -> str:
-    """The error on one line that is not too long."""
+    """Return type and message of an error on one line of at most `LONGEST_REASON` characters."""
     text = " ".join(f"{type(error).__name__}: {error}".split())
     return (
         text
@@ -242,7 +280,9 @@ def reason(error: BaseException) -> str:
 
 
 def run_name(problem: Path) -> str:
-    """Name of a problem file's runs: its folder's where it is called problem.toml, else its own."""
+    """Return the name of a problem file's runs: that of its folder if the file is called
+    problem.toml, else the file's without its ending.
+    """
     return (
         problem.resolve().parent.name
         if problem.stem == "problem"
@@ -251,7 +291,14 @@ def run_name(problem: Path) -> str:
 
 
 def require_possible(folder: Path) -> None:
-    """Refuse a folder that cannot be made, before any work is done for it."""
+    """Refuse a folder that cannot be created or written in, before any work is done for it; nothing
+    is created.
+
+    Raises
+    ------
+    InputError
+        If the nearest existing folder is not writable, or a file is in the way.
+    """
     for place in (folder, *folder.parents):
         if place.is_dir():
             if not os.access(place, os.W_OK):

@@ -23,7 +23,7 @@ with numpy.load("given.npz") as given:
 {code}
 numpy.savez("found.npz", allow_pickle=False, **found)
 """
-# Beyond what the process has mapped when the libraries of numpy are there.
+# Sets the limits of the process itself; memory is counted beyond what numpy has mapped already.
 _LIMIT = """
 try:
     import resource
@@ -40,7 +40,9 @@ except (ImportError, OSError, ValueError):
 
 
 class Failed(RuntimeError):
-    """The process left nothing; the message is its last line, or how it was killed."""
+    """Failure of an isolated process; the message is the last line that it wrote to stderr, how it
+    was killed, or the limit that it reached.
+    """
 
 
 @dataclass(frozen=True)
@@ -50,9 +52,10 @@ class ProcessLimits:
     Attributes
     ----------
     time_s : float
-        Processor time after which the process is killed; enforced on POSIX systems only.
+        Processor time after which the process is killed [s], rounded up to whole seconds; enforced
+        on POSIX systems only.
     memory_mb : float
-        Memory beyond that of Python and numpy; enforced on Linux only.
+        Memory beyond that of Python and numpy [MB]; enforced on Linux only.
     """
 
     time_s: float
@@ -65,7 +68,14 @@ class ProcessLimits:
 
     @classmethod
     def for_file(cls, path: str | Path) -> ProcessLimits:
-        """Return what reading a file may take: some tens of times what readers mostly need."""
+        """Return limits for reading a file, in proportion to its size: some tens of times what
+        readers mostly need.
+
+        Raises
+        ------
+        OSError
+            If there is no such file.
+        """
         size_mb = os.stat(path).st_size / 1e6
         return cls(
             time_s=READING_S + READING_S_PER_MB * size_mb,
@@ -93,23 +103,30 @@ def run_isolated(
     limits: ProcessLimits | None = None,
     **arrays: ArrayLike,
 ) -> dict[str, NDArray]:
-    """Run Python code in another process and return the arrays that it makes, by name.
+    """Run Python code in another process, in a temporary folder, and return the arrays that it
+    makes.
 
     Parameters
     ----------
     code : str
-        Reads the `arrays` by name and the words in `sys.argv`, and leaves arrays in `found`.
-    words : str
+        Finds the `arrays` in the dictionary `given` and the words in `sys.argv[1:]`, and leaves a
+        dictionary `found` of arrays by name (without objects). numpy is imported as `numpy`.
+    *words : str
         Arguments of the process.
     limits : ProcessLimits, optional
         Memory and time of the process; without limits by default.
-    arrays : arrays by name
-        Arrays that the code reads.
+    **arrays : array_like
+        Arrays that the code reads, by name; no objects.
+
+    Returns
+    -------
+    dict of arrays
+        The content of `found`. Output of the process is discarded.
 
     Raises
     ------
     Failed
-        If the process does not get to its end, or reaches a limit.
+        If the process ends with an error, is killed, or reaches a limit.
     """
     limit = (
         ""
@@ -154,7 +171,9 @@ def run_isolated(
 
 
 def killed_by(code: int) -> str:
-    """Return the signal that killed a process, from its exit code; "" if it ended by itself."""
+    """Return "its process was killed by SIGNAL" from the exit code of a process; "" if it ended by
+    itself (a code of 0 or more) or the signal is unknown.
+    """
     if code < 0:
         with contextlib.suppress(ValueError):
             return f"its process was killed by {signal.Signals(-code).name}"

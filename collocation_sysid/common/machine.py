@@ -15,11 +15,14 @@ CGROUP_LIMITS = (
 
 
 def machine_memory_mb() -> float | None:
-    """Memory that this process may have: the machine's, or what a container or limit leaves."""
+    """Return the memory that this process may have [MB]: the least of the machine's, a container's
+    and the process's limit; None if none is known.
+    """
     return min(_limits_mb(), default=None)
 
 
 def _limits_mb() -> Iterator[float]:
+    """Yield the limits of memory that are known on this system [MB]."""
     with suppress(AttributeError, OSError, ValueError):  # not on every system
         yield os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e6
     for file in CGROUP_LIMITS:

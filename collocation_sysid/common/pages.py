@@ -20,15 +20,19 @@ _LINK_TO_PAGE = re.compile(
 
 
 def documentation_folder() -> Path:
-    """Return the folder of the pages: that of the wheel, or docs/ in a checkout."""
+    """Return the folder with the pages: that of the wheel if it exists, otherwise docs/ of the
+    checkout, which need not exist.
+    """
     return _IN_WHEEL if _IN_WHEEL.is_dir() else _IN_CHECKOUT
 
 
 @cache
 def page_files() -> dict[str, Path]:
-    """Return the file of each page by its topic, which is the file's name, in alphabetical order.
+    """Return the file of each page by its topic, which is the file's name without its ending, in
+    alphabetical order; cached.
 
-    The dictionary is empty where neither a wheel nor a checkout is installed.
+    Pages for Sphinx alone (`_FOR_SPHINX`) are left out. The dictionary is empty where neither a
+    wheel nor a checkout is installed.
     """
     files = (
         *documentation_folder().glob("howto/*.md"),
@@ -46,18 +50,32 @@ def _topic(file: Path) -> str:
 
 
 def page_title(topic: str) -> str:
-    """Return the first heading of a page; `topic` is a key of `page_files`."""
+    """Return the first line of a page without the mark of a heading.
+
+    Raises
+    ------
+    KeyError
+        If `topic` is not a key of `page_files`.
+    """
     with page_files()[topic].open(encoding="utf-8") as page:
         return page.readline().removeprefix("# ").strip()
 
 
 def page_text(topic: str) -> str:
-    """Return a page as Markdown, with links to other pages replaced by their topics.
+    """Return a page as Markdown in which links that a terminal cannot follow are replaced.
+
+    A link to another page becomes its label (or that page's title) and "(`explain TOPIC`)"; a link
+    to the same page becomes its label; links to anything else stay.
 
     Parameters
     ----------
     topic : str
         A key of `page_files`.
+
+    Raises
+    ------
+    KeyError
+        If there is no such page.
     """
 
     def named(link: re.Match[str]) -> str:
@@ -72,14 +90,20 @@ def page_text(topic: str) -> str:
 
 
 def explain_command(*topics: str) -> str:
-    """Return the command that shows pages in a terminal."""
+    """Return the command that shows pages in a terminal: "collocation-sysid explain TOPIC …", for
+    any number of topics.
+    """
     return " ".join(("collocation-sysid explain", *topics))
 
 
 def page_url(topic: str) -> str | None:
-    """Return the address of a page on the web; None if the project states none.
+    """Return the address of a page on the web, below `documentation_url`; None if the project
+    states none.
 
-    The base is the address that `documentation_url` returns.
+    Raises
+    ------
+    KeyError
+        If `topic` is not a key of `page_files`.
     """
     base = documentation_url()
     if base is None:
@@ -93,10 +117,8 @@ def page_url(topic: str) -> str | None:
 
 
 def documentation_url() -> str | None:
-    """Return the address of the documentation without a final slash; None if the project states
-    none.
-
-    It is the address that `project.urls` of pyproject.toml calls "Documentation".
+    """Return the address that `project.urls` of the installed package calls "Documentation",
+    without a final slash; None if it states none or is not installed.
     """
     from importlib.metadata import PackageNotFoundError, metadata  # slow
 

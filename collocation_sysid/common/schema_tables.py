@@ -25,10 +25,11 @@ Unit = Literal["m", "cm", "mm", "in"]
 
 @dataclass(frozen=True)
 class ByForm:
-    """Annotation of a key with two alternative forms; values of the types `first` have the first
-    form.
-
-    A tag in <> distinguishes the forms in pydantic's error locations; messages omit it.
+    """Attributes
+    ----------
+    first : type or tuple of types
+        Python types of values that are validated as the first type of the annotated union; all
+        other values are validated as the second.
     """
 
     first: type | tuple[type, ...]
@@ -45,6 +46,7 @@ class ByForm:
         )
 
     def _tag(self, value: Any) -> str:
+        """Return the tag of the form that a value has."""
         return "<first>" if isinstance(value, self.first) else "<second>"
 
 
@@ -81,11 +83,16 @@ class Section(BaseModel):
 
 
 def declared_in(section: Section, kind: type, where: str) -> dict[str, Any]:
-    """Return the fields of a class that a table states, by name; tables in files are not read yet.
+    """Return the fields of a class that a table states, by field name, converted by the `read` of
+    their keys.
+
+    Keys that the table does not state (None) are left out, and so are keys that name a file with a
+    table (`Key.constant`).
 
     Parameters
     ----------
     section : Section
+        Table of a problem file; it has an attribute for each key.
     kind : type
         Class decorated with `declaration`.
     where : str
@@ -106,12 +113,16 @@ def declared_in(section: Section, kind: type, where: str) -> dict[str, Any]:
 
 
 def used_keys(section: Section, *names: str) -> list[str]:
-    """Return those of the keys that the file states."""
+    """Return those of `names` that the section states, in their order; a key is stated if its value
+    is not None.
+    """
     return [name for name in names if getattr(section, name) is not None]
 
 
 def require_one(section: Section, *names: str) -> None:
-    """Raise ValueError unless the section states exactly one of the keys."""
+    """Raise ValueError unless the section states exactly one of the keys `names`; a key is stated
+    if its value is not None.
+    """
     there = used_keys(section, *names)
     if len(there) != 1:
         which = " and ".join(there) or f"no {' or '.join(names)}"

@@ -2,8 +2,7 @@
 
 A dataclass becomes an object of its fields and of the properties listed in its class attribute
 ``SERIALISED_PROPERTIES``; arrays become lists. JSON has neither NaN nor infinity: null is written
-in their place,
-and is read as NaN where a number is expected.
+in their place, and is read as NaN where a number is expected.
 """
 
 from __future__ import annotations
@@ -31,14 +30,20 @@ T = TypeVar("T")
 
 
 def optional() -> Any:
-    """Return a dataclass field that is omitted from JSON if it is None; all other fields are
-    written.
+    """Return a dataclass field with the default None that is omitted from JSON if it is None; all
+    other fields are written, None as null.
     """
     return field(default=None, metadata={"optional": True})
 
 
 def content(value: Any) -> Any:
-    """Return a value as plain objects that `json` can write; NaN and infinity become None."""
+    """Return a value as plain objects that `json` can write.
+
+    Dataclasses and mappings become dictionaries (a dataclass with the properties in its
+    ``SERIALISED_PROPERTIES``, without `optional` fields that are None), arrays, lists and tuples
+    become lists, numpy scalars Python numbers, and enum members their values. NaN and infinity
+    become None. All other values, also unknown objects, are returned as they are.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         own = {f.name: getattr(value, f.name) for f in fields(value)}
         own |= {
@@ -67,40 +72,50 @@ def content(value: Any) -> Any:
 
 
 def as_json(value: Any) -> str:
-    """Return a result as JSON text, see `content`."""
+    """Return a result as JSON text with an indentation of one space, see `content`.
+
+    Raises
+    ------
+    TypeError
+        If the result contains an object that JSON cannot hold.
+    """
     return json.dumps(content(value), indent=1, allow_nan=False)
 
 
 def copy_fields(kind: type[T], of: Any, **others: Any) -> T:
-    """Return an instance of a dataclass with attributes copied by name from another object.
+    """Returns
+    -------
+    kind
+        A new object; values are not copied but shared with `of`.
 
-    Parameters
-    ----------
-    kind : type
-        Dataclass to be created.
-    of : object
-        Has an attribute for each field that is not in `others`.
-    **others
-        Fields that are not copied.
+    Raises
+    ------
+    AttributeError
+        If `of` lacks an attribute.
     """
     names = (f.name for f in fields(kind) if f.name not in others)  # type: ignore[arg-type]
     return kind(**{name: getattr(of, name) for name in names}, **others)
 
 
 def read(kind: Any, content: Any) -> Any:
-    """Return a value of a given type from parsed JSON.
+    """Return a value of a given type from parsed JSON, the inverse of `content`.
 
     Parameters
     ----------
     kind : type
-        A dataclass, or the annotation of a field: numbers, texts, tuples, mappings, arrays.
+        A dataclass, or the annotation of a field: float, int, bool, str, a Literal, a tuple, a
+        Sequence (read as a list), a mapping, an array (of floats, null as NaN), or one of these "or
+        None". Content for any other annotation is returned unchecked.
     content : object
-        Output of `json.load_object`; None is NaN where a number is expected.
+        Output of `json.load`; None is NaN where a float is expected. Entries that the dataclass
+        does not have are ignored; `optional` fields may be missing. Integers are accepted as
+        floats, but neither truth values as numbers nor floats as integers; an infinite number is
+        refused.
 
     Raises
     ------
     TypeError, KeyError, ValueError
-        If the content does not have that type.
+        If the content does not have that type, or a field is missing.
     """
     if is_dataclass(kind):
         hints = _hints(kind)
@@ -139,9 +154,11 @@ def read(kind: Any, content: Any) -> Any:
 
 
 def _is_optional(field: Field[Any]) -> bool:
+    """Return whether a field was declared by `optional`."""
     return "optional" in field.metadata
 
 
 @cache
 def _hints(kind: type) -> dict[str, Any]:
+    """Return the resolved annotations of a dataclass by field, cached."""
     return get_type_hints(kind)

@@ -19,7 +19,7 @@ from typing import NoReturn
 COMMAND = "collocation-sysid"
 # Name of a thread that is left in a library's code, which no signal reaches.
 ABANDONED_THREAD = "left behind"
-# File of the frames of an import, and how often a deferred signal tries again [s].
+# File of the frames of an import.
 IMPORTING = "<frozen importlib._bootstrap>"
 # Time after which a deferred signal tries again [s]: a person does not notice it.
 RETRY_S = 0.05
@@ -29,7 +29,8 @@ class Interrupts:
     """Handler of signals that raises `KeyboardInterrupt`, but not within imports and `deferred`.
 
     Libraries convert an exception within their imports into an error of their own. There the first
-    signal is deferred until the import has ended; a second one raises at once.
+    signal is deferred until the import (or the block) has ended: it is sent again every `RETRY_S`.
+    A second signal in this time raises at once.
     """
 
     def __init__(self) -> None:
@@ -38,7 +39,16 @@ class Interrupts:
         self._tries_again = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Raise `KeyboardInterrupt`, or defer the signal that interrupted this frame."""
+        """Raise `KeyboardInterrupt`, or defer the signal if `frame`, which it interrupted, is
+        within an import or a `deferred` block.
+
+        Parameters
+        ----------
+        number : int
+            Number of the signal.
+        frame : frame or None
+            Frame that was interrupted; None if there is none.
+        """
         is_second = self._timer is not None and not self._tries_again
         self._tries_again = False
         if not is_second and (self._deferring or _is_importing(frame)):
@@ -51,7 +61,7 @@ class Interrupts:
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """Defer the first signal beyond the end of the block."""
+        """Defer the first signal beyond the end of the block; blocks may be nested."""
         self._deferring += 1
         try:
             yield
@@ -59,12 +69,13 @@ class Interrupts:
             self._deferring -= 1
 
     def forget(self) -> None:
-        """Drop a signal that is deferred."""
+        """Drop a signal that is deferred; no effect without one."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None
 
     def _try_again(self, number: int) -> None:
+        """Send the signal `number` to the main thread once more, marked as a repetition."""
         self._tries_again = True
         if os.name == "posix":  # also wakes a main thread that waits
             signal.pthread_kill(threading.main_thread().ident or 0, number)
@@ -76,8 +87,8 @@ INTERRUPTS = Interrupts()
 
 
 def _end_quietly() -> None:
-    """Restore the default action of Ctrl-C, if this process is the command line and nothing else
-    was set.
+    """Restore the default action of Ctrl-C (the process ends without a traceback), if this process
+    is the command line and the handler is Python's own; otherwise change nothing.
     """
     handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     command = os.path.splitext(os.path.basename(sys.argv[0]))[0]
@@ -86,43 +97,45 @@ def _end_quietly() -> None:
 
 
 def heed_interrupts() -> Callable[[], None]:
-    """Let Ctrl-C and SIGTERM raise `KeyboardInterrupt` as `Interrupts` does, unless ignored.
+    """Let Ctrl-C and SIGTERM raise `KeyboardInterrupt` as `Interrupts` does.
+
+    A signal that is ignored or that has a handler of its own keeps it; outside of the main thread
+    nothing is changed.
 
     Returns
     -------
     callable
-        Function that restores the previous signal handlers.
+        Function without arguments that restores the previous handlers and drops a deferred signal.
     """
-    signal_numbers = (
-        (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
-    )
-    usual = (signal.SIG_DFL, signal.default_int_handler)
-    before = {
-        n: handler
-        for n in signal_numbers
-        if (handler := signal.getsignal(n)) in usual
-    }
-    for number in before:
-        signal.signal(number, INTERRUPTS)
+    default_handlers = (signal.SIG_DFL, signal.default_int_handler)
+    previous = {}
+    if _in_main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            handler = signal.getsignal(number)
+            if handler in default_handlers:
+                previous[number] = handler
+                signal.signal(number, INTERRUPTS)
 
     def restore() -> None:
         INTERRUPTS.forget()
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
     return restore
 
 
 def raises_interrupt(handler: object) -> bool:
-    """Return whether a handler of signals raises `KeyboardInterrupt`."""
+    """Return whether a handler of signals is one that raises `KeyboardInterrupt`: Python's own or
+    `INTERRUPTS`.
+    """
     return handler is signal.default_int_handler or handler is INTERRUPTS
 
 
 def leave(code: object) -> NoReturn:
-    """End the process with an exit code.
+    """End the process with an exit code: `code` if it is an integer, else 1 (also for None).
 
-    If a thread is still inside library code that would crash at exit, streams are flushed and the
-    process ends without cleaning up.
+    If a thread with the name `ABANDONED_THREAD` is still inside library code that would crash at
+    exit, streams are flushed and the process ends without cleaning up; otherwise by `SystemExit`.
     """
     if not any(
         thread.name == ABANDONED_THREAD for thread in threading.enumerate()
@@ -144,6 +157,7 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 
 def _in_main_thread() -> bool:
+    """Return whether this is the main thread, the only one that may set handlers."""
     return threading.current_thread() is threading.main_thread()
 
 

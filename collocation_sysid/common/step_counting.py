@@ -59,7 +59,15 @@ _phase: ContextVar[_Phase | None] = ContextVar("phase", default=None)
 
 @contextmanager
 def listen_to_shares(listener: ShareListener) -> Iterator[None]:
-    """Call `listener`, a `ShareListener`, with the completed share of each phase in the block."""
+    """Call `listener` with the completed share of each phase that is counted in the block; the
+    previous listener returns afterwards.
+
+    Parameters
+    ----------
+    listener : ShareListener
+        Called in the thread that completes steps: with 0 when a phase begins, with a share of at
+        most 1 at each report, and with None when it ends, also by an exception.
+    """
     token = _listener.set(listener)
     try:
         yield
@@ -86,18 +94,20 @@ def report_state(describe: Callable[[], str]) -> None:
 
 @contextmanager
 def counted_phase(unit: StepUnit, total: int) -> Iterator[None]:
-    """Count the steps that are completed within the block.
+    """Count the steps that are completed within the block, and report their share to the listener.
 
     Parameters
     ----------
     unit : StepUnit
-        Unit of the steps.
+        Unit of the steps; only `complete_steps` of this unit counts.
     total : int
-        Expected number of steps. Where more are completed, the share stays 1.
+        Expected number of steps. Where more are completed, the share stays 1; if it is 0, no step
+        is reported.
 
     Notes
     -----
-    Within another phase the block has no effect: its share is that of the outer phase.
+    Within another phase the block has no effect, whatever its unit: the share is that of the outer
+    phase.
     """
     if _phase.get() is not None:
         yield
@@ -112,7 +122,9 @@ def counted_phase(unit: StepUnit, total: int) -> Iterator[None]:
 
 
 def complete_steps(unit: StepUnit, count: float = 1) -> None:
-    """Report that `count` steps were completed; no effect outside of a phase of this unit."""
+    """Report that `count` further steps are completed; no effect
+    outside of a phase of this unit.
+    """
     phase = _phase.get()
     if phase is None or phase.unit is not unit or phase.total <= 0:
         return
@@ -121,6 +133,7 @@ def complete_steps(unit: StepUnit, count: float = 1) -> None:
 
 
 def _report(share: float | None) -> None:
+    """Call the listener, if there is one, with the share of the phase (None at its end)."""
     listener = _listener.get()
     if listener is not None:
         listener(share)

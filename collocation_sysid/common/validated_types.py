@@ -16,13 +16,20 @@ from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from ..errors import InputError, hint_at
 
-# Magnitudes of meaningful input; their squares are still finite, nonzero floating-point numbers.
+# Smallest magnitude of meaningful input; its square is still a nonzero floating-point number.
 SMALLEST = 1e-100
-# Largest magnitude.
+# Largest magnitude of meaningful input; its square is still finite.
 LARGEST = 1e100
 
 
 def _of_usual_size(value: float) -> float:
+    """Return the value if it is zero or its magnitude lies between `SMALLEST` and `LARGEST`.
+
+    Raises
+    ------
+    ValueError
+        If it does not.
+    """
     if value and not SMALLEST <= abs(value) <= LARGEST:
         sizes = f"zero, or a size from {SMALLEST:g} to {LARGEST:g}"
         raise ValueError(f"found {value:g}; expected {sizes}")
@@ -67,12 +74,13 @@ _EXPECTED = {
 
 
 def expected(fault: Mapping[str, Any]) -> str:
-    """Return what was expected in place of an invalid value, for an error message.
+    """Return what was expected in place of an invalid value, for an error message ("expected …").
 
     Parameters
     ----------
     fault : mapping
-        One entry of pydantic's `ValidationError.errors()`.
+        One entry of pydantic's `ValidationError.errors()`. Of the message of a ValueError raised by
+        a validator, the part after "expected " is returned ("" if there is none).
     """
     if fault["type"] == "value_error":
         return str(fault["ctx"]["error"]).partition("expected ")[2]
@@ -86,10 +94,21 @@ class Options:
     """Base class of methods and option groups: frozen dataclasses that check the types of their
     fields.
 
+    On construction each field is validated against its annotation without conversion of types, and
+    replaced by the validated value. Subclasses must be decorated with ``@dataclass(frozen=True)``.
+
+    Attributes
+    ----------
+    name : str
+        Name of the method, set by the subclass.
+    needs_complete_start : bool
+        Whether a method can only start from parameters with which everything can be simulated.
+
     Raises
     ------
     InputError
-        On construction, if a value does not have the type of its field.
+        On construction, if a value does not have the type of its field; its location is the name of
+        the field.
     """
 
     name: ClassVar[str]
@@ -109,6 +128,7 @@ class Options:
 
 @cache
 def _adapters(kind: type[Options]) -> dict[str, TypeAdapter[Any]]:
+    """Return the validator of each field by name, cached."""
     types = get_type_hints(kind, include_extras=True)
     return {
         field.name: TypeAdapter(types[field.name]) for field in fields(kind)
@@ -116,7 +136,18 @@ def _adapters(kind: type[Options]) -> dict[str, TypeAdapter[Any]]:
 
 
 def _refusal(name: str, value: Any, fault: Mapping[str, Any]) -> InputError:
-    """Return the error for an invalid value; it names the entry if the value is a table."""
+    """Return the error for an invalid value of the field `name`, whose location it is; it names the
+    entry if the value is a table.
+
+    Parameters
+    ----------
+    name : str
+        Name of the field.
+    value : object
+        Its value.
+    fault : mapping
+        One entry of pydantic's `ValidationError.errors()`.
+    """
     for part in fault["loc"]:
         if isinstance(value, Mapping) and part in value:
             name = f"{name}.{part}"

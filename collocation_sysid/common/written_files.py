@@ -24,12 +24,15 @@ IGNORED_NAME = re.compile(
 
 
 def list_files(folder: Path) -> None:
-    """Write the list of all files that are in a folder now; those of folders with a list are in it.
+    """Write the list of all files below a folder, with their hashes, as `LIST_FILE` into it.
+
+    Files in subfolders that have a list of their own are left to that list; an existing list of the
+    folder is overwritten. Drafts (`IGNORED_NAME`) and the lists themselves are not listed.
 
     Parameters
     ----------
     folder : Path
-        Every file in it was written by this program.
+        Existing folder; every file in it must have been written by this program.
     """
     hashes = {
         file.relative_to(folder).as_posix(): _hash(file)
@@ -40,13 +43,15 @@ def list_files(folder: Path) -> None:
 
 
 def add_to_list(file: Path, content: Path) -> None:
-    """Add a file to the list of its folder, if that has one.
+    """Enter a file with its present hash in the list of its folder; no effect if the folder has no
+    list (or a link in its place), or for the list itself.
 
     Parameters
     ----------
     file : Path
+        The file under its final name, which need not exist yet.
     content : Path
-        Where its content is now.
+        File with its content now, for example a draft.
     """
     listing = file.parent / LIST_FILE
     if file != listing and listing.is_file() and not listing.is_symlink():
@@ -63,19 +68,21 @@ def add_to_list(file: Path, content: Path) -> None:
 
 
 def hashes_of(contents: Mapping[str, Path]) -> dict[str, str]:
-    """Hashes by name of files whose content is at a path."""
+    """Return the SHA-256 hashes of files by name, from the paths of their contents by name."""
     return {name: _hash(content) for name, content in contents.items()}
 
 
 def list_as_text(hashes: Mapping[str, str]) -> str:
-    """Return the content of a list file from hashes by name."""
+    """Return the content of a list file (JSON, names in alphabetical order) from hashes by name."""
     return (
         json.dumps({"written": dict(sorted(hashes.items()))}, indent=1) + "\n"
     )
 
 
 def listed_hashes(folder: Path) -> dict[str, str]:
-    """Hashes by relative path of the files that are listed; none where there is no valid list."""
+    """Return the SHA-256 hashes of the listed files by path relative to the folder; an empty
+    dictionary if there is no valid list.
+    """
     try:
         content: Any = json.loads(
             (folder / LIST_FILE).read_text(encoding="utf-8")
@@ -95,13 +102,15 @@ def listed_hashes(folder: Path) -> dict[str, str]:
 
 
 def is_written_here(file: Path, folder: Path | None = None) -> bool:
-    """Whether a regular file is on the list of its folder, and as it was written.
+    """Return whether a regular file is on the list of its folder, with the content that was listed;
+    false for links and missing files.
 
     Parameters
     ----------
     file : Path
+        The file.
     folder : Path, optional
-        The folder with the list; that of the file by default.
+        The folder with the list, at or above the file; the file's own folder by default.
     """
     folder = folder or file.parent
     if file.is_symlink() or not file.is_file():
@@ -111,10 +120,11 @@ def is_written_here(file: Path, folder: Path | None = None) -> bool:
 
 
 def foreign_files(folder: Path) -> Iterator[Path]:
-    """Yield files and links below a folder that are not on its list, or were changed since.
+    """Yield, in the order of their names, files and links below a folder that are not on its list,
+    or were changed since; all files if it has no list.
 
     Links are not followed. A list in a subfolder, such as that of an export in a run folder, is
-    valid for the files of that subfolder.
+    valid for the files of that subfolder. Lists and drafts (`IGNORED_NAME`) are not yielded.
     """
     lists: dict[Path, dict[str, str]] = {}
     for file in _files(folder):
@@ -132,7 +142,9 @@ def foreign_files(folder: Path) -> Iterator[Path]:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """Everything below a folder that is no folder, in order; links are not followed."""
+    """Yield everything below a folder except folders, lists and ignored names, by name; links are
+    yielded, not followed.
+    """
     for entry in sorted(os.scandir(folder), key=lambda each: each.name):
         path = folder / entry.name
         if entry.is_dir(follow_symlinks=False):
@@ -144,7 +156,9 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _home(file: Path, folder: Path) -> Path:
-    """The nearest folder above a file, up to `folder`, that has a list; else `folder`."""
+    """Return the nearest folder above a file that has a list, not above `folder`; `folder` if there
+    is none.
+    """
     for parent in file.parents:
         if parent == folder or (parent / LIST_FILE).is_file():
             return parent
@@ -152,5 +166,6 @@ def _home(file: Path, folder: Path) -> Path:
 
 
 def _hash(file: Path) -> str:
+    """Return the SHA-256 hash of a file's content as hexadecimal digits."""
     with file.open("rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()

@@ -53,6 +53,10 @@ from .markers.marker_association import MarkerAssociation
 from .shared_nuisances import nuisance_indices, shared_charts
 from .transcription import RowWeights, SegmentOffsets, Transcription
 
+# Distance of a parameter from its bound, in units of z, at which it counts as at the bound: more
+# than the distance at which interior-point methods stop.
+BOUND_TOLERANCE = 1e-6
+
 
 def convert_variables(
     z: Array, source: Collocation, target: Collocation
@@ -71,8 +75,9 @@ def convert_variables(
 
     Returns
     -------
-    (to.variables,) array
-        Variables; lifted ones follow from positions and parameters.
+    (target.variable_count,) array
+        Variables of `target`, z itself if both have the same number. Lifted variables of the target
+        follow from positions and parameters; those of the source are dropped.
     """
     return (
         z if len(z) == target.variable_count else target.pack(*source.unpack(z))
@@ -218,8 +223,10 @@ class Collocation:
         )
 
     def with_lifted_variables(self) -> Collocation:
-        """Return the program with lifted variables, or self if it has them already or
-        nothing can be lifted.
+        """Return the program with lifted variables, or self if it has them already or nothing can
+        be lifted.
+
+        The transcriptions are shared with the copy.
         """
         has_sensors = any(len(s.sensed_dofs) for s in self.transcriptions)
         has_complementarity = any(
@@ -240,7 +247,7 @@ class Collocation:
 
     @property
     def nphi(self) -> int:
-        """Number of nuisance parameters φ of all experiments; shared ones count once."""
+        """Number of nuisance parameters φ of all fitted experiments; shared ones count once."""
         return (
             int(np.concatenate(self.parameter_indices).max(initial=self.nq - 1))
             + 1
@@ -249,16 +256,17 @@ class Collocation:
 
     @property
     def variable_count(self) -> int:
-        """Number of variables z."""
+        """Number of variables z, including lifted ones."""
         return self.phi_columns.stop + self.lifted_count()
 
     @property
     def constraint_count(self) -> int:
-        """Number of constraints g."""
+        """Number of constraints g, including the equations of lifted variables."""
         return self.transcriptions[-1].next_offsets.row + self.lifted_count()
 
     def lifted_count(self, kind: str | None = None) -> int:
-        """Return the number of lifted variables, which is also that of their equations.
+        """Return the number of lifted variables, which is also that of their equations; 0 unless
+        `has_lifted_variables`.
 
         Parameters
         ----------
@@ -271,13 +279,15 @@ class Collocation:
 
     @property
     def lifted_nonzeros(self) -> tuple[int, int]:
-        """Numbers of entries of lifted variables in the Jacobian and in the Hessian."""
+        """Numbers of additional entries due to lifted variables in the Jacobian, and in the upper
+        triangle of the Hessian.
+        """
         both = [each.entry_counts for each in self.lifted]
         return sum(each for each, _ in both), sum(each for _, each in both)
 
     @property
     def measurement_count(self) -> int:
-        """Number of scalar measurements that are compared."""
+        """Number of scalar measurements that are compared, of all fitted experiments."""
         return sum(
             int(reading.is_compared.sum())
             for segment in self.transcriptions
@@ -286,7 +296,9 @@ class Collocation:
 
     @property
     def loss_scale(self) -> float:
-        """Factor of the loss in the objective: one over the number of measurements."""
+        """Factor of the loss in the objective: one over the number of measurements, or 1 without
+        any.
+        """
         return 1.0 / max(1, self.measurement_count)
 
     def pack(self, p: Array, positions: Sequence[Array]) -> Array:
@@ -324,8 +336,8 @@ class Collocation:
         return np.concatenate([p[: self.nq], *scaled, p[self.nq :]])
 
     def unpack(self, z: Array) -> tuple[Array, list[Array]]:
-        """Return the parameters p (nq + nphi,) and the positions (N, 3n) of each experiment
-        [m] from z.
+        """Return the parameters p (nq + nphi,) and the positions (N, 3n) of each fitted experiment
+        [m] from z; lifted variables are ignored.
         """
         return self.parameters_from(z), [
             z[segment.columns].reshape(segment.grid_times, segment.dof_count)
@@ -344,7 +356,7 @@ class Collocation:
         return slice(first, first + self.nphi)
 
     def iterates(self, z: Array) -> list[ExperimentIterate]:
-        """Return every experiment at the variables z, with lifted variables taken from z."""
+        """Return every fitted experiment at the variables z, with lifted variables taken from z."""
         parts = self.iterates_at(*self.unpack(z))
         for each in self.lifted:
             parts[each.segment_index] = each.with_lifted(
@@ -354,21 +366,26 @@ class Collocation:
 
     @cached_property
     def parameter_indices(self) -> list[Index]:
-        """Indices of (q, φ) of each experiment in p."""
+        """Indices (nq + k,) of (q, φ) of each experiment in p."""
         return [segment.parameter_indices for segment in self.transcriptions]
 
     @property
     def threads(self) -> int:
-        """Number of threads that all bodies may use."""
+        """Number of threads that every body may use: the least of the bodies' numbers."""
         return min(segment.body.threads for segment in self.transcriptions)
 
     def iterates_at(
         self, p: Array, positions: Sequence[Array]
     ) -> list[ExperimentIterate]:
-        """Return every experiment at parameters p (nq + nphi,) and positions (N, 3n) [m], or their
-        first rows.
+        """Return every fitted experiment at parameters and positions, from which lifted quantities
+        follow.
 
-        Lifted quantities follow from positions and parameters.
+        Parameters
+        ----------
+        p : (nq + nphi,) array
+            Parameters (q, φ_1, φ_2, …).
+        positions : sequence of (N, 3n) arrays
+            Positions of each fitted experiment [m], or their first rows.
         """
         return [
             ExperimentIterate(
@@ -383,7 +400,7 @@ class Collocation:
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Name of each entry of p: the parameters' names, then the labels of the nuisance
-        parameters.
+        parameters; of a shared one, the label in the last experiment that has it.
         """
         names = [item.name for item in self.parameters.free] + [""] * self.nphi
         for segment in self.transcriptions:
@@ -396,10 +413,11 @@ class Collocation:
         return tuple(names)
 
     def prior_residuals(self, p: Array) -> tuple[Array, Array]:
-        """Return residuals (nq + nphi,) of the priors at p and their derivatives, both in standard
-        deviations.
+        """Return residuals (nq + nphi,) of the priors at p, and the derivative (nq + nphi,) of each
+        by its own parameter, both in standard deviations.
 
-        A parameter without a prior has the residual 0.
+        A parameter without a prior has the residual and the derivative 0; φ is measured in standard
+        deviations already.
         """
         residuals, slopes = self.parameters.prior_residuals(p[: self.nq])
         return (
@@ -409,7 +427,9 @@ class Collocation:
 
     @property
     def parameter_bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of p, (nq + nphi,) each; infinite for most φ."""
+        """Lower and upper bounds of p, (nq + nphi,) each; infinite for most φ. For a shared φ, the
+        narrowest of all experiments.
+        """
         lower, upper = self.parameters.bounds_q
         low, high = (np.full(self.nphi, bound) for bound in (-np.inf, np.inf))
         for segment in self.transcriptions:
@@ -426,12 +446,13 @@ class Collocation:
     def follow_estimates(
         self, p: Array, positions: Sequence[Array] = ()
     ) -> tuple[Collocation, Array]:
-        """Update the associations where the estimates p have left them.
+        """Return the program with associations that belong to the estimates p, and p relative to
+        them; see `Transcription.follow_estimates`.
 
         Parameters
         ----------
         p : (nq + nphi,) array
-            Parameters.
+            Parameters; not modified.
         positions : sequence of (rows, 3n) arrays
             First rows of each experiment [m], which depth cameras need; empty without depth
             cameras.
@@ -461,20 +482,21 @@ class Collocation:
     def place_unknown_markers(
         self, p: Array, positions: Sequence[Array]
     ) -> tuple[Collocation, Array]:
-        """Initialise unknown marker places and depth cameras before a solve, see
-        `Transcription.place_unknown_markers`.
+        """Return the program with unknown marker places and depth cameras initialised before a
+        solve, and p in it; see `Transcription.place_unknown_markers`.
 
         Parameters
         ----------
         p : (nq + nphi,) array
-            Parameters.
+            Parameters; not modified.
         positions : sequence of (rows, 3n) arrays
             First rows of each experiment [m].
 
         Returns
         -------
         (Collocation, array)
-            The program with the new associations, which is self if all is stated, and p in it.
+            The program with the new associations, and p in it; self and p if no experiment has
+            unknown places or depth cameras.
         """
         if not any(segment.rows_to_place for segment in self.transcriptions):
             return self, p
@@ -487,8 +509,8 @@ class Collocation:
         )
 
     def with_marker_places(self, places_m: Sequence[Array]) -> Collocation:
-        """Return the program with associations about given marker places (M, 3) [m] for each
-        experiment.
+        """Return the program with associations centred at given marker places, one array (M, 3) [m]
+        on the undeformed body for each fitted experiment.
         """
         charts = [
             s.association.centred_at(m)
@@ -508,8 +530,11 @@ class Collocation:
         p: Array,
         phis: Sequence[Array],
     ) -> tuple[Collocation, Array]:
-        """Return the program with another association of each experiment, and p (nq + nphi,) with
-        the φ of each experiment in `phis`, which refer to these associations.
+        """Return the program with another association of each fitted experiment, and p (nq + nphi,)
+        with the φ of each experiment in `phis`, which refer to these associations.
+
+        Of shared entries, the association and the φ of the first experiment are used. Values that
+        depend on associations are computed anew.
         """
         other = copy(self)
         updated = self._combine_parameters(p[: self.nq], phis)
@@ -528,8 +553,8 @@ class Collocation:
         )
 
     def _combine_parameters(self, q: Array, phis: Sequence[Array]) -> Array:
-        """Return p (nq + nphi,) from q (nq,) and the φ of each experiment; shared entries are those
-        of the first experiment.
+        """Return p (nq + nphi,) from q (nq,) and the φ (k,) of each fitted experiment; of shared
+        entries, the value in the first experiment.
         """
         p = np.concatenate([q, np.zeros(self.nphi)])
         for segment, phi in reversed(
@@ -540,14 +565,18 @@ class Collocation:
 
     @property
     def reach_p(self) -> Array:
-        """Scale of p: the change of each entry that a trust region of radius one allows."""
+        """Scale (nq + nphi,) of p: the change of each entry that a trust region of radius one
+        allows, which is one for q.
+        """
         return self._combine_parameters(
             np.ones(self.nq),
             [s.nuisance.step_limits for s in self.transcriptions],
         )
 
     def bounds(self) -> tuple[Array, Array]:
-        """Return lower and upper bounds of z; equal where a value is prescribed."""
+        """Return lower and upper bounds of z, (variables,) each;
+        equal where a value is prescribed.
+        """
         lower, upper = self.parameter_bounds
         lows, highs = zip(
             *(segment.bounds() for segment in self.transcriptions), strict=True
@@ -566,13 +595,17 @@ class Collocation:
     # Objective --------------------------------------------------------------------------------
 
     def objective(self, z: Array) -> float:
-        """Return the objective at z: loss and priors, divided by the number of measurements."""
+        """Return the objective at z: loss and priors, divided by the number of measurements;
+        constraints do not contribute.
+        """
         residuals, _ = self.prior_residuals(self.parameters_from(z))
         loss = sum(part.loss for part in self.iterates(z))
         return self.loss_scale * float(residuals @ residuals + loss)
 
     def gradient(self, z: Array) -> Array:
-        """Return the gradient (variables,) of the objective by z."""
+        """Return the gradient (variables,) of the objective by z, at constant values of all other
+        variables.
+        """
         parts = self.iterates(z)
         residuals, slopes = self.prior_residuals(self.parameters_from(z))
         by_p = 2 * residuals * slopes
@@ -636,32 +669,34 @@ class Collocation:
         return SparseAssembly.from_groups(
             structure,
             (self.constraint_count, self.variable_count),
-            of_phi + further,
+            groups=of_phi + further,
         )
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
-        """Return the values of ∂g/∂z in the order of `jacobian_structure`.
+        """Return the values of ∂g/∂z in the order of `jacobian_structure`; history variables that
+        are eliminated are treated as constant.
 
         Parameters
         ----------
         z : (variables,) array
             Variables.
         out : array, optional
-            Overwritten with the result and returned.
+            Overwritten with the result and returned; a new array by default.
         """
         return self.constraints_and_jacobian(z, out)[1]
 
     def constraints_and_jacobian(
         self, z: Array, out: Array | None = None
     ) -> tuple[Array, Array]:
-        """Return constraints g and the values of ∂g/∂z, from one evaluation of the elements.
+        """Return constraints g (constraints,) and the values of ∂g/∂z, see `jacobian_values`, from
+        one evaluation of the elements.
 
         Parameters
         ----------
         z : (variables,) array
             Variables.
         out : array, optional
-            Overwritten with the values of ∂g/∂z.
+            Overwritten with the values of ∂g/∂z and returned; a new array by default.
         """
         parts = self.iterates(z)
         height = self.transcriptions[-1].next_offsets.row
@@ -695,8 +730,8 @@ class Collocation:
         ), values
 
     def jacobian(self, z: Array) -> sp.csc_array:
-        """Return ∂g/∂z as a sparse matrix; history variables that are eliminated are
-        treated as constant.
+        """Return ∂g/∂z (constraints, variables) as a sparse matrix; history variables that are
+        eliminated are treated as constant.
         """
         indptr, indices = self.jacobian_structure
         shape = (self.constraint_count, self.variable_count)
@@ -714,8 +749,8 @@ class Collocation:
         )
 
     def jacobian_vjp(self, z: Array, multipliers: Array) -> Array:
-        """Return the vector–Jacobian product (∂g/∂z)ᵀ multipliers (variables,), including the
-        dependence through eliminated history variables.
+        """Return the vector–Jacobian product (∂g/∂z)ᵀ multipliers (variables,) at z, for
+        multipliers (constraints,), including the dependence through eliminated history variables.
         """
         slope = self.jacobian(z).T @ multipliers
         for part in self.iterates(z) if self.has_eliminated_histories else ():
@@ -723,7 +758,9 @@ class Collocation:
             weights = segment.lagrangian_weights(
                 multipliers[segment.rows]
             ).forces
-            by_x, by_p = segment.history_vjp(part.x, part.equations, weights)
+            by_x, by_p = segment.history_vjp(
+                part.x, part.equations, weights=weights
+            )
             slope[segment.columns] += segment.length_m * by_x.ravel()
             slope[segment.dynamic_columns(self.phi_columns.start)] += by_p
         return slope
@@ -760,12 +797,16 @@ class Collocation:
         further += [each.hessian_entries() for each in self.lifted]
         structure = np.concatenate(indptr), np.concatenate(indices)
         return SparseAssembly.from_groups(
-            structure, (self.variable_count, self.variable_count), further
+            structure,
+            (self.variable_count, self.variable_count),
+            groups=further,
         )
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
-        """Positions of the diagonal entries of q, and of x, in the values of the Hessian."""
+        """Positions of the diagonal entries of q (nq,), and of x of all experiments, in the values
+        of the Hessian.
+        """
         of_q = np.cumsum(np.arange(1, self.nq + 1)) - 1
         of_x = []
         used = self.nq * (self.nq + 1) // 2
@@ -865,19 +906,26 @@ class Collocation:
 
     def kkt_residual(self, z: Array, multipliers: Array) -> float:
         """Return the largest violation of the first-order optimality conditions at z, in the
-        scaling of the program.
+        scaling of the program: the maximum norm of both conditions.
 
         The conditions are stationarity of objective + multipliers · g in every variable that is not
-        prescribed (at a bound, the gradient may point outwards), and feasibility.
+        prescribed, and feasibility. A parameter closer than 1e-6 to its bound may have a gradient
+        that points outwards; bounds of other variables are not considered.
+
+        Parameters
+        ----------
+        z : (variables,) array
+            Variables.
+        multipliers : (constraints,) array
+            Multipliers of g.
         """
         rows = self.constraint_values(z)
         slope = self.gradient(z) + self.jacobian_vjp(z, multipliers)
         lower, upper = self.bounds()
         slope[lower == upper] = 0
-        tolerance = 1e-6
         for part in (slice(self.nq), self.phi_columns):
-            at_lower = (z - lower)[part] < tolerance
-            at_upper = (upper - z)[part] < tolerance
+            at_lower = (z - lower)[part] < BOUND_TOLERANCE
+            at_upper = (upper - z)[part] < BOUND_TOLERANCE
             slope[part][at_lower] = np.minimum(slope[part][at_lower], 0)
             slope[part][at_upper] = np.maximum(slope[part][at_upper], 0)
         return float(
@@ -890,7 +938,7 @@ class Collocation:
         """Return ∇²_z (loss_weight · objective + multipliers · g), both triangles, as a sparse
         matrix.
 
-        `multipliers` is None for the Gauss–Newton matrix, see `hessian_values`.
+        Arguments as in `hessian_values`; `multipliers` is None for the Gauss–Newton matrix.
         """
         indptr, indices = self.hessian_structure
         values = self.hessian_values(z, loss_weight, multipliers)
@@ -900,12 +948,16 @@ class Collocation:
     # Reading a point --------------------------------------------------------------------------
 
     def residuals_n(self, z: Array) -> list[Array]:
-        """Return the residuals of the equations of motion (N, free dofs) of each experiment [N]."""
+        """Return the residuals of the equations of motion (N, free dofs) of each fitted experiment
+        [N], zero while a grasp prescribes the dof.
+        """
         return [part.residual_n for part in self.iterates(z)]
 
     def largest_force_n(self, z: Array) -> float:
-        """Return the largest force on a dof [N] at z, internal or external and without inertia, as
-        a scale for violations.
+        """Return the largest magnitude of a force on a dof [N] at z, as a scale for violations.
+
+        Internal and external forces are compared separately, without inertia, at all dofs including
+        grasped ones.
         """
         largest = 0.0
         for part in self.iterates(z):
@@ -918,8 +970,8 @@ class Collocation:
         return largest
 
     def largest_violations(self, z: Array, count: int = 5) -> list[Violation]:
-        """Return the `count` largest residuals of the equations of motion at z, of all experiments,
-        in descending order.
+        """Return the `count` residuals of the equations of motion at z with the largest magnitudes,
+        of all experiments together, in descending order; fewer if there are fewer.
         """
         violations = []
         for part in self.iterates(z):
@@ -944,8 +996,8 @@ class Collocation:
         )[:count]
 
     def rms_marker_distance_m(self, z: Array) -> float:
-        """Return the root mean square distance of the markers from their measurements [m];
-        0 without markers.
+        """Return the root mean square distance of the markers from their measurements [m], over all
+        samples of all experiments; 0 without markers.
         """
         squares = samples = 0.0
         for part in self.iterates(z):
@@ -957,15 +1009,17 @@ class Collocation:
         return float(np.sqrt(squares / max(1.0, samples)))
 
     def parameter_values(self, z: Array) -> dict[str, float]:
-        """Return the shared parameters of z by the user's names, in SI units."""
+        """Return the shared parameters q of z by the user's names,
+        as physical values in SI units.
+        """
         return self.parameters.values(z[: self.nq])
 
 
 def _with_shared_associations(
     transcriptions: Sequence[Transcription], charts: Sequence[MarkerAssociation]
 ) -> tuple[Transcription, ...]:
-    """Return the transcriptions with the given associations, made equal where nuisance parameters
-    are shared.
+    """Return the transcriptions with the given associations, in which places and clocks of shared
+    nuisance parameters are those of the first experiment that shares them.
     """
     parts = zip(transcriptions, charts, strict=True)
     same = shared_charts(

@@ -75,12 +75,14 @@ class CustomSensorResidual(MeasurementResidual):
     ) -> CustomSensorResidual:
         """Build the measurement model of a custom sensor.
 
+        Its numbers are padded with NaN to groups of three, and all have the sensor's σ.
+
         Parameters
         ----------
         sensor : Gauge
             The user's sensor with its samples.
         number : int
-            Index of the sensor in the experiment.
+            Index of the sensor in the experiment, from 0.
         observable : Channel
             Observable.
         at_s : (n,) array
@@ -121,17 +123,25 @@ class CustomSensorResidual(MeasurementResidual):
         )
 
     def with_samples(
-        self, known_s: Array, t_s: Array, indices: Array, **changes: Any
+        self, known_s: Array, t_s: Array, measurements: Array, **changes: Any
     ) -> CustomSensorResidual:
-        """Return the model of other samples, see `MeasurementResidual.with_samples`."""
+        """Return the model of other samples, whose observable is known at `known_s`; arguments as
+        in `MeasurementResidual.with_samples`.
+        """
         return super().with_samples(
-            known_s, t_s, indices, observable_s=known_s, **changes
+            known_s,
+            t_s,
+            measurements=measurements,
+            observable_s=known_s,
+            **changes,
         )
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all samples: indices of the neighbouring times, and the data of the
-        expression.
+        """Stencil of all samples.
+
+        Its data are the distances of the neighbouring times from the sample, and the time of the
+        sample [s]. A sample beyond the known times uses the nearest ones.
         """
         used = min(
             STATIC_NEIGHBOURS if self.is_static else NEIGHBOURS,
@@ -173,7 +183,7 @@ class CustomSensorResidual(MeasurementResidual):
         )
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the user's expression (m',), padded with zeros to a multiple of three numbers.
+        """Return the user's expression (m,), padded with zeros to a multiple of three numbers.
 
         Parameters
         ----------
@@ -206,13 +216,14 @@ class CustomSensorResidual(MeasurementResidual):
 
     @cached_property
     def observable_sigmas(self) -> Array:
-        """Standard deviations (3 e,) of the observable as one sample determines it, from the
-        derivatives at zero; infinite where the readings do not depend on an entry.
+        """Standard deviations (3 e,) of the observable's components as one sample determines them,
+        from the derivatives at zero values, averaged over the compared numbers; infinite where the
+        readings do not depend on a component.
         """
         nothing = np.zeros(
             (self.observable.count, self.observable.vector_count, GROUP)
         )
-        _, _, by_u = self._evaluate(nothing, np.zeros(self.nuisance.size))
+        by_u = self._evaluate(nothing, np.zeros(self.nuisance.size)).by_inputs
         by_observables = np.nan_to_num(
             by_u[..., : by_u.shape[3] - self.own_parameters.shape[1]]
         )
@@ -224,8 +235,8 @@ class CustomSensorResidual(MeasurementResidual):
             return 1 / np.sqrt(squares)
 
     def predict_motion(self, motion: ObservedMotion, phi: Array) -> Array:
-        """Return predictions (S, G, 3) for a motion at the observable's times, at φ; NaN for
-        samples outside these times.
+        """Return predictions (S, G, 3) for a motion over all times of the observable, at φ (k,);
+        NaN for samples outside these times.
         """
         predicted = self.predict(self.observable.evaluate(motion, phi), phi)
         return np.where(
@@ -235,15 +246,17 @@ class CustomSensorResidual(MeasurementResidual):
         )
 
     def without_padding(self, predicted_m: Array) -> Array:
-        """Return the m numbers (S, m) of the sensor from predictions (S, G, 3)."""
+        """Return the m numbers (S, m) of the sensor from predictions (S, G, 3), in the unit of the
+        sensor.
+        """
         return predicted_m.reshape(len(predicted_m), -1)[
             :, : self.sensor.measured_values.shape[1]
         ]
 
 
 def _is_within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
-    """Return the mask (S,) of samples at times (S,) within the range of ascending times `at_s`; all
-    false if there are no times.
+    """Return the mask (S,) of samples at times `t_s` (S,) within the range of ascending times
+    `at_s`, ends included with `TIME_TOLERANCE_S`; all false if there are no times.
     """
     if not len(at_s):
         return np.zeros(len(t_s), dtype=bool)
@@ -259,16 +272,16 @@ def custom_sensor_residuals(
     nuisance: NuisanceMap,
     huber: float | None = None,
 ) -> tuple[CustomSensorResidual, ...]:
-    """Build the measurement models of all custom sensors of an experiment.
+    """Build the measurement models of all custom sensors of an experiment, in their order.
 
     Parameters
     ----------
     experiment : Experiment
         The experiment.
     t_s : (N,) array
-        Times of the rows of x [s].
+        Times of the rows of x [s], at which sensors of points are observed.
     grid : ReactionGrid
-        Times at which reaction forces are known.
+        Times at which reaction forces are known, for sensors of a grasp.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment.
     huber : float or None
@@ -308,14 +321,23 @@ def custom_sensor_residuals(
 def observed_points(
     experiment: Experiment, sensor: Gauge, rows: int
 ) -> PointPositions:
-    """Return the points of a custom sensor as an observable at the first `rows` grid times."""
+    """Return the points of a custom sensor as an observable at the first `rows` grid times; their
+    places are exact, without estimated coordinates.
+
+    Raises
+    ------
+    InputError
+        If a point is not on or in the body, see `place_markers`.
+    """
     body = experiment.body
     points = np.asarray(sensor.points_m)
     names = [f"{sensor.name} {k + 1}" for k in range(len(points))]
     placement = place_markers(
         points, body.nodes.points_m, body=body, names=names
     )
-    chart = MarkerAssociation.from_exact_places(body, placement, points)
+    chart = MarkerAssociation.from_exact_places(
+        body, placement, points_m=points
+    )
     return PointPositions(
         np.arange(rows),
         chart,

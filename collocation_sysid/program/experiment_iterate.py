@@ -62,13 +62,14 @@ class ExperimentIterate:
 
     @cached_property
     def equations(self) -> EquationsAtParameters:
-        """Equations of motion at q and φ."""
+        """Equations of motion at q and φ, see `Transcription.equations_at`."""
         return self.segment.equations_at(self.q, self.phi)
 
     @cached_property
     def histories(self) -> tuple[AnyHistory, ...]:
-        """History variables of the body and of forces at all evaluations, then given contact
-        pressures: lifted ones where they are variables, else computed from the positions.
+        """History variables of the body and of forces at all evaluations, then forces of
+        complementary contact with given pressures: lifted ones where they are variables, otherwise
+        computed from the positions.
         """
         dynamics = self.equations.dynamics
         pressed = dynamics.contact_with_pressures(self.x, self.lifted_pressures)
@@ -81,12 +82,16 @@ class ExperimentIterate:
 
     @cached_property
     def motion(self) -> ObservedMotion:
-        """Positions and reaction forces for the observables."""
+        """Motion without changes, as observables use it; its reaction forces are computed on first
+        use.
+        """
         return self.observation.motion(self.x, self.histories)
 
     @cached_property
     def observables(self) -> list[Array]:
-        """Observables (n, e, 3) of each measurement."""
+        """Values (n, e, 3) of the observable of each measurement, in the order of
+        `segment.residuals`; lifted ones are the values of the variables.
+        """
         return [
             self.lifted_observables[k]
             if k in self.lifted_observables
@@ -96,13 +101,15 @@ class ExperimentIterate:
 
     @property
     def depth_residuals(self) -> list[tuple[DepthResidual, Array]]:
-        """Measurement models of the depth cameras, each with its observables."""
+        """Measurement models of the depth cameras, each with the values (n, e, 3) of its
+        observable: positions of the surface nodes [m].
+        """
         return self.surface_residuals[: len(self.segment.depths)]
 
     @property
     def surface_residuals(self) -> list[tuple[DepthResidual, Array]]:
-        """Measurement models of the depth cameras, then of the outlines, each with its
-        observables.
+        """Measurement models of the depth cameras, then of the outlines, each with the values (n,
+        e, 3) of its observable.
         """
         readings = (*self.segment.depths, *self.segment.outlines)
         return [
@@ -115,8 +122,8 @@ class ExperimentIterate:
 
     @property
     def outline_distances_px(self) -> list[tuple[OutlineResidual, Array]]:
-        """Measurement models of the outlines, each with the distances (n,) of outline
-        points from their edges [pixels].
+        """Measurement models of the outlines, each with the signed distances (n,) of outline points
+        from their edges [pixels]; points without an edge are left out.
         """
         distances = []
         for reading, observation in self.surface_residuals[
@@ -129,7 +136,7 @@ class ExperimentIterate:
 
     @property
     def loss(self) -> float:
-        """Loss of all measurements, without priors."""
+        """Loss Σ ρ of all measurements of this experiment, without priors."""
         pairs = zip(self.segment.residuals, self.observables, strict=True)
         return sum(
             reading.loss(observation, self.phi)
@@ -138,7 +145,9 @@ class ExperimentIterate:
 
     @cached_property
     def loss_gradients(self) -> list[tuple[Array, Array]]:
-        """Gradient of the loss of each measurement by its observables (n, e, 3) and by φ (k,)."""
+        """Gradient of the loss of each measurement by the values of its observable (n, e, 3) and,
+        at constant values, by φ (k,).
+        """
         pairs = zip(self.segment.residuals, self.observables, strict=True)
         return [
             reading.loss_gradient(observation, self.phi)
@@ -146,10 +155,11 @@ class ExperimentIterate:
         ]
 
     def gradient(self) -> tuple[Array, Array]:
-        """Return the gradient of the loss by x (N, 3n) [1/m] and by (q, φ) (nq + k,).
+        """Return the gradient of the loss by x (N, 3n) [1/m] and by (q, φ) (nq + k,), including the
+        dependence through reaction forces.
 
         Observables that are variables of the program (`lifted_observables`) are treated as
-        constant.
+        constant; priors are not included.
         """
         nq = self.segment.nq
         phi = self.phi
@@ -161,7 +171,7 @@ class ExperimentIterate:
             by_p[nq:] += by_phi
             if k not in self.lifted_observables:
                 products = reading.observable.vjp(
-                    self.motion, phi, by_observables
+                    self.motion, phi, by_values=by_observables
                 )
                 by_x = by_x + products.by_x
                 by_p[nq:] = by_p[nq:] + products.by_phi
@@ -179,13 +189,15 @@ class ExperimentIterate:
 
     @cached_property
     def forces(self) -> Linearisation:
-        """Forces at the evaluations with their derivatives; valid until the segment
-        linearises again.
+        """Forces at the evaluations with their derivatives; stored in the segment's
+        `linearisation_buffer`, hence valid until the segment linearises again.
         """
         rows = self.segment.linearisation_buffer
         return self.equations.dynamics.linearise(self.x, rows, self.histories)
 
     @property
     def residual_n(self) -> Array:
-        """Violation of the equations of motion (N, free dofs) [N]."""
+        """Residuals of the equations of motion (N, free dofs) [N],
+        see `Transcription.residual_n`.
+        """
         return self.segment.residual_n(self.x, self.equations, self.histories)

@@ -25,7 +25,8 @@ _geqrf, _trtrs, _trtri, _trcon = get_lapack_funcs(_names, dtype=np.float64)
 SINGULAR = 1e-12
 # Share of a parameter in a direction without information that does not matter.
 NEGLIGIBLE = 1e-3
-# Triangles with a smaller reciprocal condition are not solved by substitution.
+# Triangles with a smaller reciprocal condition number are not solved by substitution, whose error
+# would exceed that of the orthogonal methods used instead.
 ROUNDING = 1e-12
 
 
@@ -52,12 +53,12 @@ class SquareRootInformation:
     def with_rows(
         self, residual: Array, jacobian: Array, parameters: Array | None = None
     ) -> SquareRootInformation:
-        """Return the problem with further rows.
+        """Return the problem with further rows; without any, self.
 
         Parameters
         ----------
         residual : (k,) array
-            Residuals at `parameters`.
+            Residuals at `parameters`, in standard deviations.
         jacobian : (k, P) array
             Derivatives by p.
         parameters : (P,) array, optional
@@ -73,8 +74,14 @@ class SquareRootInformation:
     def with_problem(
         self, other: SquareRootInformation, indices: Index | slice = slice(None)
     ) -> SquareRootInformation:
-        """Return the problem with all rows of another, whose parameters are those with `indices`
-        among these; the same by default.
+        """Return the problem with all rows of another one in some of these parameters.
+
+        Parameters
+        ----------
+        other : SquareRootInformation
+            Problem whose rows are added; if it represents none, self is returned.
+        indices : (P',) array of int or slice
+            Indices of its parameters among those of self; the same by default.
         """
         rows = np.zeros((len(other.triangle), self.triangle.shape[1]))
         rows[:, :-1][:, indices] = other.jacobian
@@ -84,8 +91,8 @@ class SquareRootInformation:
     def _with_augmented_rows(
         self, rows: Array, count: int
     ) -> SquareRootInformation:
-        """Return the problem with rows of derivatives and residuals at p = 0, which count
-        as `count` rows.
+        """Return the problem with rows (k, P + 1) of derivatives and residuals at p = 0, which
+        count as `count` rows; self if `count` is 0.
         """
         if not count:
             return self
@@ -96,12 +103,12 @@ class SquareRootInformation:
 
     @property
     def jacobian(self) -> Array:
-        """Derivatives S by p, as the triangle represents them."""
+        """Derivatives S (k, P) by p, as the triangle represents them, k ≤ P + 1."""
         return self.triangle[:, :-1]
 
     @property
     def residual(self) -> Array:
-        """Residuals at p = 0, as the triangle represents them."""
+        """Residuals r (k,) at p = 0, as the triangle represents them, k ≤ P + 1."""
         return self.triangle[:, -1]
 
     @property
@@ -111,17 +118,24 @@ class SquareRootInformation:
 
     @property
     def score(self) -> Array:
-        """Score (P,), Sᵀ r: half the gradient of the sum of squares at p = 0."""
+        """Score (P,), Sᵀ r with r at p = 0: half the gradient of the sum of squares there."""
         return self.jacobian.T @ self.residual
 
     def loss(self, p: Array) -> float:
-        """Return the sum of squares at p."""
+        """Return the sum of squares ‖S p + r‖² at p (P,)."""
         residual = self.triangle @ np.append(p, 1.0)
         return float(residual @ residual)
 
     def minimiser(self, lower: Array, upper: Array) -> Array:
-        """Return the p with the least sum of squares between bounds (P,); without active
-        bounds, the shortest of several.
+        """Return the p (P,) with the least sum of squares between bounds.
+
+        Where the minimum without bounds is within them, it is returned; of several, the shortest
+        one.
+
+        Parameters
+        ----------
+        lower, upper : (P,) arrays
+            Bounds of p, infinite where there is none.
         """
         size = len(lower)
         square = self.jacobian[:size]
@@ -142,7 +156,7 @@ class SquareRootInformation:
 
     def marginal(self, count: int) -> SquareRootInformation:
         """Return the problem in the first `count` parameters alone, with the others eliminated at
-        their optimum.
+        their optimum; residuals that the others can reduce to zero do not count.
         """
         size = self.triangle.shape[1]
         others = np.arange(count, size - 1)
@@ -154,12 +168,16 @@ class SquareRootInformation:
 
     @cached_property
     def root(self) -> Array:
-        """Matrix L (P, r) with SᵀS = (L Lᵀ)⁻¹ in the r directions that the rows determine."""
+        """Matrix L (P, r) with L Lᵀ = (SᵀS)⁻¹ in the r directions that the rows determine; r = P if
+        these determine all parameters.
+        """
         return self._root_and_undetermined[0]
 
     @cached_property
     def is_undetermined(self) -> NDArray[np.bool_]:
-        """Mask (P,) of the parameters that a direction with zero information contains."""
+        """Mask (P,) of the parameters with a share above `NEGLIGIBLE` in a direction without
+        information; an eigenvalue below `SINGULAR` counts as zero.
+        """
         return self._root_and_undetermined[1]
 
     @cached_property
@@ -188,13 +206,13 @@ class SquareRootInformation:
     def covariance(self, score_covariance: Array | None = None) -> Array:
         """Return the covariance (P, P) of p.
 
-        Undetermined parameters have infinite variance, and NaN covariances.
+        Undetermined parameters have infinite variance, and NaN covariances with all others.
 
         Parameters
         ----------
         score_covariance : (r, r) array, optional
-            Lᵀ B L for errors e whose score Sᵀe has the covariance B; by default errors are
-            independent with unit variance.
+            Lᵀ B L for errors e whose score Sᵀe has the covariance B, with L = `root`; by default
+            errors are independent with unit variance.
         """
         root = self.root
         is_undetermined = self.is_undetermined
@@ -216,7 +234,7 @@ class SquareRootInformation:
 
 
 def _triangularise(rows: Array) -> Array:
-    """Return the triangle of a QR factorisation of rows (k, P + 1)."""
+    """Return the triangle (min(k, P + 1), P + 1) of a QR factorisation of rows (k, P + 1)."""
     size = rows.shape[1]
     factors, *_ = _geqrf(rows, lwork=64 * size)
     return np.triu(factors[:size])

@@ -40,11 +40,15 @@ class LocalLoss:
 
     @cached_property
     def structure(self) -> tuple[Index, Index]:
-        """Rows and columns among (x, φ) of the entries, upper triangle, sorted by column."""
+        """Rows and columns among (x, φ) of the possible entries, upper triangle, sorted by column,
+        each once.
+        """
         none = np.zeros(self.nuisance_count)
         codes = [np.zeros(0, dtype=np.int64)]
         for reading, points in self.residuals:
-            slopes = points.derivative_matrix(None, none, self.position_count)
+            slopes = points.derivative_matrix(
+                None, none, position_count=self.position_count
+            )
             codes.append(self._codes(*reading.hessian_structure(slopes)))
         unique_codes = np.unique(np.concatenate(codes))
         return unique_codes % self._height, unique_codes // self._height
@@ -61,7 +65,10 @@ class LocalLoss:
     def hessian(
         self, x: Array, phi: Array, has_observation_curvature: bool = True
     ) -> Array:
-        """Return the values of the entries.
+        """Return the values of the entries of `structure`, in SI units.
+
+        A loss that is quadratic is evaluated once; its Hessian contains the observation curvature,
+        which is zero.
 
         Parameters
         ----------
@@ -70,7 +77,8 @@ class LocalLoss:
         phi : (k,) array
             Nuisance parameters.
         has_observation_curvature : bool
-            If false, neglect the curvature of the observations (Gauss–Newton).
+            If false, neglect the curvature of the observations (Gauss–Newton): the derivatives of
+            the loss through second derivatives of the residuals.
         """
         return (
             self._constant
@@ -90,7 +98,9 @@ class LocalLoss:
 
     @cached_property
     def _constant(self) -> Array:
-        """Values of the entries at zero positions."""
+        """Values of the entries at zero positions and parameters; valid everywhere if
+        `_is_quadratic`.
+        """
         rows = max(
             (points.rows[-1] + 1 for _, points in self.residuals), default=1
         )
@@ -104,7 +114,7 @@ class LocalLoss:
         self, x: Array, phi: Array, has_observation_curvature: bool
     ) -> Array:
         """Return the values of the entries of `structure` at x (N, 3n) and φ (k,), with or without
-        the curvature of the observables.
+        the curvature of the observations.
         """
         codes = self._codes(*self.structure)
         values = np.zeros(len(codes))
@@ -127,7 +137,9 @@ class LocalLoss:
             yield reading.hessian(
                 values,
                 phi,
-                points.derivative_matrix(x, phi, self.position_count),
+                points.derivative_matrix(
+                    x, phi, position_count=self.position_count
+                ),
                 has_observation_curvature,
             )
             if has_observation_curvature and not points.is_linear:

@@ -31,7 +31,7 @@ from .wrench.wrench_observable import GraspWrench, ReactionGrid
 # Numbers of a vector [x, y, z], whose residuals share a weight of Huber's loss.
 GROUP = 3
 
-# What can be looked at.
+# Observables of measurements.
 Channel = PointPositions | GraspWrench
 
 T = TypeVar("T", float, ca.SX)
@@ -67,8 +67,8 @@ class ResidualExpression:
 
     @cached_property
     def residual(self) -> GeneratedFunction:
-        """Residual r of u = (c, φ), given the data, ŷ and 1/σ; the latter is zero where
-        nothing is measured.
+        """Residual r (m,) of u = (c, φ), the vectors c one after the other; its data are those of
+        the expression, ŷ and 1/σ, and 1/σ is zero where nothing is measured.
         """
         return GeneratedFunction(
             self._residual_expression,
@@ -78,14 +78,16 @@ class ResidualExpression:
 
     @cached_property
     def loss(self) -> GeneratedFunction:
-        """Loss Σ ρ of the residual, of the same inputs."""
+        """Loss Σ ρ of the residual, with the same inputs and data."""
         return GeneratedFunction(
             self._loss_expression, self._input_count, data_size=self._data_count
         )
 
     @property
     def is_quadratic(self) -> bool:
-        """Whether second derivatives of the loss are constant."""
+        """Whether the loss is a quadratic function of u: no Huber
+        threshold, and y is linear in u.
+        """
         return self.huber is None and self.residual.is_linear
 
     def curvature(
@@ -97,12 +99,13 @@ class ResidualExpression:
         ----------
         u : (k, …) array
             Inputs (c, φ) of the samples.
-        data : array
-            Data, ŷ and 1/σ.
+        data : (d + 2 m, …) array
+            Data, ŷ and 1/σ of the samples.
         has_observation_curvature : bool
-            If false, neglect the curvature of the observations: the Gauss–Newton matrix, which is
-            convex. Outliers then have the weights ρ'/2d of reweighted least squares; this is an
-            upper bound of the curvature of ρ, and avoids the zero of ρ'' along their residuals.
+            If true, the exact second derivatives. If false, neglect the curvature of the
+            observations: the Gauss–Newton matrix, which is positive semidefinite. Outliers then
+            have the weights ρ'/2d of reweighted least squares; this is an upper bound of the
+            curvature of ρ, and avoids the zero of ρ'' along their residuals.
         """
         if has_observation_curvature:
             return self.loss.weighted_hessian(u, data)
@@ -127,11 +130,11 @@ class ResidualExpression:
 
     @property
     def _data_count(self) -> int:
-        """Number of data, including ŷ and 1/σ."""
+        """Number of data, including the measurements ŷ and the weights 1/σ."""
         return self.data_count + 2 * self.measured_count
 
     def _residual_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the expression of the residual (prediction − measurement) / σ."""
+        """Return the expression (m,) of the residual (y − ŷ) / σ in u = (c, φ) and the data."""
         ends = [
             0,
             self.data_count,
@@ -148,11 +151,8 @@ class ResidualExpression:
         return weight * (predicted - measured)
 
     def _loss_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the expression of the robust loss of the residual."""
-        return self._robust_loss(self._residual_expression(u, data), data)
-
-    def _robust_loss(self, residual: ca.SX, _: ca.SX) -> ca.SX:
-        """Expression of Σ ρ over the groups of a residual."""
+        """Return the expression (scalar) of the loss Σ ρ in u and the data."""
+        residual = self._residual_expression(u, data)
         groups = ca.vertsplit(residual, self.group_size)
         return sum(
             (self._robust_loss_of_square(ca.sumsqr(group)) for group in groups),
@@ -160,7 +160,7 @@ class ResidualExpression:
         )
 
     def _robust_loss_of_square(self, square: ca.SX) -> ca.SX:
-        """Expression of ρ from the squared length of a group."""
+        """Return the expression of ρ from the squared length of a group."""
         if self.huber is None:
             return square
         limit = self.huber**2
@@ -171,21 +171,10 @@ class ResidualExpression:
 def huber_as_least_squares(
     residual: Array, derivatives: Array, huber: float | None
 ) -> tuple[Array, Array]:
-    """Scale residuals and derivatives such that their squares reproduce Huber's loss and its
-    gradient.
-
-    With d the length of a group and δ the threshold, ρ = d² up to δ and 2δd − δ² beyond. Beyond,
-    residuals are scaled by √ρ / d and derivatives by δ / √ρ, so that r'ᵀr' = Σρ and S'ᵀr' is half
-    the gradient (Huber 1964; reweighting after Triggs et al. 2000, sec. 4.3).
-
-    Parameters
-    ----------
-    residual : (…, 3) array
-        Residuals in standard deviations.
-    derivatives : (…, 3, p) array
-        Their derivatives by p parameters.
-    huber : float or None
-        Threshold δ; None returns both unchanged.
+    """Returns
+    -------
+    ((…, 3) array, (…, 3, p) array)
+        Scaled residuals and derivatives; the arguments are not modified.
     """
     if huber is None:
         return residual, derivatives
@@ -203,9 +192,11 @@ def huber_as_weights(
 ) -> tuple[Array, Array]:
     """Weight residuals and derivatives as Huber's loss does at its optimum, for statistics.
 
-    Derivatives get the square root of the weight in the normal equations. Residuals are shortened
-    to the threshold, so that a few outliers do not determine the noise of the others. Arguments as
-    in `huber_as_least_squares`; without threshold (None) both are returned as they are.
+    Up to the threshold δ both are unchanged. Beyond, with the length d of a group, derivatives are
+    multiplied by √(δ/d), the square root of their weight in the normal equations, and residuals by
+    δ/d: they are shortened to the threshold, so that a few outliers do not determine the noise of
+    the others. Arguments as in `huber_as_least_squares`; without threshold (None) both are returned
+    as they are.
     """
     if huber is None:
         return residual, derivatives
@@ -215,12 +206,13 @@ def huber_as_weights(
 
 
 class RowStencil(NamedTuple):
-    """Vectors and data that samples are computed from.
+    """Vectors and data from which the first S samples are computed.
 
     Attributes
     ----------
     indices : (S, E, v) array
-        Indices of v vectors among those of the observable, flattened over times and points.
+        Indices of v vectors among the n e vectors of the observable, time by time: time · e +
+        point.
     data : (d, S, E) array
         Data of the expression.
     """
@@ -240,7 +232,7 @@ class PooledResiduals:
     sigmas : (M,) array
         Standard deviations.
     is_compared : (S, M, 3) array of bool
-        Numbers that exist.
+        True for numbers that are compared.
     places_m : (3M, 3) array or None
         Place of each number on the undeformed body [m]; None if they have none.
     """
@@ -254,6 +246,9 @@ class PooledResiduals:
 @dataclass(frozen=True, eq=False)
 class MeasurementResidual(ABC):
     """Measurement model: S samples of E entities at a time, of m numbers each, in one experiment.
+
+    An entity is what is measured at the same time by the same expression with other nuisance
+    parameters, such as one marker.
 
     Attributes
     ----------
@@ -272,7 +267,7 @@ class MeasurementResidual(ABC):
     measured : (S, E, m) array
         Measurements ŷ, NaN where missing.
     is_compared : (S, G, g) array of bool
-        Numbers that are compared.
+        Numbers that are compared: they exist, and the model can predict them.
     own_parameters : (E, f) array
         Indices in φ of the nuisance parameters of each entity.
     sigma_key : str
@@ -308,72 +303,91 @@ class MeasurementResidual(ABC):
 
     @property
     def first_needed_s(self) -> float:
-        """Time [s] that must be known before the first sample can be compared, for any φ."""
+        """Time [s] up to which the motion must be known before the first sample can be compared,
+        for any φ; that of the first sample if none is compared.
+        """
         return float(self.t_s[self.is_compared.any(axis=(1, 2)).argmax()])
 
     @cached_property
     def pooled_groups(self) -> PooledResiduals:
-        """Groups that statistics use: those of the measurement, unless a subclass combines
-        neighbours.
+        """Groups that statistics use: those of the measurement, without places, unless a subclass
+        combines neighbours.
         """
         return PooledResiduals(
             self.names, self.sigmas, is_compared=self.is_compared
         )
 
     def pool_values(self, values: Array) -> Array:
-        """Return residuals (S, G, g, …), or their derivatives, as values (S, M, 3, …) of
-        the groups of `pooled_groups`.
+        """Return residuals (S, G, g, …), or their derivatives, as values (S, M, 3, …) of the groups
+        of `pooled_groups`; the argument itself unless a subclass combines groups.
         """
         return values
 
     @property
     def observable_sigmas(self) -> Array:
-        """Standard deviations (3 e,) of the observable as one sample determines it;
-        infinite where it does not.
+        """Standard deviations (3 e,) of the observable's components as one sample determines them,
+        infinite where it does not; here σ of each group for its three components.
         """
         return np.repeat(self.sigmas, GROUP)
 
     @abstractmethod
     def expression(self, vectors: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the prediction y of one sample as a CasADi expression.
+        """Return the prediction y (m,) of one sample as a CasADi expression.
 
         Parameters
         ----------
         vectors : (3, v) SX
             Vectors of the observable.
-        phi : SX
+        phi : (f,) SX
             Nuisance parameters of the entity.
-        data : SX
+        data : (d,) SX
             Data of the stencil.
         """
 
     @abstractmethod
     def stencil(self, phi: Array, known: int) -> RowStencil:
-        """Return the stencil of those first samples for which the first `known` times of
-        the observable may suffice.
+        """Return the stencil of the first samples that can be computed from the first `known` times
+        of the observable.
+
+        Parameters
+        ----------
+        phi : (k,) array
+            Nuisance parameters of the experiment.
+        known : int
+            Number of times of the observable that are known. The stencil ends before the first
+            sample that surely needs a later one; `is_covered` excludes further samples.
         """
 
     def all_stencils(self) -> Index:
-        """Return the indices (…, E, v) of vectors that samples may be computed from, for any φ."""
+        """Return the indices (…, E, v) of vectors that samples may be computed from, for any φ;
+        here those of the stencil at φ = 0 and all times.
+        """
         return self.stencil(
             np.zeros(self.nuisance.size), self.observable.count
         ).indices
 
     def compared_with(self, known: int) -> NDArray[np.bool_]:
-        """Return the mask (S, G, 3) of the numbers that can be compared if the first
-        `known` times are known.
+        """Return the mask (S, G, g) of the numbers that can be compared if the first `known` times
+        of the observable are known.
         """
         return self.is_compared & self.is_covered(known)[:, None, None]
 
     def is_covered(self, known: int) -> NDArray[np.bool_]:
-        """Return the mask (S,) of the samples for which the first `known` times suffice,
-        for any φ.
+        """Return the mask (S,) of the samples for which the first `known` times suffice, for any φ;
+        here all, since the stencil excludes others.
         """
         return np.ones(len(self.t_s), dtype=bool)
 
     def rough_residuals(self, x: Array, phi: Array) -> Array | None:
         """Return residuals for ranking first guesses, or None if the ordinary residuals are
-        suitable.
+        suitable, as here.
+
+        Parameters
+        ----------
+        x : (rows, 3n) array
+            First rows of the motion [m].
+        phi : (k,) array
+            Nuisance parameters.
         """
         return None
 
@@ -381,13 +395,17 @@ class MeasurementResidual(ABC):
 
     @cached_property
     def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
-        """Generated functions by the numbers of vectors and of data."""
+        """Cache of the generated functions by the numbers of vectors and of data; filled by
+        `expression_for`.
+        """
         return {}
 
     def with_samples(
-        self, known_s: Array, t_s: Array, indices: Array, **changes: Any
+        self, known_s: Array, t_s: Array, measurements: Array, **changes: Any
     ) -> Self:
-        """Return the model of other samples, sharing the generated functions.
+        """Return the model with other samples of its only entity, sharing the generated functions.
+
+        Every measurement that is not NaN is compared.
 
         Parameters
         ----------
@@ -395,13 +413,13 @@ class MeasurementResidual(ABC):
             Times at which the observable is known [s].
         t_s : (S,) array
             Times of the samples [s].
-        indices : (S, m) array
-            Measurements, NaN where missing.
-        changes : Any
+        measurements : (S, m') array
+            Measurements, NaN where missing; missing columns (m' < m) are padded with NaN.
+        **changes
             Other attributes to replace.
         """
         measured = np.full((len(t_s), 1, self.measured.shape[2]), np.nan)
-        measured[:, 0, : indices.shape[1]] = indices
+        measured[:, 0, : measurements.shape[1]] = measurements
         is_compared = np.isfinite(measured).reshape(len(t_s), -1, GROUP)
         changes |= {
             "t_s": t_s,
@@ -421,8 +439,8 @@ class MeasurementResidual(ABC):
         return other
 
     def expression_for(self, vectors: int, data: int) -> ResidualExpression:
-        """Return the generated functions for stencils with numbers of vectors and data; they are
-        created on the first call and stored.
+        """Return the generated functions for stencils with `vectors` vectors and `data` data; they
+        are created on the first call and stored.
         """
         if (vectors, data) not in self._expressions:
             self._expressions[vectors, data] = ResidualExpression(
@@ -438,7 +456,9 @@ class MeasurementResidual(ABC):
 
     @cached_property
     def _data_and_weights(self) -> tuple[Array, Array]:
-        """Measurements ŷ (m, S, E), and 1/σ, which is zero where nothing is compared."""
+        """Measurements ŷ (m, S, E), zero where missing, and 1/σ (m, S, E), zero where nothing is
+        compared.
+        """
         weight = (self.is_compared / self.sigmas[:, None]).reshape(
             self.measured.shape
         )
@@ -446,11 +466,11 @@ class MeasurementResidual(ABC):
             weight, 2, 0
         )
 
-    def _inputs_at(
-        self, values: Array, phi: Array
-    ) -> tuple[ResidualExpression, RowStencil, Array, Array]:
-        """Return the generated functions, the stencil, the inputs u (k, s, E) and the data of the s
-        first samples that can be computed from values (n, e, 3) of the observable at φ.
+    def _inputs_at(self, values: Array, phi: Array) -> _SampleInputs:
+        """Return the inputs of the first s samples that can be computed from values (n, e, 3) of
+        the observable at φ (k,).
+
+        The weights 1/σ among the data are zero for samples that are not covered, see `is_covered`.
         """
         window = self.stencil(phi, len(values))
         samples, each, vectors = window.indices.shape
@@ -467,7 +487,12 @@ class MeasurementResidual(ABC):
         is_covered = self.is_covered(len(values))[:samples, None]
         data = np.concatenate([window.data, measured, weight * is_covered])
         u = np.concatenate([neighbouring.transpose(2, 0, 1), own])
-        return self.expression_for(vectors, len(window.data)), window, u, data
+        return _SampleInputs(
+            self.expression_for(vectors, len(window.data)),
+            window,
+            u=u,
+            data=data,
+        )
 
     def _grouped(self, values: Array) -> Array:
         """Return values (m, s, E) as groups (s, G, g)."""
@@ -478,28 +503,32 @@ class MeasurementResidual(ABC):
     # All samples ------------------------------------------------------------------------------
 
     def predict(self, values: Array, phi: Array) -> Array:
-        """Return predictions y (s, G, g), for the first samples that the values suffice for.
+        """Return predictions y (s, G, g) of the s first samples that the values suffice for, also
+        where nothing was measured.
 
         Parameters
         ----------
         values : (n, e, 3) array
-            Values of the observable.
+            Values of the observable at its first n times.
         phi : (k,) array
             Nuisance parameters.
         """
-        instrument, window, u, data = self._inputs_at(values, phi)
-        own = len(window.data)
+        inputs = self._inputs_at(values, phi)
+        own = len(inputs.stencil.data)
         measured = self.measured.shape[2]
-        data[own : own + measured] = 0.0
-        data[own + measured :] = 1.0
-        return self._grouped(instrument.residual.evaluate(u, data))
+        # With ŷ = 0 and 1/σ = 1, the residual is the prediction.
+        inputs.data[own : own + measured] = 0.0
+        inputs.data[own + measured :] = 1.0
+        residual = inputs.functions.residual
+        return self._grouped(residual.evaluate(inputs.u, inputs.data))
 
     def residuals(self, values: Array, phi: Array) -> Array:
-        """Return residuals (y − ŷ) / σ (s, G, g), zero where missing; arguments as in
-        `predict`.
+        """Return residuals (y − ŷ) / σ (s, G, g) of the samples that the values suffice for, zero
+        where nothing is compared; arguments as in `predict`.
         """
-        instrument, _, u, data = self._inputs_at(values, phi)
-        return self._grouped(instrument.residual.evaluate(u, data))
+        inputs = self._inputs_at(values, phi)
+        residual = inputs.functions.residual
+        return self._grouped(residual.evaluate(inputs.u, inputs.data))
 
     def linearise(
         self,
@@ -508,11 +537,11 @@ class MeasurementResidual(ABC):
         phi: Array,
         size: int,
     ) -> tuple[Array, Array]:
-        """Return residuals (y − ŷ) / σ (s, G, g), zero where missing, and their derivatives (s, G,
-        g, size) by all parameters.
+        """Return residuals (y − ŷ) / σ (s, G, g), zero where nothing is compared, and their
+        derivatives (s, G, g, size) by all parameters.
 
         Samples s are those that the values suffice for; G is the number of `names` and g the
-        `group_size`. Without values the arrays are zero.
+        `group_size`. Huber's loss is not applied. Without values (n = 0) both arrays are zero.
 
         Parameters
         ----------
@@ -534,7 +563,9 @@ class MeasurementResidual(ABC):
                 )
             )
             return none, np.zeros((*none.shape, size))
-        window, residual, by_u = self._evaluate(values, phi)
+        samples_at = self._evaluate(values, phi)
+        window = samples_at.stencil
+        by_u = samples_at.by_inputs
         samples, each, vectors = window.indices.shape
         by_observables = by_u[..., : GROUP * vectors]
         by_own = by_u[..., GROUP * vectors :]
@@ -570,24 +601,20 @@ class MeasurementResidual(ABC):
                 columns=first + self.own_parameters,
                 values=by_own,
             )
-        grouped = residual.reshape(samples, len(self.names), self.group_size)
+        grouped = samples_at.residuals.reshape(
+            samples, len(self.names), self.group_size
+        )
         return grouped, derivatives.reshape(*grouped.shape, size)
 
-    def _evaluate(
-        self, values: Array, phi: Array
-    ) -> tuple[RowStencil, Array, Array]:
-        """Return the stencil, residuals (s, E, m) in standard deviations and their derivatives (s,
-        E, m, u) by the inputs, from values (n, e, 3) of the observable at φ.
+    def _evaluate(self, values: Array, phi: Array) -> _LinearisedSamples:
+        """Return the first s samples, linearised in their inputs at values (n, e, 3) of the
+        observable and φ (k,).
         """
-        if self._linear_part is None or len(values) < self.observable.count:
-            instrument, window, u, data = self._inputs_at(values, phi)
-            residual, by_u = instrument.residual.evaluate_with_jacobian(u, data)
-            return (
-                window,
-                residual.transpose(1, 2, 0),
-                by_u.transpose(2, 3, 0, 1),
-            )
-        window, at_zero, by_u = self._linear_part
+        linear = self._linear_part
+        if linear is None or len(values) < self.observable.count:
+            return self._linearise_at(values, phi)
+        window = linear.stencil
+        by_u = linear.by_inputs
         samples, each, vectors = window.indices.shape
         neighbouring = values.reshape(-1, GROUP)[window.indices].reshape(
             samples, each, GROUP * vectors
@@ -597,12 +624,29 @@ class MeasurementResidual(ABC):
                 phi[self.own_parameters], (samples, *self.own_parameters.shape)
             )
             neighbouring = np.concatenate([neighbouring, own], axis=2)
-        return window, at_zero + (by_u @ neighbouring[..., None])[..., 0], by_u
+        change = (by_u @ neighbouring[..., None])[..., 0]
+        return _LinearisedSamples(
+            window, linear.residuals + change, by_inputs=by_u
+        )
+
+    def _linearise_at(self, values: Array, phi: Array) -> _LinearisedSamples:
+        """Return the first s samples linearised by their generated functions, also where these are
+        not linear; arguments as in `_evaluate`.
+        """
+        inputs = self._inputs_at(values, phi)
+        residual, by_u = inputs.functions.residual.evaluate_with_jacobian(
+            inputs.u, inputs.data
+        )
+        return _LinearisedSamples(
+            inputs.stencil,
+            residual.transpose(1, 2, 0),
+            by_inputs=by_u.transpose(2, 3, 0, 1),
+        )
 
     @cached_property
-    def _linear_part(self) -> tuple[RowStencil, Array, Array] | None:
-        """Stencil, residuals and derivatives at zero inputs; None if derivatives are not
-        constant.
+    def _linear_part(self) -> _LinearisedSamples | None:
+        """All samples linearised at zero inputs, where derivatives are the same for all inputs;
+        None if they are not constant.
         """
         if (
             not self.has_fixed_stencils
@@ -612,16 +656,16 @@ class MeasurementResidual(ABC):
         nothing = np.zeros(
             (self.observable.count, self.observable.vector_count, GROUP)
         )
-        instrument, window, u, data = self._inputs_at(
-            nothing, np.zeros(self.nuisance.size)
+        at_zero = self._linearise_at(nothing, np.zeros(self.nuisance.size))
+        return _LinearisedSamples(
+            at_zero.stencil,
+            np.ascontiguousarray(at_zero.residuals),
+            by_inputs=np.ascontiguousarray(at_zero.by_inputs),
         )
-        residual, by_u = instrument.residual.evaluate_with_jacobian(u, data)
-        by_u = np.ascontiguousarray(by_u.transpose(2, 3, 0, 1))
-        return window, np.ascontiguousarray(residual.transpose(1, 2, 0)), by_u
 
     def residual_changes(self, values: Array, by: Array, phi: Array) -> Array:
-        """Return the changes (s, M, 3, c) of the pooled residuals at values (n, e, 3) and φ if the
-        observable changes by `by` (n, e, 3, c), to first order.
+        """Return the changes (s, M, 3, c) of the pooled residuals at values (n, e, 3) and φ (k,) if
+        the observable changes by `by` (n, e, 3, c), to first order and at constant φ.
         """
         size = by.shape[3] + len(phi)
         slopes = ObservableDerivatives.without_own(np.arange(by.shape[3]), by)
@@ -631,22 +675,27 @@ class MeasurementResidual(ABC):
 
     def loss(self, values: Array, phi: Array) -> float:
         """Return the loss Σ ρ of values (n, e, 3) of the observable at φ (k,), over the samples
-        that these suffice for.
+        that these suffice for; 0 without values.
         """
         if not len(values):
             return 0.0
-        instrument, _, u, data = self._inputs_at(values, phi)
-        return float(instrument.loss.evaluate(u, data).sum())
+        inputs = self._inputs_at(values, phi)
+        loss = inputs.functions.loss.evaluate(inputs.u, inputs.data)
+        return float(loss.sum())
 
     def loss_gradient(self, values: Array, phi: Array) -> tuple[Array, Array]:
-        """Return the gradient of the loss by the observable (n, e, 3) and by φ (k,)."""
+        """Return the gradient of `loss` by the observable (n, e, 3) and, at constant values of it,
+        by φ (k,); zeros without values.
+        """
         by_values = np.zeros_like(values)
         by_phi = np.zeros(len(phi))
         if not len(values):
             return by_values, by_phi
-        instrument, window, u, data = self._inputs_at(values, phi)
-        by_u = instrument.loss.evaluate_with_jacobian(u, data)[1][0]
-        places = window.indices
+        inputs = self._inputs_at(values, phi)
+        by_u = inputs.functions.loss.evaluate_with_jacobian(
+            inputs.u, inputs.data
+        )[1][0]
+        places = inputs.stencil.indices
         by_observables, by_own = np.split(by_u, [GROUP * places.shape[2]])
         by_observables = by_observables.reshape(
             places.shape[2], GROUP, *places.shape[:2]
@@ -663,7 +712,9 @@ class MeasurementResidual(ABC):
     # Second derivatives -----------------------------------------------------------------------
 
     def _gather_matrix(self, places: Index) -> sp.csr_array:
-        """Return ∂u/∂(c, φ) of samples with stencils (s, E, v); rows by sample, then by input."""
+        """Return ∂u/∂(c, φ), a matrix of zeros and ones, of samples with stencils (s, E, v); rows
+        by sample, then by entity, then by input.
+        """
         samples, each, vectors = places.shape
         observable_columns = GROUP * places[..., None] + np.arange(GROUP)
         first = GROUP * self.observable.count * self.observable.vector_count
@@ -682,12 +733,14 @@ class MeasurementResidual(ABC):
 
     @property
     def is_quadratic(self) -> bool:
-        """Whether second derivatives of the loss by the observable are constant."""
+        """Whether the loss is a quadratic function of the observable and φ, so that its second
+        derivatives are constant.
+        """
         return self._full_expression.is_quadratic
 
     @cached_property
     def _full_expression(self) -> ResidualExpression:
-        """Generated functions for the stencil of all times."""
+        """Generated functions for the stencil of all times of the observable."""
         window = self.stencil(
             np.zeros(self.nuisance.size), self.observable.count
         )
@@ -701,7 +754,8 @@ class MeasurementResidual(ABC):
     def hessian_structure(
         self, derivatives: sp.csr_array
     ) -> tuple[Index, Index]:
-        """Return rows and columns of ∂²loss by some variables, upper triangle, sorted by column.
+        """Return rows and columns of the possible entries of ∂²loss by some variables, upper
+        triangle, sorted by column.
 
         Parameters
         ----------
@@ -726,8 +780,11 @@ class MeasurementResidual(ABC):
         derivatives: sp.csr_array,
         has_observation_curvature: bool = True,
     ) -> SparseEntries:
-        """Return the entries of ∂²loss by some variables, upper triangle; entries may be missing or
-        repeated.
+        """Return the entries of Sᵀ (∂²loss/∂(c, φ)²) S for the derivatives S of (c, φ) by some
+        variables, upper triangle; entries may be missing or repeated.
+
+        The second derivatives of c by the variables are not included, see
+        `PointPositions.curvature`.
 
         Parameters
         ----------
@@ -736,25 +793,65 @@ class MeasurementResidual(ABC):
         phi : (k,) array
             Nuisance parameters.
         derivatives : sparse array
-            Derivatives of (c, φ) by the variables.
+            Derivatives S of (c, φ), in this order, by the variables.
         has_observation_curvature : bool
             If false, neglect the curvature of the observations, see `ResidualExpression.curvature`.
         """
-        instrument, window, u, data = self._inputs_at(values, phi)
-        by_u = np.moveaxis(
-            instrument.curvature(u, data, has_observation_curvature),
-            (0, 1),
-            (2, 3),
+        inputs = self._inputs_at(values, phi)
+        curvature = inputs.functions.curvature(
+            inputs.u, inputs.data, has_observation_curvature
         )
+        by_u = np.moveaxis(curvature, (0, 1), (2, 3))
         by_u = by_u.reshape(-1, *by_u.shape[2:])
         return _congruence(
-            self._gather_matrix(window.indices) @ derivatives, by_u
+            self._gather_matrix(inputs.stencil.indices) @ derivatives, by_u
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _SampleInputs:
+    """Inputs of the generated functions for the first s samples.
+
+    Attributes
+    ----------
+    functions : ResidualExpression
+        Generated functions for this stencil.
+    stencil : RowStencil
+        Stencil of the samples.
+    u : (k, s, E) array
+        Vectors of the observable, then nuisance parameters of the entity.
+    data : (d + 2 m, s, E) array
+        Data of the stencil, measurements ŷ and 1/σ.
+    """
+
+    functions: ResidualExpression
+    stencil: RowStencil
+    u: Array
+    data: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _LinearisedSamples:
+    """Residuals of the first s samples and their derivatives by the inputs u.
+
+    Attributes
+    ----------
+    stencil : RowStencil
+        Stencil of the samples.
+    residuals : (s, E, m) array
+        Residuals in standard deviations.
+    by_inputs : (s, E, m, u) array
+        Derivatives.
+    """
+
+    stencil: RowStencil
+    residuals: Array
+    by_inputs: Array
 
 
 def _gather(by: Array, places: Index) -> Array:
-    """Return changes (s, E, 3 v, c) of the stencils' vectors from changes (n, e, 3, c) of
-    the observable.
+    """Return changes (s, E, 3 v, c) of the stencils' vectors from changes `by` (n, e, 3, c) of the
+    observable, for the stencils' indices `places` (s, E, v).
     """
     times, each, _, count = by.shape
     rows = by.reshape(times * each, GROUP, count)[places]
@@ -771,8 +868,8 @@ def _add_columns(
 
 
 def _congruence(slopes: sp.csr_array, blocks: Array) -> SparseEntries:
-    """Return the upper triangle of Sᵀ B S, B being block-diagonal with the blocks
-    (instances, u, u).
+    """Return the upper triangle of Sᵀ B S, B being block-diagonal with the blocks (instances, u,
+    u); each entry occurs once.
     """
     count = np.arange(len(blocks) + 1)
     middle = sp.bsr_array((blocks, count[:-1], count))
@@ -783,21 +880,23 @@ def _congruence(slopes: sp.csr_array, blocks: Array) -> SparseEntries:
         np.asarray(index, dtype=np.int64) for index in upper.coords
     )
     return SparseEntries(
-        rows, columns, np.asarray(upper.data, dtype=np.float64)
+        rows, columns, values=np.asarray(upper.data, dtype=np.float64)
     )
 
 
 def neighbouring_times(known_s: Array, at_s: Array, count: int) -> Index:
-    """Return the indices (S, count) of consecutive times around each sample, as evenly as possible.
+    """Return the indices (S, count) of consecutive times around each sample, as evenly as possible;
+    at the ends of the known times, and beyond them, the first or last ones.
 
     Parameters
     ----------
     known_s : (n,) array
-        Ascending times.
+        Ascending times [s].
     at_s : (S,) array
-        Times of the samples.
+        Times of the samples [s].
     count : int
-        Number of neighbours, at most n.
+        Number of neighbours, at most n. Of an odd number, the middle one is the last time that is
+        not after the sample.
     """
     index_before = np.searchsorted(known_s, at_s, side="right") - 1
     first = np.clip(index_before - (count - 1) // 2, 0, len(known_s) - count)
@@ -805,14 +904,20 @@ def neighbouring_times(known_s: Array, at_s: Array, count: int) -> Index:
 
 
 def lagrange_weights(position: T, places: Sequence[T]) -> list[Any]:
-    """Return Lagrange's weights of values at some places, for the value at `position`.
+    """Return the weights of values at some places whose sum is the interpolating polynomial at
+    `position` (Lagrange).
 
     Parameters
     ----------
     position : float or SX
-        Place of interpolation.
+        Place of interpolation; outside of the places it extrapolates.
     places : sequence of float or SX
         Distinct places of the values.
+
+    Returns
+    -------
+    list of float or SX
+        One weight for each place; 1 for a single place.
     """
     return [
         math.prod(

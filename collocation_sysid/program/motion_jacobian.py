@@ -77,7 +77,7 @@ class MotionJacobian:
 
     @property
     def _row_starts(self) -> Index:
-        """Return the index of the first row of each grid time, −1 where there are no rows."""
+        """Index of the first row of each grid time, (N,); −1 where there are no rows."""
         first_row = self.dynamics.first_row
         starts = (np.arange(self.dynamics.row_count) - first_row) * len(
             self.constrained_dofs
@@ -131,7 +131,9 @@ class MotionJacobian:
         return blocks
 
     def _inertia_rows(self, lag: int) -> Index:
-        """Return the grid times whose equations of motion have inertia at a lag."""
+        """Return the indices of the grid times whose equations of motion contain inertia of the
+        position `lag` times earlier.
+        """
         rows = np.arange(
             max(self.dynamics.first_row, lag), self.dynamics.row_count
         )
@@ -162,7 +164,9 @@ class MotionJacobian:
         return np.concatenate(positions), grasps.ravel()
 
     def _inertia(self, dynamics: Dynamics) -> Array:
-        """Return the inertia entries of ∂c/∂x in the order of their positions."""
+        """Return the scaled inertia entries of ∂c/∂x with the masses of `dynamics`, in the order of
+        their positions.
+        """
         mass = (
             dynamics.mass.inertia_kg[:, self.free_dofs]
             * self.length_m
@@ -182,7 +186,7 @@ class MotionJacobian:
 
     @cached_property
     def _released_grasps(self) -> ReleasedGrasps:
-        """Corrections where grasps begin or end."""
+        """Corrections where grasps that hold for a part of the time begin or end."""
         scale = self.length_m / self.force_n
         return ReleasedGrasps.from_dynamics(
             self.dynamics,
@@ -200,12 +204,12 @@ class MotionJacobian:
         dynamics: Dynamics,
         has_variable_mass: bool,
     ) -> None:
-        """Write the values of ∂c/∂x.
+        """Write the values of ∂c/∂x of the scaled rows by the scaled positions.
 
         Parameters
         ----------
-        values : (band.nnz,) array
-            Values, overwritten.
+        values : (structure.nnz,) array
+            Values in the order of `structure`, overwritten.
         forces : Linearisation
             Derivatives of the forces at the evaluations.
         dynamics : Dynamics
@@ -232,7 +236,7 @@ class MotionJacobian:
         self._released_grasps.correct(
             values,
             forces.by_position,
-            forces.by_velocity,
+            by_velocity=forces.by_velocity,
             skew=skew,
             rate_skew=of_rates,
         )
@@ -240,7 +244,9 @@ class MotionJacobian:
 
 
 def shifted_back(values: Array, steps: int) -> Array:
-    """Return values[t + steps] at index t, zero beyond the end."""
+    """Return a copy with values[t + steps] at index t, zero beyond the end; `steps` is not
+    negative.
+    """
     shifted = np.zeros_like(values)
     shifted[: len(values) - steps] = values[steps:]
     return shifted
@@ -268,25 +274,24 @@ class _DroppedForce:
     positions: Index
     evaluation: int
     source: Index
-    complete: (
-        Index  # the same in both triangles, as `full_skew_values` has them
-    )
+    complete: Index
     a: float
     b: float
 
 
 @dataclass(frozen=True, eq=False)
 class ReleasedGrasps:
-    """Corrections of ∂c/∂x for grasps that hold for a part of the time.
+    """Corrections of ∂c/∂x for grasps that hold for a part of the time; empty without any.
 
     Attributes
     ----------
     dropped : tuple of _DroppedForce
         Forces to subtract.
     zeros : array
-        Positions of entries to set to zero.
+        Positions in the values of the Jacobian that are set to zero: the rows of dofs while they
+        are prescribed.
     ones : array
-        Positions of entries to set to one.
+        Positions that are set to one: the diagonal entries of these rows.
     """
 
     dropped: tuple[_DroppedForce, ...]
@@ -342,7 +347,7 @@ class ReleasedGrasps:
                 dynamics, band, pattern=pattern, place=place, scale=scale
             )
         )
-        return cls(dropped, zeros, np.concatenate([nothing, *ones]))
+        return cls(dropped, zeros, ones=np.concatenate([nothing, *ones]))
 
     def correct(
         self,
@@ -388,8 +393,21 @@ def _dropped_forces(
     place: Index,
     scale: float,
 ) -> list[_DroppedForce]:
-    """Return the entries of forces that act while a dof is prescribed, in later rows where
-    it is free.
+    """Return the entries of forces that act while a dof is prescribed for a part of the time, in
+    later rows where it is free.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Equations of motion.
+    band : BlockBand
+        Structure of the Jacobian.
+    pattern : SymmetricPattern
+        Sparsity pattern of the blocks.
+    place : (3n,) array
+        Index of each dof's row within a grid time; −1 where it has none.
+    scale : float
+        Factor of the rows, `length_m` / `force_n`.
     """
     tables = dynamics.tables
     step_s = dynamics.step_s

@@ -25,7 +25,7 @@ from .markers.marker_association import MarkerAssociation, ShapeFunctions
 
 @dataclass(frozen=True, eq=False)
 class ReactionForces:
-    """Reaction forces on the sensed dofs at the first grid times.
+    """Reaction forces on the g sensed dofs at the first grid times.
 
     Attributes
     ----------
@@ -34,7 +34,8 @@ class ReactionForces:
     position_m : (N, g) array
         Positions of the dofs [m].
     reaction_by, position_by : (N, g, c) arrays or None
-        Their changes with c columns; None where they are not needed.
+        Their changes with c columns, such as derivatives by parameters; None where they are not
+        needed.
     """
 
     reaction: Array
@@ -52,9 +53,10 @@ class ObservedMotion:
     x : (rows, 3n) array
         Positions of the first grid times [m].
     compute_reactions : callable
-        Returns the reaction forces; called at most once.
+        Returns the reaction forces; called at most once, on the first use of `reactions`.
     changes : (R, p, c) array or None
-        Changes with c columns of the observable's operator applied to x; None means no change.
+        Changes with c columns of the p values of an observable's operator applied to the R rows of
+        x at which it is observed; None means no change.
     """
 
     x: Array
@@ -96,7 +98,13 @@ class ObservableDerivatives(NamedTuple):
         observable whose points have no parameters of their own.
         """
         none = np.zeros(0, dtype=np.int64)
-        return cls(columns, by, none, none.reshape(0, 0), by[:, :0, :, :0])
+        return cls(
+            columns,
+            by,
+            entities=none,
+            own_parameters=none.reshape(0, 0),
+            by_own=by[:, :0, :, :0],
+        )
 
 
 class VectorJacobianProduct(NamedTuple):
@@ -118,7 +126,9 @@ class VectorJacobianProduct(NamedTuple):
 
 
 class SparseEntries(NamedTuple):
-    """Entries of a sparse matrix; values with the same row and column are summed."""
+    """Entries of a sparse matrix, three arrays of equal length; values with the same row and column
+    are summed.
+    """
 
     rows: Index
     columns: Index
@@ -127,12 +137,12 @@ class SparseEntries(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PointPositions:
-    """Positions of points X of the body, h(x_t) = Σ_a N_a(X) x_{t,a}, as an observable.
+    """Positions of e points X of the body, h(x_t) = Σ_a N_a(X) x_{t,a}, as an observable.
 
     Attributes
     ----------
     rows : (T,) array
-        Grid times.
+        Indices of the grid times at which they are observed, ascending.
     association : MarkerAssociation
         Elements of the points.
     coordinate_parameters : (e, k) array
@@ -156,7 +166,9 @@ class PointPositions:
 
     @property
     def is_linear(self) -> bool:
-        """Whether its derivatives are constant."""
+        """Whether the positions are a linear function of x that does not depend on φ: no place is
+        estimated.
+        """
         return not len(self.association.estimated)
 
     @property
@@ -166,7 +178,7 @@ class PointPositions:
 
     @property
     def vector_count(self) -> int:
-        """Number of observed points."""
+        """Number e of observed points, each of which gives one vector of three coordinates."""
         return len(self.association.prior_places_m)
 
     @property
@@ -175,7 +187,9 @@ class PointPositions:
         return len(self.association.body.nodes_m)
 
     def shape_functions(self, phi: Array) -> tuple[Index, ShapeFunctions]:
-        """Return the nodes (e, npe) of each point and their shape functions at φ (k,)."""
+        """Return the indices of the npe nodes of each point's element (e, npe), and the shape
+        functions with their derivatives at the places estimated by φ (k,).
+        """
         return self.association.shape_functions(
             np.append(phi, 0.0)[self.coordinate_parameters]
         )
@@ -190,7 +204,7 @@ class PointPositions:
         )
 
     def _interpolate(self, x: Array, nodes: Index, weights: Array) -> Array:
-        """Return Σ_a weights[m, a, …] x_a, (R, m, 3, …), at those of the observable's R rows that x
+        """Return Σ_a weights[m, a, …] x_a, (R, m, 3, …), at those R of the observable's rows that x
         (rows, 3n) contains, for nodes (m, a).
         """
         rows = self.rows[self.rows < len(x)]
@@ -214,8 +228,8 @@ class PointPositions:
         )
 
     def evaluate(self, motion: ObservedMotion, phi: Array) -> Array:
-        """Return the positions (R, e, 3) of the points in a motion [m], at those times that
-        the motion covers.
+        """Return the positions (R, e, 3) of the points in a motion [m] at φ (k,), at those R of the
+        observable's times that the motion covers.
         """
         return self.evaluate_positions(motion.x, phi)
 
@@ -229,12 +243,12 @@ class PointPositions:
     def linearise(
         self, motion: ObservedMotion, phi: Array, columns: Index, size: int
     ) -> tuple[Array, ObservableDerivatives]:
-        """Return the values (R, e, 3) and their derivatives.
+        """Return the values (R, e, 3) [m] and their derivatives.
 
         Parameters
         ----------
         motion : ObservedMotion
-            The motion, with its changes `by` (R, 3e, c).
+            The motion, with its changes (R, 3e, c); without them, x does not change.
         phi : (k,) array
             Nuisance parameters.
         columns : (c,) array
@@ -259,7 +273,8 @@ class PointPositions:
         columns: Index,
         changes: Array,
     ) -> ObservableDerivatives:
-        """Return the derivatives of the values by parameters.
+        """Return the derivatives of the values by parameters, those of the motion and the points'
+        own coordinates.
 
         Parameters
         ----------
@@ -268,7 +283,7 @@ class PointPositions:
         shape_functions : tuple
             Result of `shape_functions` at φ.
         columns : (c,) array of int
-            Parameters.
+            Indices of the parameters of the changes.
         changes : (R, 3e, c) array
             Derivatives of the points by these parameters through the positions x.
         """
@@ -287,7 +302,7 @@ class PointPositions:
     def vjp(
         self, motion: ObservedMotion, phi: Array, by_values: Array
     ) -> VectorJacobianProduct:
-        """Vector–Jacobian product: derivatives of a scalar from those by the values.
+        """Vector–Jacobian product: derivatives of a scalar by x and φ from those by the values.
 
         Parameters
         ----------
@@ -312,7 +327,7 @@ class PointPositions:
                 ),
             )
             by_phi[self.coordinate_parameters[here]] = own
-        return VectorJacobianProduct(by_x, None, by_phi)
+        return VectorJacobianProduct(by_x, None, by_phi=by_phi)
 
     def frame_changes(
         self,
@@ -333,8 +348,9 @@ class PointPositions:
 
     @cached_property
     def _dependencies(self) -> tuple[Index, Index]:
-        """Point and corner of its element (w,) for each pair of a point and a node on which its
-        position can depend.
+        """Index of the point and of the corner of its element, (w,) each, for each pair of a point
+        and a node on which its position can depend: all corners if the place is estimated,
+        otherwise those with a weight.
         """
         reads = self.association.weights != 0
         reads[self.association.estimated] = True
@@ -395,10 +411,10 @@ class PointPositions:
         self, x: Array | None, phi: Array, position_count: int
     ) -> sp.csr_array:
         """Return the sparse derivative of the stacked positions c of all points at all rows, and of
-        φ, by (x, φ).
+        φ itself, by (x, φ).
 
-        The rows are those of c (3 R e), row by row of the motion, then of φ; the columns those of
-        x, then of φ.
+        The rows are those of c (3 T e), one observed time after the other, then of φ; the columns
+        those of x, then of φ.
 
         Parameters
         ----------
@@ -427,7 +443,8 @@ class PointPositions:
     def curvature(
         self, x: Array, phi: Array, by_values: Array, position_count: int
     ) -> SparseEntries:
-        """Return Σ by_values · ∂²c/∂(x, φ)², upper triangle; non-zero for estimated points only.
+        """Return Σ by_values · ∂²c/∂(x, φ)², upper triangle; there are entries for estimated places
+        only.
 
         Parameters
         ----------
@@ -438,7 +455,7 @@ class PointPositions:
         by_values : (T, e, 3) array
             Weights.
         position_count : int
-            Number of positions N · 3n.
+            Number of positions N · 3n, all of which precede φ.
         """
         estimated = self.association.estimated
         nodes, shape = self.shape_functions(phi)
@@ -461,14 +478,16 @@ class PointPositions:
         return SparseEntries(
             np.concatenate([rows.ravel(), column[upper[0], upper[1]]]),
             np.concatenate([columns.ravel(), column[upper[0], upper[2]]]),
-            np.concatenate([value.ravel(), by_coordinates[upper]]),
+            values=np.concatenate([value.ravel(), by_coordinates[upper]]),
         )
 
 
 def interpolation_matrix(
     nodes: Index, weights: Array, node_count: int
 ) -> sp.csr_array:
-    """Return the matrix (3M, 3n) of Σ_a weights[m, a] x_a; row 3 m + axis, column 3 node + axis."""
+    """Return the matrix (3M, 3n) of Σ_a weights[m, a] x_a for nodes (M, npe); row 3 m + axis,
+    column 3 node + axis, without entries of zero weights.
+    """
     marker = np.repeat(np.arange(len(nodes)), nodes.shape[1])
     per_node = sp.csr_array(
         (weights.ravel(), (marker, nodes.ravel())),

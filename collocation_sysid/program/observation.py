@@ -82,8 +82,8 @@ class Observation:
     def _reactions_at(
         self, x: Array, histories: Sequence[AnyHistory] = ()
     ) -> ReactionForces:
-        """Return the reaction forces on the sensed dofs at positions x (rows, 3n) [m]; internal
-        variables are computed from x where `histories` is empty.
+        """Return the reaction forces on the sensed dofs, without changes, at positions x (rows, 3n)
+        [m]; history variables are computed from x where `histories` is empty.
         """
         dynamics = self.equations.dynamics.truncated_to(len(x))
         dofs = self.segment.sensed_dofs
@@ -109,14 +109,21 @@ class Observation:
     def response_of_rows(
         self, rows: Iterable[Array], grasp_forces: GraspForces
     ) -> ObservableResponse:
-        """Compute the changes of the observables from changes of x, row by row.
+        """Compute the changes of the observables from changes of x, row by row, so that only
+        observed rows are stored.
 
         Parameters
         ----------
         rows : iterable of (3n, m) arrays
-            Changes of each row of x [m]; consumed.
+            Changes of each row of x [m], from row 0 on; consumed.
         grasp_forces : GraspForces
-            Forces on the sensed dofs with their changes.
+            Forces on the sensed dofs with their changes; stored, and complete only after the rows
+            are consumed if their iterator fills it.
+
+        Raises
+        ------
+        ValueError
+            If an observable is not observed at any of the rows.
         """
         channels = [reading.observable for reading in self.segment.residuals]
         operators = [channel.operator(self.phi) for channel in channels]
@@ -133,8 +140,14 @@ class Observation:
     def response_of_array(
         self, changes_m: Array, grasp_forces: GraspForces
     ) -> ObservableResponse:
-        """Return the changes of the observables, computed at once from changes (rows, 3n, m) [m] of
-        the first rows of x and from changes of the grasp forces.
+        """Return the changes of the observables, computed at once.
+
+        Parameters
+        ----------
+        changes_m : (rows, 3n, m) array
+            Changes of the first rows of x [m]; observed rows beyond them are left out.
+        grasp_forces : GraspForces
+            Forces on the sensed dofs with their changes; stored.
         """
         changes = []
         _, dofs, count = changes_m.shape
@@ -160,7 +173,8 @@ class Observation:
         step: Array | None = None,
         is_by_parameters: bool = True,
     ) -> list[ObservedMotion]:
-        """Return the motion as each measurement observes it, with its changes.
+        """Return the motion as each measurement observes it, with its changes; reaction forces are
+        computed on demand.
 
         Parameters
         ----------
@@ -172,7 +186,8 @@ class Observation:
             Step [m]. If given, values are those after the step, to first order, and column 0 of the
             forces of the response must belong to it.
         is_by_parameters : bool
-            Whether the columns are derivatives by the parameters that change the motion.
+            Whether the columns are derivatives by the parameters that change the motion, which also
+            change the masses.
 
         Returns
         -------
@@ -203,20 +218,11 @@ class Observation:
         step: Array | None,
         by_p: bool,
     ) -> ReactionForces:
-        """Return reaction forces with their changes.
-
-        Parameters
-        ----------
-        x : (rows, 3n) array
-            Positions [m].
-        grasp_forces : GraspForces
-            Forces on the sensed dofs, and their changes.
-        changes_m : (rows, g, c) array
-            Changes of the positions of the sensed dofs [m].
-        step : (rows, 3n) array or None
-            Feasibility step [m], whose change comes before the others; None without it.
-        by_p : bool
-            Whether the columns are derivatives by parameters, which also change masses.
+        """Returns
+        -------
+        ReactionForces
+            Values, with a step those after it to first order, and changes without the column of the
+            step.
         """
         dynamics = self.equations.dynamics.truncated_to(len(x))
         dofs = self.segment.sensed_dofs
@@ -240,7 +246,7 @@ class Observation:
         if by_p:
             first = 0 if step is None else 1
             by[..., first:] += self.equations.inertia_derivatives(
-                slice(len(x)), acceleration, dofs
+                slice(len(x)), acceleration, dofs=dofs
             )
         if step is None:
             return ReactionForces(
@@ -256,22 +262,22 @@ class Observation:
     def linearise(
         self, x: Array, response: ObservableResponse, step: Array | None = None
     ) -> list[tuple[Array, Array]]:
-        """Linearise the residuals of all measurements by (q, φ).
+        """Linearise the residuals of all measurements by (q, φ) along the equations of motion.
 
         Parameters
         ----------
         x : (rows, 3n) array
             Positions [m].
         response : ObservableResponse
-            Changes of the observables with the parameters.
+            Changes of the observables with the parameters of `Transcription.dynamic_parameters`.
         step : (rows, 3n) array, optional
             Step after which residuals are computed, to first order; see `linearised_motions`.
 
         Returns
         -------
         list of (array, array)
-            For each measurement, residuals (s, G, 3) and derivatives (s, G, 3, size) by all size =
-            nq + k parameters.
+            For each measurement, residuals (s, G, g) and derivatives (s, G, g, size) by all size =
+            nq + k parameters, see `MeasurementResidual.linearise`.
         """
         segment = self.segment
         size = self.segment.nq + len(self.phi)
@@ -298,6 +304,8 @@ class Observation:
         -------
         list of (array, array)
             For each measurement, residuals (s, G, 3) and derivatives (s, G, 3, k).
+
+        Wrenches are included, with the reaction forces of the motion.
         """
         forced = self._reactions_at(x)
         none = np.zeros(0, dtype=np.int64)
@@ -331,19 +339,21 @@ class Observation:
     # Backward ---------------------------------------------------------------------------------
 
     def reaction_vjp(self, x: Array, weights: Array) -> tuple[Array, Array]:
-        """Vector–Jacobian product of the reaction forces.
+        """Vector–Jacobian product of the reaction forces. The segment's `linearisation_buffer` is
+        overwritten.
 
         Parameters
         ----------
         x : (N, 3n) array
             Positions [m].
         weights : (N, g) array
-            Weights of the reaction forces R.
+            Weights of the reaction forces R [1/N].
 
         Returns
         -------
         ((N, 3n) array, (m,) array)
-            Derivatives of Σ weights · R by x and by the parameters that change the motion.
+            Derivatives of Σ weights · R by x [1/m] and by the parameters that change the motion,
+            including the dependence through history variables.
         """
         setting = self.equations
         segment = self.segment
@@ -360,7 +370,9 @@ class Observation:
         )
         if setting.mass_depends_on_parameters:
             acceleration = dynamics.acceleration(x)[:, dofs]
-            own = setting.inertia_derivatives(slice(None), acceleration, dofs)
+            own = setting.inertia_derivatives(
+                slice(None), acceleration, dofs=dofs
+            )
             by_p += np.einsum("tg,tgp->p", weights, own)
         rows = Submatrix(dynamics.pattern, dofs)
         state = np.zeros_like(x)
@@ -379,5 +391,7 @@ class Observation:
         by_x += dynamics.combine_transposed(t.q, rate) / dynamics.step_s
         inertia = dynamics.combine_transposed(t.s, self._mass_kg * weights)
         by_x[:, dofs] += inertia / dynamics.step_s**2
-        through_histories, own = segment.history_vjp(x, setting, force_weights)
+        through_histories, own = segment.history_vjp(
+            x, setting, weights=force_weights
+        )
         return by_x + through_histories, by_p + own

@@ -20,7 +20,7 @@ from ..recording.experiment import Experiment
 from ..recording.nuisance import PLACE, POSE_TURN, NuisanceRow
 from .markers.marker_association import MarkerAssociation
 
-# What a chart has for each marker.
+# Attributes of a `MarkerAssociation` with one row for each marker.
 OF_MARKERS = (
     "prior_places_m",
     "cells",
@@ -55,6 +55,9 @@ def nuisance_indices(
 ) -> list[NuisanceIndices]:
     """Assign the nuisance parameters of each experiment to entries of p.
 
+    A parameter gets a new entry, in the order of the experiments, unless an earlier experiment
+    shares it.
+
     Parameters
     ----------
     experiments : sequence of Experiment
@@ -62,10 +65,16 @@ def nuisance_indices(
     first : int
         Index in p of the first nuisance parameter.
 
+    Returns
+    -------
+    list of NuisanceIndices
+        One entry for each experiment.
+
     Raises
     ------
     InputError
-        If experiments share a parameter of things that differ, or with different priors.
+        If experiments share a parameter of objects that differ, with different priors, or a marker
+        with different stated places.
     """
     indices = []
     known = dict[Any, tuple[int, NuisanceEntry, Experiment]]()
@@ -107,10 +116,17 @@ def _require_same_objects(
     """Check that the objects on which a shared nuisance parameter depends are the same in two
     experiments.
 
+    Parameters
+    ----------
+    leader, experiment : Experiment
+        The first experiment with this scope, and the one that is checked; they may be the same.
+    row : NuisanceRow
+        Kind of nuisance parameter.
+
     Raises
     ------
     InputError
-        If they differ.
+        If an object of `experiment` differs; it is named.
     """
     theirs = row.same(leader)
     ours = row.same(experiment)
@@ -129,7 +145,12 @@ def _require_same_prior(
     other: tuple[Experiment, NuisanceEntry],
 ) -> None:
     """Check that a nuisance parameter shared by two experiments has one prior, and a shared marker
-    one stated place.
+    one stated place, in both or in neither.
+
+    Parameters
+    ----------
+    one, other : (Experiment, NuisanceEntry)
+        The first experiment that has the parameter, and the one that is checked.
 
     Raises
     ------
@@ -163,7 +184,7 @@ def _require_same_prior(
 
 
 def _declared_place(experiment: Experiment, entry: NuisanceEntry) -> Array:
-    """Return the stated place (3,) of a marker, NaN if there is none."""
+    """Return the stated place (3,) of a marker on the undeformed body [m], NaN if there is none."""
     markers = experiment.markers
     at = markers.predict_positions(experiment.body.nodes_m)[entry.number]
     return at if markers.located[entry.number] else np.full(3, np.nan)
@@ -172,7 +193,17 @@ def _declared_place(experiment: Experiment, entry: NuisanceEntry) -> Array:
 def _sharing_error(
     experiment: Experiment, row: NuisanceRow, result: str, expected: str
 ) -> InputError:
-    """Return the error message for a parameter that cannot be shared."""
+    """Return the error for a parameter that cannot be shared.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment that the message names as its location.
+    row : NuisanceRow
+        Kind of nuisance parameter.
+    result, expected : str
+        What was found, and what was expected, for the message.
+    """
     key = row.key or row.name
     message = f"{key} is shared with {result}; expected {expected}, or a separate scope"
     return InputError(message, None, where=f"experiment '{experiment.name}'")
@@ -183,8 +214,14 @@ def shared_charts(
         tuple[NuisanceIndices, NuisanceMap, MarkerAssociation]
     ],
 ) -> list[MarkerAssociation]:
-    """Return the associations, with shared places and clocks equal to those of the first experiment
-    that shares them.
+    """Return the association of each experiment, with shared places and clocks equal to those of
+    the first experiment that shares them; an association without such differences is returned as it
+    is.
+
+    Parameters
+    ----------
+    experiments : iterable of (NuisanceIndices, NuisanceMap, MarkerAssociation)
+        The experiments in their order.
     """
     leaders = dict[int, tuple[MarkerAssociation, int]]()
     samples = dict[int, int]()

@@ -34,7 +34,7 @@ from .wrench.reaction_forces import forces_on_dofs, reaction_forces
 from .wrench.wrench_observable import ReactionGrid, sensed_dofs
 from .wrench.wrench_residual import wrench_residuals
 
-# Name of the integrator that is no collocation scheme, and its order of accuracy.
+# Name of the integrator that is no collocation scheme.
 NEWMARK = "newmark"
 # Order of accuracy of Newmark's method with the trapezoidal rule.
 NEWMARK_ORDER = 2
@@ -55,7 +55,7 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Simulated motion of an experiment, with the predictions of its measurements.
+    """Simulated motion of an experiment, with the predictions of its measurements without noise.
 
     Attributes
     ----------
@@ -68,17 +68,19 @@ class Trajectory:
     markers_m : (T, M, 3) array
         Markers [m].
     reactions : (ReactionGrid, ReactionForces)
-        Reaction forces on the dofs of instrumented grasps, and their times.
-    wrenches : tuple of (S, 6) arrays
-        Predictions of the force–torque sensors at their times [N] and [N m], NaN outside the known
+        Reaction forces on the dofs of instrumented grasps at the times of the time steps, and these
         times.
+    wrenches : tuple of (S, 6) arrays
+        Predictions of the force–torque sensors at the times of their samples [N] and [N m], NaN
+        outside the known times.
     custom_sensor_values : tuple of (S, m) arrays
         Predictions of the custom sensors, from the positions at the samples.
     steps_per_sample : int
         Time steps between samples; 1 in a static experiment.
     step_error_m : float or None
         Largest error of node positions at the samples due to the time step [m], estimated by
-        halving the step; None where the step was stated, or the experiment is static.
+        halving the step; None where the step was stated, the experiment is static, or only the
+        finest steps could be simulated.
     """
 
     t_s: Array
@@ -93,7 +95,9 @@ class Trajectory:
 
 
 def require_steps(experiment: Experiment, step_s: float) -> None:
-    """Raise InputError if a time step needs too many steps per sample of an experiment."""
+    """Raise InputError if time steps of `step_s` [s] would be more than `MOST_STEPS` per sample of
+    an experiment; a static one has none.
+    """
     if not experiment.is_static and experiment.timestep_s > MOST_STEPS * step_s:
         raise InputError(
             f"found steps of {step_s:g} s; expected at most {MOST_STEPS} from sample to sample"
@@ -114,21 +118,24 @@ def simulate(
     Parameters
     ----------
     experiment : Experiment
-        The experiment; measurements are not used.
+        The experiment; measurements are not used, nor are its nuisance parameters.
     parameters : Parameters, mapping or sequence of float
         Parameters (their guesses are used), values by name, or θ in the order of the body.
     integrator : str or Scheme
-        "newmark", or a scheme on the collocation grid, by its name in `schemes.SCHEMES`.
+        "newmark", or a scheme on the collocation grid, by its name in `schemes.SCHEMES`. A static
+        experiment is simulated in the same way with all.
     timestep_s : float, optional
-        Newmark's step, rounded to divide the sample interval; ignored for schemes.
+        Newmark's step [s], rounded to divide the sample interval; ignored for schemes.
     substeps : int or "auto"
         Time steps between samples; ignored where `timestep_s` is given for Newmark. "auto" doubles
         them until the node positions at the samples are accurate to 0.01 % of the largest
-        displacement, at most 32 (`Trajectory.steps_per_sample`, `Trajectory.step_error_m`).
+        displacement, at most 32 (`Trajectory.steps_per_sample`, `Trajectory.step_error_m`). If 32
+        do not suffice, the result with 32 is returned.
     options : NewtonOptions, optional
         Options of Newton's method.
     progress : callable, optional
-        Called with the share done, between 0 and 1, of each pass.
+        Called with the share done, between 0 and 1, of each pass; automatic steps take several
+        passes.
 
     Returns
     -------
@@ -138,8 +145,8 @@ def simulate(
     Raises
     ------
     InputError
-        For a step or substeps that are not positive, too many steps, an unknown scheme, or a
-        density that leaves a node without mass.
+        For a step or substeps that are not positive, too many steps, an unknown scheme, a density
+        that leaves a node without mass, or a stress-free shape that cannot be computed.
     SimulationError
         When a step fails even after halvings; names time and element, and where an equilibrium
         ceased to be stable the mode, see `program.find_stability_loss`.
@@ -170,8 +177,8 @@ def _simulate(
     options: NewtonOptions | None,
     progress: Progress | None,
 ) -> Trajectory:
-    """Return what `simulate` returns; see there for the arguments. Errors do not have the reasons
-    that `simulate` adds.
+    """Return the result of `simulate`, with arguments as there except θ (`theta`); errors do not
+    contain the reasons that `simulate` adds.
     """
     if timestep_s is not None and not timestep_s > 0:
         raise InputError(
@@ -221,9 +228,11 @@ def _with_automatic_steps(
     options: NewtonOptions | None,
     progress: Progress | None,
 ) -> Trajectory:
-    """Return the simulation of a dynamic experiment whose steps are halved until it is accurate.
+    """Return the simulation of a dynamic experiment whose steps are halved until it is accurate, or
+    `MOST_AUTOMATIC_STEPS` are reached.
 
-    A number of steps that cannot be simulated counts as inaccurate. Arguments as in `simulate`.
+    A number of steps that cannot be simulated counts as inaccurate. Arguments as in `simulate`,
+    with constants θ.
 
     Raises
     ------
@@ -265,8 +274,8 @@ def _with_automatic_steps(
 def _accepted_error_m(trajectory: Trajectory) -> float:
     """Return the error of positions [m] at which a simulation needs no finer steps.
 
-    It is relative to the largest distance of a node from its first position; for a body that does
-    not move it is a rounding error.
+    It is `STEP_TOLERANCE` times the largest distance of a node from its first position; for a body
+    that hardly moves it is a rounding error, `ROUNDING` times the size of the body.
     """
     positions = trajectory.positions_m
     farthest_m = np.linalg.norm(positions - positions[0], axis=2).max()
@@ -282,10 +291,14 @@ def _with_steps(
     options: NewtonOptions | None,
     progress: Progress | None,
 ) -> Trajectory:
-    """Return the simulation with a number of time steps between samples, see `simulate`."""
+    """Return the simulation with `steps` time steps between samples; other arguments as in
+    `simulate`, with constants θ.
+
+    Velocities of a collocation scheme are central differences of its positions.
+    """
     sensed = sensed_dofs(experiment)
     if integrator == NEWMARK and not experiment.is_static:
-        x, v, forced = simulate_newmark(
+        motion = simulate_newmark(
             experiment,
             theta,
             steps_per_sample=steps,
@@ -293,6 +306,9 @@ def _with_steps(
             progress=progress,
             sensed=sensed,
         )
+        x = motion.positions_m
+        v = motion.velocities_m_s
+        forced = motion.reactions
         rows = (len(x) - 1) * steps + 1
         at = ReactionGrid.from_times(
             np.linspace(experiment.t_s[0], experiment.t_s[-1], rows)
@@ -355,7 +371,9 @@ def _custom_sensor_values(
     Parameters
     ----------
     experiment : Experiment
+        The experiment.
     positions_m : (T, n, 3) array
+        Node positions at its samples [m].
     reactions : (ReactionGrid, ReactionForces)
         Reaction forces of the motion, and their times.
     ideal : NuisanceMap
@@ -384,19 +402,34 @@ def with_wrenches(
 ) -> Experiment:
     """Return the experiment with other samples (S, 6) [N, N m] of its force–torque sensors, one
     array for each grasp that has one, in the order of the grasps.
+
+    Raises
+    ------
+    ValueError
+        If the number of arrays is not that of the sensors.
     """
-    samples = iter(wrenches)
-    grasps = []
-    for grasp in experiment.grasps:
-        sensor = grasp.wrench and replace(grasp.wrench, values=next(samples))
-        grasps.append(replace(grasp, wrench=sensor))
+    instrumented = [
+        k for k, g in enumerate(experiment.grasps) if g.wrench is not None
+    ]
+    grasps = [*experiment.grasps]
+    for k, values in zip(instrumented, wrenches, strict=True):
+        sensor = grasps[k].wrench
+        assert sensor is not None
+        grasps[k] = replace(grasps[k], wrench=replace(sensor, values=values))
     return replace(experiment, grasps=grasps)
 
 
 def with_readings(
     experiment: Experiment, values: Sequence[ArrayLike]
 ) -> Experiment:
-    """Return the experiment with other samples (S, m) of its custom sensors, one array for each."""
+    """Return the experiment with other samples (S, m) of its custom sensors, one array for each, in
+    their order.
+
+    Raises
+    ------
+    ValueError
+        If the number of arrays is not that of the sensors.
+    """
     pairs = zip(experiment.readings, values, strict=True)
     return replace(
         experiment, readings=[replace(g, values=v) for g, v in pairs]

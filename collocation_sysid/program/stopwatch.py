@@ -6,6 +6,25 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from typing import NamedTuple
+
+
+class ComputingTimes(NamedTuple):
+    """Computing times by kind of work.
+
+    Attributes
+    ----------
+    build : float
+        Time of symbolic work and tables [s].
+    evaluations : float
+        Time of element kernels [s].
+    linear_algebra : float
+        Time of factorisations and substitutions [s].
+    """
+
+    build: float
+    evaluations: float
+    linear_algebra: float
 
 
 class Stopwatch:
@@ -37,7 +56,7 @@ class Stopwatch:
 
     @contextmanager
     def _timing(self, kind: str) -> Iterator[None]:
-        """Context manager that adds the time of its block to the attribute `kind`."""
+        """Add the time of the block, also if it raises, to the attribute `kind`."""
         began = self.clock()
         try:
             yield
@@ -48,26 +67,32 @@ class Stopwatch:
     def add(
         self, build: float, evaluations: float, linear_algebra: float
     ) -> None:
-        """Add times measured by another stopwatch [s]."""
+        """Add times measured by another stopwatch [s] to the attributes of the same names, in
+        place.
+        """
         with self._adding:
             self.build += build
             self.evaluations += evaluations
             self.linear_algebra += linear_algebra
 
-    def read_and_reset(self) -> tuple[float, float, float]:
-        """Return (build, evaluations, linear_algebra) [s] and reset all three to zero."""
-        spent = self.build, self.evaluations, self.linear_algebra
+    def read_and_reset(self) -> ComputingTimes:
+        """Return the accumulated times and reset all three to zero."""
+        spent = ComputingTimes(
+            self.build,
+            self.evaluations,
+            linear_algebra=self.linear_algebra,
+        )
         self.build = self.evaluations = self.linear_algebra = 0.0
         return spent
 
     def building(self) -> AbstractContextManager[None]:
-        """Context manager that measures symbolic work and tables."""
+        """Return a context manager that adds the time of its block to `build`."""
         return self._timing("build")
 
     def evaluating(self) -> AbstractContextManager[None]:
-        """Context manager that measures element kernels."""
+        """Return a context manager that adds the time of its block to `evaluations`."""
         return self._timing("evaluations")
 
     def solving(self) -> AbstractContextManager[None]:
-        """Context manager that measures factorisations and substitutions."""
+        """Return a context manager that adds the time of its block to `linear_algebra`."""
         return self._timing("linear_algebra")

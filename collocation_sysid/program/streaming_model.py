@@ -70,7 +70,9 @@ class StreamStencil(NamedTuple):
     delay: int = 0
 
     def rows_of_sample(self, at: float) -> range:
-        """Return the rows that a sample at a position `at`, in rows, needs."""
+        """Return the rows that a sample at a position `at`, in rows and not necessarily a whole
+        number, needs for every clock error; none before `first`.
+        """
         begins, ends = (
             max(
                 int(np.floor(at + off + ROW_TOLERANCE))
@@ -80,6 +82,25 @@ class StreamStencil(NamedTuple):
             for off in (-self.clock_error, self.clock_error)
         )
         return range(begins, ends + self.neighbours)
+
+
+class StencilMatrices(NamedTuple):
+    """Stencil coefficients as matrices that map values at all rows to values of each row.
+
+    Each has the shape (rows, rows); p, q and s apply to positions and give the states ξ [m] and ν
+    [m/s] of the evaluations and the accelerations [m/s²], w applies to the forces at the
+    evaluations. The time step is included in q and s.
+
+    Attributes
+    ----------
+    p, q, w, s : (rows, rows) arrays
+        Coefficients of row t and time t − i at [t, t − i], see `model.schemes`.
+    """
+
+    p: Array
+    q: Array
+    w: Array
+    s: Array
 
 
 class StreamInstrument(NamedTuple):
@@ -92,7 +113,8 @@ class StreamInstrument(NamedTuple):
     stencil : StreamStencil
         Rows that its samples need.
     observable : slice or int
-        Slice of its points among all observed points, or the index of the grasp sensor.
+        Slice of its points among all observed points, those of the markers first; or the index of
+        the wrench in `StreamingModel.wrench_sensors`.
     """
 
     reading: MeasurementResidual
@@ -104,12 +126,14 @@ class StreamInstrument(NamedTuple):
 class StreamingModel:
     """Program whose recording arrives frame by frame.
 
+    Its cached buffers are shared by all sweeps with this model, so that only one may run at a time.
+
     Attributes
     ----------
     experiment : Experiment
         Fitted experiment, as declared in the problem.
     collocation : Collocation
-        Program of the still recording.
+        Program of the still recording, the template of all rows.
     """
 
     experiment: Experiment
@@ -124,9 +148,10 @@ class StreamingModel:
         Parameters
         ----------
         experiment : Experiment
-            Fitted experiment. Its grasps hold throughout, and its loads are constant.
+            Fitted experiment. Its grasps hold throughout, and its loads are constant (not checked
+            here).
         collocation : Collocation
-            Program of this experiment, in which every parameter has a guess.
+            Program of this experiment, in which every parameter has a guess; its options are used.
         """
         still = replace(
             collocation,
@@ -135,19 +160,20 @@ class StreamingModel:
         return cls(experiment, still)
 
     def at_start(self, poses: Poses) -> Experiment:
-        """Return the experiment that begins with its grasps at these poses."""
+        """Return the still recording with its grasps at these poses, one (rotation, position) for
+        each grasp.
+        """
         still = self.segment.experiment
         return replace(still, grasps=_grasps_at(still, poses))
 
     def with_marker_places(self, tracks_m: Array, x: Array) -> StreamingModel:
-        """Return the model with unknown marker places set from the first frame.
-
-        Self if all are known.
+        """Return the model with unknown marker places set from the first frame; self if no unknown
+        marker is in the frame.
 
         Parameters
         ----------
         tracks_m : (M, 3)
-            Marker positions of the first frame, NaN where missing.
+            Marker positions of the first frame [m], NaN where missing.
         x : (3n,)
             Node positions of the start [m].
         """
@@ -196,12 +222,12 @@ class StreamingModel:
 
     @property
     def rows_per_chunk(self) -> int:
-        """Largest number of rows that are linearised together."""
+        """Largest number of rows that are linearised together, `ROWS_PER_CHUNK`."""
         return ROWS_PER_CHUNK
 
     @property
     def substeps(self) -> int:
-        """Number of rows per sample."""
+        """Number of rows (time steps) from sample to sample."""
         return self.collocation.substeps
 
     @property
@@ -221,7 +247,8 @@ class StreamingModel:
         return places, self.collocation.guess_p[places]
 
     def transformed(self, p: Array) -> Array:
-        """Return the variables (P,) in which residuals are nearly linear, for parameters p (P,).
+        """Return the variables (P,) in which residuals are nearly linear, for parameters p (P,),
+        which are not modified.
 
         For mass-proportional damping γ_m this is its value divided by the guess, otherwise p
         itself.
@@ -232,7 +259,9 @@ class StreamingModel:
         return transformed_values
 
     def physical(self, transformed: Array) -> Array:
-        """Return the parameters p of transformed variables: the inverse of `transformed`."""
+        """Return the parameters p (P,) of transformed variables (P,), which must be positive for
+        γ_m: the inverse of `transformed`.
+        """
         places, guesses = self._mass_damping
         p = transformed.copy()
         p[places] = guesses + np.log(transformed[places])
@@ -248,8 +277,9 @@ class StreamingModel:
         return rates
 
     def prior_information(self, p: Array) -> SquareRootInformation:
-        """Return the information before the first frame, linearised about p: priors and a weak
-        prior.
+        """Return the information before the first frame in the transformed parameters, linearised
+        about p (P,): the stated priors, and a weak prior of deviation `WEAK_PRIOR_DEVIATION` about
+        the guess of each shared parameter.
         """
         residual, slopes = self.collocation.prior_residuals(p)
         nq = self.collocation.nq
@@ -265,14 +295,15 @@ class StreamingModel:
         ) / self.transformation_derivatives(transformed_values)
         empty = SquareRootInformation.empty(self.parameter_count)
         return empty.with_rows(
-            np.concatenate([residual, from_guess]), rows, transformed_values
+            np.concatenate([residual, from_guess]),
+            rows,
+            parameters=transformed_values,
         )
 
     @cached_property
     def neighbouring_samples(self) -> int:
-        """Number of samples before and after one that its evaluation needs.
-
-        0 if no clock is estimated.
+        """Number of samples before, and after, one marker sample that its evaluation needs; 0 if no
+        clock is estimated.
         """
         return (
             NEIGHBOURS // 2 if len(self.segment.nuisance.clock_indices) else 0
@@ -280,8 +311,8 @@ class StreamingModel:
 
     @cached_property
     def marker_model(self) -> MarkerResidual:
-        """Sensor model of one marker sample, in the middle of its neighbours, measured at the
-        origin.
+        """Sensor model of one marker sample, in the middle of its neighbouring samples, measured at
+        the origin, with a quadratic loss.
         """
         neighbours = self.neighbouring_samples
         markers = self.segment.experiment.markers
@@ -295,14 +326,16 @@ class StreamingModel:
         return MarkerResidual.from_markers(
             origin,
             rows,
-            segment.nuisance,
-            segment.association,
+            nuisance=segment.nuisance,
+            association=segment.association,
             preceding_times=neighbours,
         )
 
     @cached_property
     def instruments(self) -> tuple[StreamInstrument, ...]:
-        """Custom sensors, then the sensors of grasps."""
+        """Custom sensors, then the sensors of grasps, each in its order; their samples are those of
+        the still recording.
+        """
         instruments = []
         place = len(self.experiment.markers.names)
         step_s = self.segment.dynamics.step_s
@@ -328,12 +361,16 @@ class StreamingModel:
                 reading = replace(reading, observable=points_of_sensor)
                 observable = slice(place, place + points_of_sensor.vector_count)
                 place += points_of_sensor.vector_count
-            instruments.append(StreamInstrument(reading, stencil, observable))
+            instruments.append(
+                StreamInstrument(reading, stencil, observable=observable)
+            )
         return tuple(instruments)
 
     @cached_property
     def largest_delay_rows(self) -> int:
-        """Largest number of rows that instruments need in addition to those of the markers."""
+        """Largest number of rows that instruments need in addition to those of the markers; 0
+        without instruments.
+        """
         spans = (
             2 * each.stencil.clock_error + each.stencil.delay
             for each in self.instruments
@@ -342,7 +379,9 @@ class StreamingModel:
 
     @cached_property
     def observed_points(self) -> tuple[PointPositions, ...]:
-        """Points that custom sensors of points observe."""
+        """Points that custom sensors observe, one entry for each custom sensor of points; those of
+        grasps have none.
+        """
         still = self.segment.experiment
         gauges = [gauge for gauge in still.readings if gauge.grasp is None]
         return tuple(
@@ -351,7 +390,9 @@ class StreamingModel:
 
     @cached_property
     def wrench_sensors(self) -> tuple[Sensor, ...]:
-        """Wrenches of grasps that sensors observe, each with the index of its grasp."""
+        """Wrenches of grasps that sensors observe, each with the index of its grasp, from 0: those
+        of force–torque sensors, then of custom sensors.
+        """
         channels = [reading.observable for reading in self.segment.residuals]
         grasps = [id(grasp) for grasp in self.segment.experiment.grasps]
         wrenches = (
@@ -379,11 +420,20 @@ class StreamingModel:
 
     @cached_property
     def first_poses(self) -> Poses:
-        """Poses of all grasps at the start of the problem's recording."""
+        """Poses of all grasps at the start of the problem's
+        recording, (rotation, position) each.
+        """
         return _first_poses(self.experiment)
 
     def all_poses(self, moved: Poses) -> Poses:
-        """Return the poses of all grasps from those of the moving ones."""
+        """Return the poses of all grasps from those of the moving ones, in the order of
+        `moving_grasps`; the others are at their first poses.
+
+        Raises
+        ------
+        ValueError
+            If the number of poses is not that of the moving grasps.
+        """
         still = list(self.first_poses)
         for number, pose in zip(self.moving_grasps, moved, strict=True):
             still[number] = pose
@@ -396,21 +446,25 @@ class StreamingModel:
 
     @cached_property
     def factor_memory(self) -> FactorMemory | None:
-        """Memory for the factor of a row, shared by all passes; None without native code."""
+        """Memory for the factor of a row, shared by all passes; None where factors allocate their
+        own.
+        """
         return self.solver.factoriser.allocate(
             1 + self.segment.body.is_unsymmetric
         )
 
     @cached_property
     def linearisation_memory(self) -> Array:
-        """Memory for rows that are linearised together."""
+        """Memory for rows that are linearised together, (ROWS_PER_CHUNK, width); overwritten by
+        each linearisation.
+        """
         return np.empty(
             (ROWS_PER_CHUNK, self.segment.dynamics.forces.linearisation_width)
         )
 
     @cached_property
     def body_size_m(self) -> float:
-        """Diagonal of the body [m]."""
+        """Diagonal of the bounding box of the undeformed body [m]."""
         return float(np.linalg.norm(np.ptp(self.segment.body.nodes_m, axis=0)))
 
     def displaced_nodes(self, phi: Array) -> tuple[Array, Array]:
@@ -423,14 +477,15 @@ class StreamingModel:
     def prescribed_positions(
         self, displaced_nodes: tuple[Array, Array], poses: Sequence[Poses]
     ) -> tuple[Array, Array]:
-        """Return the prescribed positions (K, g) at K poses, and their derivatives by φ (K, g, m).
+        """Return the prescribed positions (K, g) [m] of the g grasped dofs at K times, and their
+        derivatives by φ (K, g, m).
 
         Parameters
         ----------
         displaced_nodes : tuple
             Result of `displaced_nodes`.
         poses : sequence of Poses
-            K poses of all grasps.
+            For each of the K times, the poses of all grasps.
         """
         rotations = np.array([[turn for turn, _ in each] for each in poses])[
             :, *self._axes
@@ -451,31 +506,35 @@ class StreamingModel:
         return grasp, dofs % 3
 
     @cached_property
-    def stencils(self) -> tuple[Array, Array, Array, Array]:
-        """Coefficients p, q, w and s of all rows, as (rows, rows) matrices.
-
-        q and s include the time step.
-        """
+    def stencils(self) -> StencilMatrices:
+        """Stencil coefficients of all rows of the template."""
         dynamics = self.segment.dynamics.truncated_to(self.template_rows)
         tables = dynamics.tables
         step_s = dynamics.step_s
-        p, q, w, s = (
-            np.sum(
-                [
-                    np.diag(each[lag:, lag], -lag)
-                    for lag in range(each.shape[1])
-                ],
-                axis=0,
-            )
-            for each in (tables.p, tables.q, tables.w, tables.s)
+        return StencilMatrices(
+            p=_banded_matrix(tables.p),
+            q=_banded_matrix(tables.q) / step_s,
+            w=_banded_matrix(tables.w),
+            s=_banded_matrix(tables.s) / step_s**2,
         )
-        return p, q / step_s, w, s / step_s**2
+
+
+def _banded_matrix(table: Array) -> Array:
+    """Return the matrix (rows, rows) with table[t, lag] at [t, t − lag], from a table (rows, lags);
+    entries before row 0 are left out.
+    """
+    matrix = np.zeros((len(table), len(table)))
+    for lag in range(table.shape[1]):
+        matrix += np.diag(table[lag:, lag], -lag)
+    return matrix
 
 
 def _still_experiment(
     experiment: Experiment, collocation: Collocation
 ) -> Experiment:
-    """Return the experiment as a few samples in which nothing moves."""
+    """Return the experiment as a few samples in which nothing moves: grasps at their first poses,
+    markers at their first samples (zero for markers without any), and sensors at zero.
+    """
     reach = collocation.transcriptions[0].dynamics.largest_lag
     # The rows of the start, and room for a reading.
     count = max(2 * reach + 2 + ROWS_PER_CHUNK, NEIGHBOURS, 3)
@@ -514,13 +573,15 @@ def _still_wrench(wrench: Wrench, t_s: NDArray) -> Wrench:
 
 
 def _first_poses(experiment: Experiment) -> Poses:
-    """Return the poses of all grasps at the start of a recording."""
+    """Return the poses of all grasps at the first times of their pose sequences, (rotation,
+    position) each.
+    """
     poses = (grasp.poses.at(grasp.poses.t_s[:1]) for grasp in experiment.grasps)
     return tuple((rotations[0], shifts[0]) for rotations, shifts in poses)
 
 
 def _grasps_at(experiment: Experiment, poses: Poses) -> list:
-    """Return the grasps of an experiment, at rest at given poses."""
+    """Return the grasps of an experiment, at rest at given poses, (rotation, position) each."""
     grasps = []
     for grasp, (turn, shift) in zip(experiment.grasps, poses, strict=True):
         matrix = np.eye(4)

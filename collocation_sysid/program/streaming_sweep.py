@@ -27,7 +27,11 @@ from .forward.newton_solver import NewtonFailure, simulation_error
 from .forward.scheme_simulation import RowEquations, extrapolate, solve_row
 from .least_squares import SquareRootInformation
 from .measurement_residual import huber_as_least_squares, lagrange_weights
-from .observables import ObservableDerivatives, ObservedMotion
+from .observables import (
+    ObservableDerivatives,
+    ObservedMotion,
+    ReactionForces,
+)
 from .streaming_model import ROW_TOLERANCE, ROWS_PER_CHUNK, StreamingModel
 from .sweep import (
     FactorisedStep,
@@ -53,11 +57,12 @@ class Sample(NamedTuple):
     Attributes
     ----------
     rows_back : float
-        Time of the sample, in rows before the row after which it is evaluated.
+        Time of the sample, in rows before the row after which it is evaluated; 0 for that row
+        itself.
     values : (M, 3) or (m,)
-        Marker positions, or values of an instrument; NaN where missing.
+        Marker positions [m], or values of an instrument; NaN where missing.
     instrument : int
-        0 for markers, or the number of the instrument, from 1 on.
+        0 for markers, or the number of the instrument in `StreamingModel.instruments`, from 1 on.
     """
 
     rows_back: float
@@ -71,9 +76,9 @@ class LoggedRow(NamedTuple):
     Attributes
     ----------
     poses : Poses
-        Poses of the grasps that move.
+        Poses of the grasps that move, in the order of `StreamingModel.moving_grasps`.
     samples : list of Sample
-        Samples that are evaluated after this row.
+        Samples that are evaluated after this row; often empty.
     """
 
     poses: Poses
@@ -103,9 +108,10 @@ class LinearisedResidual(NamedTuple):
 
     Attributes
     ----------
-    at_zero : (G, 3) or (m,)
-        Residuals extrapolated to transformed parameters of zero; NaN where missing.
-    slope : (…, P)
+    at_zero : (G, 3)
+        Residuals in standard deviations, extrapolated to transformed parameters of zero; NaN where
+        missing.
+    slope : (G, 3, P)
         Derivatives by the transformed parameters.
     instrument : int
         Instrument, see `Sample`.
@@ -116,7 +122,9 @@ class LinearisedResidual(NamedTuple):
     instrument: int = 0
 
     def evaluate_at(self, transformed: Array) -> Array:
-        """Return the residuals at transformed parameters, to first order."""
+        """Return the residuals (G, 3) at transformed parameters (P,), to first order; NaN where
+        missing.
+        """
         return self.at_zero + self.slope @ transformed
 
 
@@ -132,18 +140,18 @@ class SweepState:
     Attributes
     ----------
     row : int
-        Number of rows done.
+        Number of rows done since the start of the recording.
     end : int
-        Index of the next row in the template.
+        Index of the next row in the template, whose rows before it are the latest ones.
     x, force : (rows, 3n)
-        Positions and forces of the rows of the template.
+        Positions [m] and forces [N] of the rows of the template.
     prescribed_columns : (rows, g, 1 + m)
         Columns of the prescribed positions of the grasped dofs.
     reactions : GraspReactions
         Reaction forces of grasps with a sensor.
     last_rows : ForwardState or None
         Columns of the last rows; None at the start.
-    observed_rows : tuple of Read
+    observed_rows : tuple of ObservedRow
         Observed quantities of the last rows, the latest one last.
     """
 
@@ -163,12 +171,14 @@ class StreamingSweep:
     Parameters
     ----------
     model : StreamingModel
+        The program; its buffers are used.
     p : (P,)
         Linearisation point.
-    known : SquareRootInformation
-        Information from before its first row.
+    prior_information : SquareRootInformation
+        Information from before its first row, in the transformed parameters.
     start : SweepState, optional
-        State at which the pass begins; the start of the recording by default.
+        State at which the pass begins, not modified; the start of the recording by default, also
+        without `at`.
     at : (P,), optional
         Linearisation point of that state, which is moved to p along its columns. Columns by
         transformed parameters stay the same.
@@ -176,14 +186,14 @@ class StreamingSweep:
     Attributes
     ----------
     information : SquareRootInformation
-        Information at p in the transformed parameters, from `known` and all samples so far.
+        Information in the transformed parameters, from `prior_information` and all residuals added.
     longest_m : float
-        Longest correction so far [m].
+        Longest accepted correction so far [m].
 
     Raises
     ------
     SimulationError
-        If the start cannot be computed.
+        By `advance`, if the start or a row cannot be computed.
     """
 
     def __init__(
@@ -267,8 +277,9 @@ class StreamingSweep:
         )
 
     def _moved_state(self, state: SweepState, at: Array) -> SweepState:
-        """Return `state` extrapolated to first order from the parameters `at` of its linearisation
-        point to those of this pass; unchanged if they are equal.
+        """Return `state` extrapolated to first order from the parameters `at` (P,) of its
+        linearisation point to those of this pass; the same object if they are equal or nothing is
+        computed yet.
         """
         if state.last_rows is None or (at == self.p).all():
             return state
@@ -305,7 +316,7 @@ class StreamingSweep:
         point_columns = self._at_points(columns_of_rows)
         point_columns[..., 1:] *= self.rates[moving]
         stored_rows = [
-            StoredRow(self.transformed, w[:, 0], k.columns)
+            StoredRow(self.transformed, w[:, 0], columns=k.columns)
             for w, k in zip(columns_of_rows, stored, strict=True)
         ]
         all_wrenches = np.array(
@@ -327,7 +338,7 @@ class StreamingSweep:
         )
 
     def _resume(self, state: SweepState) -> None:
-        """Replace the state of this pass, in place, by a given one, whose arrays are copied."""
+        """Set the state of this pass, in place, to a given one, whose arrays are copied."""
         self.row = state.row
         self.end = state.end
         self.x = state.x.copy()
@@ -336,7 +347,7 @@ class StreamingSweep:
         grasped = None
         if self.segment.nuisance.affects_grasps:
             grasped = PrescribedColumns.from_columns(
-                self.solver, self.grasped, self.prescribed_columns
+                self.solver, self.grasped, columns=self.prescribed_columns
             )
         self.columns = SweepColumns(
             self.setting, self.count, has_step=True, prescribed=grasped
@@ -359,12 +370,16 @@ class StreamingSweep:
 
     @property
     def needs_another_pass(self) -> bool:
-        """Whether a correction was so long that its square is not negligible."""
+        """Whether an accepted correction was longer than `LARGEST_CORRECTION` body sizes, so that
+        its square is not negligible.
+        """
         return self.longest_m > LARGEST_CORRECTION * self.model.body_size_m
 
     @property
     def state(self) -> SweepState:
-        """Copy of the state on which the next row depends."""
+        """State on which the next row depends; its arrays are copied, except the columns of the
+        last rows.
+        """
         return SweepState(
             row=self.row,
             end=self.end,
@@ -384,14 +399,15 @@ class StreamingSweep:
         """Compute further rows with given poses; return them for later passes.
 
         Fewer rows than given are computed if one is far from its initial guess: later guesses are
-        then wrong, too.
+        then wrong, too. At the start of an experiment whose row 0 is given, this row alone is
+        computed. The caller passes the remaining poses again.
 
         Parameters
         ----------
         poses : sequence of Poses
-            Poses of the moving grasps, for at most `ROWS_PER_CHUNK` rows.
+            Poses of the moving grasps, for one to `ROWS_PER_CHUNK` rows.
         guesses : sequence of (3n,), optional
-            Initial guesses of the positions; extrapolated by default.
+            Initial guesses of the positions [m], one for each row; extrapolated by default.
 
         Returns
         -------
@@ -477,8 +493,9 @@ class StreamingSweep:
         return self.end
 
     def _extrapolate(self, t: int, poses: Poses) -> Array:
-        """Return an initial guess of the positions (3n,) of row t, on a cubic polynomial through
-        the last four rows, or through fewer at the start; row 0 is the initial state for `poses`.
+        """Return an initial guess of the positions (3n,) of row t of the template, on a cubic
+        polynomial through the last four rows, or through fewer at the start; row 0 is the initial
+        state for `poses`.
         """
         if t == 0:
             return self._start_positions(poses)
@@ -506,32 +523,37 @@ class StreamingSweep:
     def _linearise(
         self, here: range
     ) -> tuple[Linearisation, tuple[Array, Array]]:
-        """Return forces with derivatives at guessed rows, and the right-hand sides of their
-        columns.
+        """Return forces with derivatives at the guessed rows `here` of the template, and the
+        right-hand sides (R, F_R) of their columns, see `SweepColumns.right_hand_sides`.
 
-        Corrections of the previous rows count as done and are set to zero.
+        The corrections of previous rows, column 0 of the state, are contained in their positions:
+        they are set to zero, in place.
         """
         for past in (*self.forward.past, *self.forward.past_increments):
             past[:, 0] = 0.0
         rows = slice(here.start, here.stop)
         known = slice(here.stop)
-        p, q, w, s = (table[rows, known] for table in self.model.stencils)
+        stencils = self.model.stencils
         x = self.x[known]
         force = self.force[known]
         free = self.solver.free
-        nu = q @ x
-        acceleration = s @ x
+        acceleration = stencils.s[rows, known] @ x
         at = self.forces.linearise(
-            p @ x, nu, self.model.linearisation_memory[: len(here)]
+            stencils.p[rows, known] @ x,
+            stencils.q[rows, known] @ x,
+            self.model.linearisation_memory[: len(here)],
         )
         force[rows] = at.force
-        residual = (w @ force - self.mass_kg * acceleration)[:, free]
+        total = stencils.w[rows, known] @ force
+        residual = (total - self.mass_kg * acceleration)[:, free]
         return at, self.columns.right_hand_sides(
-            rows, at, acceleration, residual, free
+            rows, at, acceleration=acceleration, residual=residual, free=free
         )
 
     def _stencil_row(self, t: int) -> StencilRow:
-        """Return the coefficients of a row, cached while the masses do not depend on parameters."""
+        """Return the coefficients of row t of the template, cached in the model while the masses do
+        not depend on parameters, otherwise in this pass.
+        """
         if t not in self._rows:
             self._rows[t] = StencilRow.from_dynamics(self.dynamics, t)
         return self._rows[t]
@@ -567,7 +589,7 @@ class StreamingSweep:
             by_velocity = at.by_velocity[k]
             by_position_skew = at.by_position_skew[k]
             by_velocity_skew = at.by_velocity_skew[k]
-            block = row.block(by_position, by_velocity, solver.pattern)
+            block = row.block(by_position, by_velocity, pattern=solver.pattern)
             skew_block = row.skew_block(by_position_skew, by_velocity_skew)
             solved.append(row_columns)
             try:
@@ -584,7 +606,7 @@ class StreamingSweep:
                     skew=by_position_skew,
                     rate_skew=by_velocity_skew,
                 )
-                forward.solve_step(step, right, force, row_columns)
+                forward.solve_step(step, right, force=force, out=row_columns)
             except np.linalg.LinAlgError:
                 return solved, np.nan
             length = float(np.abs(row_columns[:, 0]).max(initial=0.0))
@@ -604,11 +626,15 @@ class StreamingSweep:
         return solved, None
 
     def _store_rows(self, columns: Sequence[Array]) -> list[StoredRow]:
-        """Return the last rows for later passes, from their columns (3n, 1 + m), which
-        `_solve_rows` returns.
+        """Return the last rows for later passes.
 
         The reactions are corrected, and observed quantities of these rows are appended to those
         stored, in place.
+
+        Parameters
+        ----------
+        columns : sequence of (3n, 1 + m) arrays
+            Columns of the last rows that have been counted, which `_solve_rows` returns.
         """
         rows = slice(self.end - len(columns), self.end)
         all_columns = np.array(columns)
@@ -644,13 +670,17 @@ class StreamingSweep:
         first = max(here.start, int(sensors[0][0].known_rows[0]) + DELAY_STEPS)
         if first >= here.stop:
             return wrenches
-        *_, w, s = self.model.stencils
+        stencils = self.model.stencils
         x = self.x[: here.stop, self.sensed]
         rows = np.arange(first, here.stop)
         reactions, channels = self.reactions.wrenches(
-            sensors, self.setting, x, (w, s), rows
+            sensors, self.setting, x, (stencils.w, stencils.s), rows
         )
-        motion = ObservedMotion(x, lambda: reactions)
+
+        def known_reactions() -> ReactionForces:
+            return reactions
+
+        motion = ObservedMotion(x, known_reactions)
         for k, channel in enumerate(channels):
             value, slopes = channel.linearise(
                 motion, self.phi, self.moving, size
@@ -696,7 +726,9 @@ class StreamingSweep:
             self._fail(failure)
 
     def _fail(self, failure: NewtonFailure) -> NoReturn:
-        """Raise the `SimulationError` of a row that cannot be solved."""
+        """Raise the `SimulationError` of the next row, which cannot be solved for the reason
+        `failure`.
+        """
         model = self.model
         what = f"the step at row {self.row}"
         time_s = self.row * model.interval_s / model.substeps
@@ -709,13 +741,14 @@ class StreamingSweep:
     def linearise_samples(
         self, pairs: Sequence[tuple[Sample, int]]
     ) -> list[LinearisedResidual]:
-        """Return the linearised residuals of samples, in the order of `pairs`.
+        """Return the linearised residuals of samples, in the order of `pairs`; the rows that they
+        need must still be stored.
 
         Parameters
         ----------
         pairs : sequence of (Sample, int)
-            Samples, and for each the number of rows that have been computed since it became
-            available.
+            Samples, and for each the number of rows that have been computed since the row after
+            which it is evaluated.
         """
         residuals: list[LinearisedResidual | None] = [None] * len(pairs)
         for of in {sample.instrument for sample, _ in pairs}:
@@ -735,7 +768,7 @@ class StreamingSweep:
             ):
                 slope /= self.rates
                 residuals[k] = LinearisedResidual(
-                    residual - slope @ self.transformed, slope, of
+                    residual - slope @ self.transformed, slope, instrument=of
                 )
         return [each for each in residuals if each is not None]
 
@@ -771,7 +804,9 @@ class StreamingSweep:
             begins_s + step_s * np.array(rows) for rows in (needed_rows, at)
         )
         sensor = reading.with_samples(
-            known_s, t_s, np.array([sample.values for sample, _ in pairs])
+            known_s,
+            t_s,
+            measurements=np.array([sample.values for sample, _ in pairs]),
         )
         if isinstance(observable, slice):
             columns = self.moving
@@ -802,8 +837,9 @@ class StreamingSweep:
         Parameters
         ----------
         reading : Sample
+            The sample.
         rows : int
-            Number of rows that have been computed since the sample became available.
+            Number of rows that have been computed since the row after which it is evaluated.
         """
         model = self.model
         neighbours = self.model.neighbouring_samples
@@ -820,7 +856,10 @@ class StreamingSweep:
         point_columns = point_columns[:, : 3 * len(self.shape_functions[0])]
         values = point_columns[..., 0].reshape(len(point_columns), -1, 3)
         slopes = markers.observable.derivatives_from(
-            x, self.shape_functions, self.moving, point_columns[..., 1:]
+            x,
+            self.shape_functions,
+            columns=self.moving,
+            changes=point_columns[..., 1:],
         )
         since_s = (self.row - 1 - back) / model.substeps * model.interval_s
         markers = markers.shifted(since_s)
@@ -830,16 +869,17 @@ class StreamingSweep:
         return residual[0] - reading.values / markers.sigmas[:, None], slope[0]
 
     def _interpolated_row(self, back: float) -> tuple[Array, Array]:
-        """Return positions (3n,) and observed points (3M + …, 1 + m) between stored rows.
+        """Return positions (3n,) [m] and observed points (3M + …, 1 + m) at, or between, stored
+        rows.
 
-        Column 0 has the values, the others the derivatives. Four rows are interpolated by a cubic
-        polynomial; positions before the first stored row are extrapolated.
+        Column 0 of the points has the values [m], the others the derivatives. Between rows, four
+        are interpolated by a cubic polynomial; times before the first stored row are extrapolated.
 
         Parameters
         ----------
         back : float
-            How many rows before the last one, not necessarily a whole number; an integer beyond the
-            stored rows gives the first of them.
+            How many rows before the last one. Within `ROW_TOLERANCE` of a whole number that row is
+            returned, or the first stored row if it is earlier.
         """
         nearest = round(back)
         last = len(self.read) - 1
@@ -859,7 +899,9 @@ class StreamingSweep:
         )
 
     def add_residuals(self, residuals: Sequence[LinearisedResidual]) -> None:
-        """Add linearised residuals to the information; missing ones are skipped."""
+        """Add linearised residuals to `information`, in place of which a new object is stored;
+        missing numbers are skipped.
+        """
         self.information = self.with_residuals(self.information, residuals)
 
     def with_residuals(
@@ -867,7 +909,11 @@ class StreamingSweep:
         known: SquareRootInformation,
         residuals: Sequence[LinearisedResidual],
     ) -> SquareRootInformation:
-        """Return information with linearised residuals added, with the weights of the loss at p."""
+        """Return the information `known` with linearised residuals added; missing numbers are
+        skipped.
+
+        With Huber's loss, residuals are weighted by their values at the parameters of this pass.
+        """
         if not residuals:
             return known
         at_zero = np.concatenate([each.at_zero for each in residuals])
@@ -884,5 +930,5 @@ class StreamingSweep:
             residual, slopes, huber=self.model.collocation.huber
         )
         return known.with_rows(
-            rows[is_present], slopes[is_present], self.transformed
+            rows[is_present], slopes[is_present], parameters=self.transformed
         )

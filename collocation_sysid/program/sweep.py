@@ -50,9 +50,9 @@ if TYPE_CHECKING:
 
 # Largest size of the element results and factors that are stored at a time [bytes].
 CHUNK_BYTES = 128e6
-# Largest number of narrow factors that are stored at a time. They reuse memory: allocating it again
-# costs half as much as a factorisation.
-ROOMS = 16
+# Largest number of time steps with skyline factors that are stored at a time. They reuse memory:
+# allocating it again costs half as much as a factorisation.
+LARGEST_CHUNK_ROWS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,14 +90,14 @@ class ForwardState:
 
     Attributes
     ----------
-    solutions : (3n, c) arrays
-        Y_{t−i} for i = 1, 2, …
-    increments : (free, c) arrays
-        Force changes dF_{t−j}.
-    forces : (free,) arrays
+    solutions : tuple of (3n, c) arrays
+        Y_{t−i} for i = 1, 2, … up to the largest lag.
+    increments : tuple of (free, c) arrays
+        Force changes dF_{t−j} for j = 1, 2, …
+    forces : tuple of (free,) arrays
         Total forces F_{t−j} at the evaluations [N].
-    history_columns : arrays
-        Columns of the history variables, body first, then forces.
+    history_columns : tuple of arrays
+        Columns of the history variables, body first, then forces; empty without any.
     """
 
     solutions: tuple[Array, ...]
@@ -114,11 +114,12 @@ class FactorisedStep(NamedTuple):
     t : int
         Index of the grid time.
     row : StencilRow
-        Coefficients of the scheme and masses.
+        Coefficients of the scheme, with the time step in q and s, and masses.
     force : (3n,) array
         Force F at the evaluation [N].
     by_position, by_velocity : (m,) arrays
-        Lower triangles of the symmetric parts of G = ∂F/∂ξ and C = ∂F/∂ν.
+        Lower triangles of the symmetric parts of G = ∂F/∂ξ and C = ∂F/∂ν, in the order of the
+        sparsity pattern.
     factor : Factor
         Factorised matrix −∂c_t/∂x_t on the free dofs.
     skew, rate_skew : arrays
@@ -176,32 +177,38 @@ class PrescribedColumns:
     def from_columns(
         cls, sweep: Sweep, dofs: Index, columns: Array
     ) -> PrescribedColumns:
-        """Build the prescribed rows of dofs (g,) that change by `columns` (N, g, c) [m]."""
+        """Build the prescribed rows of dofs (g,) that change by `columns` (N, g, c) [m].
+
+        A dof counts as prescribed at the times at which a grasp of `sweep` holds it; `columns` is
+        not copied.
+        """
         return cls(
             dofs,
             columns,
-            sweep.dynamics.is_temporarily_prescribed[:, dofs]
+            is_prescribed=sweep.dynamics.is_temporarily_prescribed[:, dofs]
             | ~np.isin(dofs, sweep.free),
         )
 
     @property
     def column_count(self) -> int:
-        """Number c of columns."""
+        """Number c of right-hand sides to which the prescribed changes belong."""
         return self.columns.shape[-1]
 
     def write_into(self, t: int, solution: Array) -> None:
-        """Write the prescribed rows of grid time t into `solution` (3n, c), in place."""
+        """Write the rows of the dofs that are prescribed at grid time t into `solution` (3n, c), in
+        place; other rows are kept.
+        """
         prescribed = self.is_prescribed[t]
         solution[self.dofs[prescribed]] = self.columns[t, prescribed]
 
     def force(self, sweep: Sweep, step: FactorisedStep) -> Array | float:
-        """Return the contribution (free, c) [N] of the prescribed changes at a time step to the
-        changes of the force on the free dofs; 0 if nothing changes.
+        """Return the contribution (p_0 G + q_0 C) U_t (free, c) [N] of the prescribed changes U_t
+        at a time step to the changes of the force on the free dofs; 0 if nothing changes.
         """
         now = np.where(
             self.is_prescribed[step.t, :, None], self.columns[step.t], 0.0
         )
-        # What is only parameters of other kinds does not move them.
+        # Columns of parameters that do not move grasps are zero.
         changed = np.flatnonzero(now.any(axis=0))
         if not len(changed):
             return 0.0
@@ -227,7 +234,8 @@ class SweepColumns:
     count : int
         Number of columns.
     has_parameters : bool
-        Whether the last columns are derivatives by the parameters that change the motion.
+        Whether the last columns are derivatives by the parameters that change the motion; otherwise
+        only prescribed changes act.
     has_step : bool
         Whether the first column is the feasibility step.
     prescribed : PrescribedColumns or None
@@ -247,7 +255,8 @@ class SweepColumns:
         equations: EquationsAtParameters,
         x: Array | None = None,
     ) -> SweepColumns:
-        """Build the columns of all parameters that change the motion.
+        """Build the columns of all parameters that change the motion
+        (`Transcription.dynamic_parameters`), with the changes of grasps that depend on φ.
 
         Parameters
         ----------
@@ -271,7 +280,7 @@ class SweepColumns:
             if x is not None:
                 columns[..., 0] = np.nan_to_num(goals - x[:, prescribed.dofs])
             grasped = PrescribedColumns.from_columns(
-                sweep, prescribed.dofs, columns
+                sweep, prescribed.dofs, columns=columns
             )
         return cls(
             equations, first + count, has_step=x is not None, prescribed=grasped
@@ -281,11 +290,11 @@ class SweepColumns:
     def from_prescribed(
         cls, sweep: Sweep, equations: EquationsAtParameters, changes_m: Array
     ) -> SweepColumns:
-        """Build the columns of prescribed changes `changes_m` (N, g, c) of the grasped dofs
-        [m], without parameters.
+        """Build the columns of prescribed changes `changes_m` (N, g, c) of the grasped dofs [m],
+        those of `equations.prescribed`, at constant parameters.
         """
         grasped = PrescribedColumns.from_columns(
-            sweep, equations.prescribed.dofs, changes_m
+            sweep, equations.prescribed.dofs, columns=changes_m
         )
         return cls(
             equations,
@@ -302,20 +311,12 @@ class SweepColumns:
         residual: Array | None,
         free: Index,
     ) -> tuple[Array, Array]:
-        """Return R (k, free, c) and F_R (k, 3n, c) of k rows, see the module's documentation.
-
-        Parameters
-        ----------
-        rows : slice
-            Their grid times.
-        linearisation : Linearisation
-            Forces of these rows with their derivatives.
-        acceleration : (k, 3n) array
-            Accelerations [m/s²].
-        residual : (k, free) array or None
-            Residuals c [N]; None unless the first column is the feasibility step.
-        free : (free,) array
-            Free dofs.
+        """Returns
+        -------
+        (k, free, c) array
+            R: the residual in the first column, −∂(M a)/∂p in those of parameters; otherwise zero.
+        (k, 3n, c) array
+            F_R: ∂F/∂p in the columns of parameters, otherwise zero.
         """
         count, size = acceleration.shape
         right, force = (
@@ -329,7 +330,7 @@ class SweepColumns:
                 rows, linearisation.by_theta
             )
             right[..., first:] -= self.equations.inertia_derivatives(
-                rows, acceleration[:, free], free
+                rows, acceleration[:, free], dofs=free
             )
         return right, force
 
@@ -337,22 +338,21 @@ class SweepColumns:
         """Return the derivatives (U, c) of the U inputs at evaluation t by the columns;
         zeros for the feasibility step.
         """
-        own = self.equations.input_derivatives[t]
-        none = np.zeros(
-            (
-                len(own),
-                int(self.has_step) if self.has_parameters else self.count,
-            )
-        )
-        return np.hstack([none, own]) if self.has_parameters else none
+        by_parameters = self.equations.input_derivatives[t]
+        if not self.has_parameters:
+            return np.zeros((len(by_parameters), self.count))
+        of_step = np.zeros((len(by_parameters), int(self.has_step)))
+        return np.hstack([of_step, by_parameters])
 
 
 class Sweep:
     """Forward and backward substitution in time for the first rows of one experiment.
 
+    A copy in another process computes its tables again and has a new stopwatch.
+
     Parameters
     ----------
-    segment : Transcription
+    transcription : Transcription
         Transcription of the experiment.
     rows : int, optional
         Number of grid times to use; None means all.
@@ -389,7 +389,9 @@ class Sweep:
             columns=transcription.prescribed_motion.dofs,
         )
         self.of_sensed = Submatrix(self.pattern, self.sensed)
-        self._takes = bool(self.dynamics.is_temporarily_prescribed.any())
+        self._has_temporary_grasps = bool(
+            self.dynamics.is_temporarily_prescribed.any()
+        )
 
     def __reduce__(
         self,
@@ -408,7 +410,7 @@ class Sweep:
         equations: EquationsAtParameters,
         known: Tangent | None = None,
     ) -> Tangent:
-        """Compute the feasibility step p and the sensitivities Z.
+        """Compute the feasibility step p and the sensitivities Z at all grid times of this sweep.
 
         Parameters
         ----------
@@ -417,14 +419,15 @@ class Sweep:
         equations : EquationsAtParameters
             Equations of motion at the parameters.
         known : Tangent, optional
-            Result for the first rows at the same positions and parameters; it is continued.
+            Result for the first rows at the same positions and parameters; it is continued, not
+            modified.
 
         Raises
         ------
         SimulationError
             If the equations of a time step are singular or not finite.
         """
-        sweep_columns = SweepColumns.by_parameters(self, equations, x)
+        sweep_columns = SweepColumns.by_parameters(self, equations, x=x)
         columns = np.zeros((*x.shape, sweep_columns.count))
         grasp_forces = GraspForces.zeros(
             len(x), len(self.sensed), sweep_columns.count
@@ -443,7 +446,7 @@ class Sweep:
             march.indefinite = known.indefinite_count
             grasp_forces.copy_first_rows(known.grasp_forces)
         for _ in march.iterate_rows(
-            x, 0 if known is None else len(known.step), columns
+            x, 0 if known is None else len(known.step), out=columns
         ):
             pass
         return Tangent(
@@ -464,8 +467,8 @@ class Sweep:
         """Iterate over the sensitivities Z_t (3n, m) row by row, keeping only the last few rows in
         memory.
 
-        Rows before the first equation of motion are zero. The arrays must not be modified, because
-        later rows depend on them.
+        Rows before the first equation of motion are yielded as zero. The arrays must not be
+        modified, because later rows depend on them. Nothing is computed before the iteration.
 
         Parameters
         ----------
@@ -479,7 +482,7 @@ class Sweep:
         Raises
         ------
         SimulationError
-            If the equations of a time step are singular or not finite.
+            During the iteration, if the equations of a time step are singular or not finite.
         """
         return ForwardSubstitution(
             self,
@@ -500,12 +503,18 @@ class Sweep:
         equations : EquationsAtParameters
             Equations of motion at the parameters.
         gradient : (N, 3n) array
-            Gradient of a scalar by the positions [1/m].
+            Gradient of a scalar by the positions [1/m]; not modified.
 
         Returns
         -------
         (N, 3n) array
-            Multipliers y of the equations of motion [1/N]; zero at prescribed dofs.
+            Multipliers y of the equations of motion [1/N]; zero at prescribed dofs and in rows
+            without an equation.
+
+        Raises
+        ------
+        SimulationError
+            If the equations of a time step are singular or not finite.
         """
         reach = self.dynamics.largest_lag
         free = self.free
@@ -567,27 +576,25 @@ class Sweep:
         return y
 
     def without_prescribed(self, t: int, rows: Array) -> Array:
-        """Set rows (free, …) of grid time t to zero where a grasp that holds for a part of
-        the time prescribes the dof, in place.
+        """Set rows (free, …) of grid time t to zero, in place, where a grasp that holds for a part
+        of the time prescribes the dof; return `rows`.
         """
-        if self._takes:
+        if self._has_temporary_grasps:
             rows[self.dynamics.is_temporarily_prescribed[t, self.free]] = 0
         return rows
 
     @property
     def chunk_rows(self) -> int:
-        """Number of time steps that are linearised and factorised at a time."""
-        most = ROOMS if self.factoriser.skyline else self.dynamics.row_count
+        """Number of time steps that are linearised and factorised at a time: as many as
+        `CHUNK_BYTES` allow, but at least one for each thread.
+        """
+        rows = self.dynamics.row_count
         # Each thread has one to factorise, however large it is.
-        least = min(self.body.threads, self.dynamics.row_count)
-        return max(
-            least,
-            min(
-                self.dynamics.row_count,
-                most,
-                int(CHUNK_BYTES / self._step_bytes),
-            ),
-        )
+        least = min(self.body.threads, rows)
+        most = min(rows, int(CHUNK_BYTES / self._step_bytes))
+        if self.factoriser.skyline:
+            most = min(most, LARGEST_CHUNK_ROWS)
+        return max(least, most)
 
     @property
     def chunk_bytes(self) -> int:
@@ -596,7 +603,9 @@ class Sweep:
 
     @property
     def _step_bytes(self) -> int:
-        """Memory of one time step: element results and one factor [bytes]."""
+        """Memory of one time step: element results and one factor [bytes], the latter of an
+        unsymmetric matrix if the body's is.
+        """
         solver = self.factoriser
         values = (
             solver.unsymmetric_factor_size
@@ -606,7 +615,9 @@ class Sweep:
         return 8 * (self.body.linearisation_width + values)
 
     def dynamics_at(self, equations: EquationsAtParameters) -> Dynamics:
-        """Return the equations of motion of the first rows with the inputs of a setting."""
+        """Return the discrete equations of motion of `equations`, truncated to the grid times of
+        this sweep.
+        """
         return equations.dynamics.truncated_to(self.dynamics.row_count)
 
     def chunks(
@@ -619,6 +630,8 @@ class Sweep:
     ) -> Iterator[LinearisedChunk]:
         """Iterate over the linearised and factorised time steps, a few at a time, using threads.
 
+        A chunk is valid until the next one is computed, because factors reuse memory.
+
         Parameters
         ----------
         x : (N, 3n) array
@@ -626,11 +639,12 @@ class Sweep:
         equations : EquationsAtParameters
             Equations of motion at the parameters.
         backward : bool
-            If true, yield the last chunk first.
+            If true, yield the last chunk first; the steps within a chunk are still in ascending
+            order.
         first : int
-            Grid time to begin with.
+            Index of the grid time to begin with; rows without an equation are skipped.
         histories : sequence of histories
-            History variables at x; empty without any.
+            History variables at x; empty if there are none.
 
         Raises
         ------
@@ -642,7 +656,7 @@ class Sweep:
         starts = range(
             max(first, dynamics.first_row), dynamics.row_count, self.chunk_rows
         )
-        rooms = [
+        buffers = [
             self.factoriser.allocate(1 + self.body.is_unsymmetric)
             for _ in range(self.chunk_rows)
         ]
@@ -662,7 +676,9 @@ class Sweep:
                     StencilRow.from_dynamics(dynamics, t)
                     for t in range(start, here.stop)
                 ]
-                factors = self._factorise(dynamics, at, here, rows, rooms)
+                factors = self._factorise(
+                    dynamics, at, grid_times=here, rows=rows, buffers=buffers
+                )
             steps = map(
                 FactorisedStep,
                 range(start, here.stop),
@@ -684,12 +700,15 @@ class Sweep:
         rows: list[StencilRow],
         buffers: Sequence[FactorMemory | None] = (),
     ) -> list[Factor]:
-        """Return the factors of −∂c_t/∂x_t of some rows, computed on several threads; dofs that are
-        prescribed for a part of the time have a diagonal entry alone.
+        """Return the factors of −∂c_t/∂x_t of some rows, computed on several threads.
+
+        A dof that a grasp prescribes for a part of the time has, at these times, only a diagonal
+        entry of the mean size of the diagonal.
 
         Parameters
         ----------
         dynamics : Dynamics
+            Equations of motion.
         linearisation : Linearisation
             Derivatives of the forces at these rows alone.
         grid_times : slice
@@ -702,7 +721,7 @@ class Sweep:
         Raises
         ------
         SimulationError
-            If a matrix is singular.
+            If a matrix is singular or not finite.
         """
         pattern = self.pattern
         is_prescribed = dynamics.is_temporarily_prescribed[grid_times]
@@ -711,7 +730,7 @@ class Sweep:
             values = rows[k].block(
                 linearisation.by_position[k],
                 linearisation.by_velocity[k],
-                pattern,
+                pattern=pattern,
             )
             skew = rows[k].skew_block(
                 linearisation.by_position_skew[k],
@@ -733,7 +752,7 @@ class Sweep:
             count = len(linearisation.force)
             threads = self.body.threads
             return self.factoriser.factorise_each(
-                matrix, count, threads, buffers
+                matrix, count, threads=threads, buffers=buffers
             )
         except np.linalg.LinAlgError as error:
             raise SimulationError(
@@ -749,7 +768,7 @@ class ForwardSubstitution:
     Attributes
     ----------
     violation_n : float
-        Largest residual of the equations of motion so far [N].
+        Largest residual of the equations of motion so far [N]; 0 without a feasibility step.
     indefinite : int
         Number of time steps so far whose matrix is not positive definite.
 
@@ -759,10 +778,10 @@ class ForwardSubstitution:
         Factorised time steps.
     columns : SweepColumns
         Right-hand sides.
-    state : ForwardState, optional
+    last : ForwardState, optional
         State after earlier rows; by default there are none.
-    held : GraspForces, optional
-        Filled in place with the forces on instrumented grasps.
+    grasp_forces : GraspForces, optional
+        Filled in place with the forces on instrumented grasps; ignored if there are none.
     """
 
     def __init__(
@@ -799,7 +818,7 @@ class ForwardSubstitution:
 
     @property
     def state(self) -> ForwardState:
-        """State that later rows depend on."""
+        """State that later rows depend on; its arrays are not copied."""
         return ForwardState(
             solutions=tuple(self.past),
             increments=tuple(self.past_increments),
@@ -812,7 +831,8 @@ class ForwardSubstitution:
     def iterate_rows(
         self, x: Array, done: int = 0, out: Array | None = None
     ) -> Iterator[Array]:
-        """Iterate over the solutions Y_t (3n, c).
+        """Iterate over the solutions Y_t (3n, c) from row `done` on; the state is advanced in
+        place.
 
         Parameters
         ----------
@@ -821,7 +841,13 @@ class ForwardSubstitution:
         done : int
             Number of rows that are known already.
         out : (N, 3n, c) array, optional
-            Overwritten with the solutions.
+            The solution of each row with an equation is written into it, in place, and yielded as a
+            view. By default new arrays are yielded.
+
+        Raises
+        ------
+        SimulationError
+            If the equations of a time step are singular or not finite.
         """
         solver = self.solver
         columns = self.columns
@@ -833,7 +859,7 @@ class ForwardSubstitution:
         known = self._known or [None] * len(histories)
         pairs = zip(histories, known, strict=True)
         self.internal_states = [
-            each.forward_columns(columns.input_derivatives, done, own)
+            each.forward_columns(columns.input_derivatives, done, known=own)
             for each, own in pairs
         ]
         for t in range(done, first):  # the start is given
@@ -871,7 +897,8 @@ class ForwardSubstitution:
                 yield solution
 
     def _residual(self, step: FactorisedStep, acceleration: Array) -> Array:
-        """Return c_t on the free dofs (free,) [N], from the acceleration (3n,) of the row.
+        """Return c_t on the free dofs (free,) [N], from the acceleration (3n,) of the row [m/s²];
+        zero while a grasp prescribes the dof.
 
         It stores the force, which later rows need: call it once for every row, in ascending order.
         """
@@ -889,7 +916,7 @@ class ForwardSubstitution:
     def solve_step(
         self, step: FactorisedStep, right: Array, force: Array, out: Array
     ) -> None:
-        """Solve one row and store Y_t in `out`.
+        """Solve one row, store Y_t in `out`, and advance the state to the next row.
 
         Parameters
         ----------
@@ -898,7 +925,7 @@ class ForwardSubstitution:
         right : (free, c) array
             R_t; modified.
         force : (3n, c) array
-            F_R.
+            F_R; not modified.
         out : (3n, c) array
             Y_t, overwritten.
         """
@@ -957,12 +984,13 @@ class ForwardSubstitution:
         Parameters
         ----------
         grasp_forces : GraspForces
+            Row t is overwritten.
         step : FactorisedStep
             Row t.
         force : (3n, c) array
-            Changes of the force at fixed positions.
+            Changes of the force at fixed positions [N].
         solution : (3n, c) array
-            Changes of x_t.
+            Changes of x_t [m].
         """
         row = step.row
         dofs = self.solver.sensed

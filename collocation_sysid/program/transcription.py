@@ -57,11 +57,14 @@ from .wrench.wrench_observable import ReactionGrid, sensed_dofs
 from .wrench.wrench_residual import WrenchResidual, wrench_residuals
 
 T = TypeVar("T", bound=np.generic)
-# Of what two stencils (p, q) of an evaluation make of its two matrices.
+# Coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v from the stencils (p, q) of two positions, see
+# `_state_factors`.
 Factors = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
+# History variables and their weights in a Lagrangian.
 WeightedHistory = tuple[AnyHistory, Array]
 
-CHARTED = (
+# Cached attributes of a `Transcription` that depend on its association.
+ASSOCIATION_DEPENDENT = (
     "markers",
     "depths",
     "outlines",
@@ -110,6 +113,8 @@ class RowWeights:
 class Transcription:
     """Variables x_{t,i} and constraints of one experiment, at grid time t and dof i.
 
+    Instances are immutable apart from cached values; a copy in another process has none of them.
+
     Attributes
     ----------
     experiment : Experiment
@@ -145,12 +150,12 @@ class Transcription:
     association: MarkerAssociation
 
     def __getstate__(self) -> dict[str, Any]:
-        # What follows from the fields is found anew where it is needed.
+        # Cached values are computed again where they are needed.
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @property
     def body(self) -> Body:
-        """Body of the experiment."""
+        """Body whose motion is measured; several experiments may share one."""
         return self.experiment.body
 
     @property
@@ -165,8 +170,8 @@ class Transcription:
 
     @cached_property
     def dynamics(self) -> Dynamics:
-        """Discrete equations of motion with the inputs as stated in the experiment, before
-        any estimate.
+        """Discrete equations of motion with the inputs as stated in the experiment, before any
+        estimate; the constants of the body are not set.
         """
         return with_inputs(
             Dynamics.from_experiment(
@@ -196,7 +201,7 @@ class Transcription:
 
     @cached_property
     def sensors(self) -> tuple[WrenchResidual, ...]:
-        """Measurement models of the grasps' force–torque sensors."""
+        """Measurement models of the grasps' force–torque sensors, in the order of the grasps."""
         return wrench_residuals(
             self.experiment,
             ReactionGrid.from_dynamics(self.dynamics),
@@ -206,7 +211,7 @@ class Transcription:
 
     @cached_property
     def custom_sensors(self) -> tuple[CustomSensorResidual, ...]:
-        """Measurement models of the custom sensors."""
+        """Measurement models of the custom sensors, in their order."""
         grid = ReactionGrid.from_dynamics(self.dynamics)
         return custom_sensor_residuals(
             self.experiment,
@@ -247,7 +252,7 @@ class Transcription:
 
     @cached_property
     def camera_models(self) -> tuple[DepthCameraModel, ...]:
-        """Camera models of the depth cameras, in their order."""
+        """Camera models of all depth cameras of the experiment, in their order."""
         cameras = range(len(self.experiment.depths))
         return tuple(
             DepthCameraModel.from_experiment(self.experiment, k, self.nuisance)
@@ -269,8 +274,8 @@ class Transcription:
 
     @cached_property
     def local_loss(self) -> LocalLoss:
-        """Second derivatives of the loss by x and φ, for the measurements that depend on
-        few positions.
+        """Second derivatives of the loss by x and φ of those measurements that depend on few
+        positions (`local` observables with at least one point); wrenches are not among them.
         """
         pairs = (
             (reading, reading.observable.local) for reading in self.residuals
@@ -293,37 +298,38 @@ class Transcription:
         return sensed_dofs(self.experiment)
 
     def with_association(self, association: MarkerAssociation) -> Transcription:
-        """Return the transcription with another association: elements, clock samples and
-        correspondences of its measurements.
+        """Return a copy with another association: elements, clock samples and correspondences of
+        its measurements.
 
-        Everything that does not depend on the association is shared with the copy, also what has
-        been computed.
+        Cached values that do not depend on the association are shared with the copy.
         """
         other = replace(self, association=association)
-        # Nothing but how the markers are read depends on the chart.
-        independent = {k: v for k, v in vars(self).items() if k not in CHARTED}
-        vars(other).update(independent | {"association": association})
+        for name, value in vars(self).items():
+            if name != "association" and name not in ASSOCIATION_DEPENDENT:
+                vars(other)[name] = value
         return other
 
     def follow_estimates(
         self, phi: Array, x: Array
     ) -> tuple[MarkerAssociation, Array]:
-        """Update the association where estimates have left it.
+        """Return the association that belongs to the estimates, and φ relative to it.
 
         Markers get the elements that contain their estimated places, clocks the nearest samples,
-        and depth cameras the correspondences in the current shapes.
+        and depth cameras the correspondences in the current shapes. Neither self nor φ is modified.
 
         Parameters
         ----------
         phi : (k,) array
-            Nuisance parameters in units of their priors.
+            Nuisance parameters in units of their priors, relative to the present association.
         x : (rows, 3n) array
-            First rows of the motion [m], at least `rows_to_follow`; no rows without depth cameras.
+            First rows of the motion [m], at least `rows_to_follow`; it may have no rows if there
+            are no depth cameras.
 
         Returns
         -------
         (MarkerAssociation, (k,) array)
-            The association, which is the present one if nothing has left it, and φ in it.
+            The association, which is the present object if nothing has changed, and a copy of φ in
+            which the coordinates of estimated marker places refer to it.
         """
         nuisance = self.nuisance
         places = self.markers.coordinate_parameters
@@ -349,10 +355,13 @@ class Transcription:
     def place_unknown_markers(
         self, phi: Array, x: Array
     ) -> tuple[MarkerAssociation, Array]:
-        """Initialise unknown marker places and depth cameras from the first rows of a motion.
+        """Return the association and φ with unknown marker places and depth cameras initialised
+        from the first rows of a motion.
 
-        A marker without a stated place is put where its first sample lies on the body; depth
-        cameras are aligned with the first shape that they measure.
+        A marker without a stated place is put where its first sample lies on the body; it keeps its
+        place if it has no sample or its first one is later than the rows. Depth cameras are aligned
+        with the first shape that they measure, and the parameters of their poses are set
+        accordingly.
 
         Parameters
         ----------
@@ -364,7 +373,8 @@ class Transcription:
         Returns
         -------
         (MarkerAssociation, (k,) array)
-            The association, and φ in it.
+            The association, which is the present object if there is nothing to initialise, and φ in
+            it.
         """
         phi = phi.copy()
         sightings = tuple(
@@ -383,7 +393,10 @@ class Transcription:
         self, phi: Array, x: Array
     ) -> tuple[MarkerAssociation, Array]:
         """Return the association and φ (k,) with unknown marker places initialised from rows x
-        (rows, 3n) [m]; unchanged if all places are stated.
+        (rows, 3n) [m].
+
+        Both are returned unchanged if all places are stated, or no unknown marker has a first
+        sample within the rows.
         """
         markers = self.experiment.markers
         rows = self.markers.sample_rows
@@ -421,7 +434,10 @@ class Transcription:
 
     @property
     def rows_to_follow(self) -> int:
-        """Number of rows of x that `follow_estimates` needs; 0 without depth cameras."""
+        """Number of rows of x that `follow_estimates` needs; 0 without depth cameras.
+
+        All grid times are needed.
+        """
         return self.grid_times if self.depths else 0
 
     def marker_places_m(self, phi: Array) -> Array:
@@ -453,8 +469,8 @@ class Transcription:
     def _with_marker_places(
         self, phi: Array, place_coordinates: Array
     ) -> Array:
-        """Return φ (k,) with other coordinates of the estimated marker places, from
-        `place_coordinates` (M, k').
+        """Return a copy of φ (k,) with other coordinates of the estimated marker places, from
+        `place_coordinates` (M, k') of all markers.
         """
         updated = phi.copy()
         estimated = self.association.estimated
@@ -472,22 +488,26 @@ class Transcription:
 
     @property
     def dof_count(self) -> int:
-        """Number of dofs, 3n."""
+        """Number of dofs of the body, 3n: three displacements for each of n nodes."""
         return self.pattern.size
 
     @cached_property
     def free_dofs(self) -> Index:
-        """Dofs that are free at some time."""
+        """Dofs (f,) that are free at some time, ascending; the columns "free" of arrays are in this
+        order.
+        """
         return self.experiment.free_dofs
 
     @cached_property
     def prescribed_dofs(self) -> Index:
-        """Dofs that are prescribed at all times."""
+        """Dofs that are prescribed at all times, ascending."""
         return self.experiment.prescribed_dofs
 
     @cached_property
     def constrained_dofs(self) -> Index:
-        """Dof of each constraint of one grid time, (rows_per_time,)."""
+        """Dof of each constraint of one grid time, ascending: all dofs if prescribed displacements
+        are constraints, otherwise the free ones.
+        """
         return (
             np.arange(self.dof_count)
             if self.has_constraints_of_grasps
@@ -496,7 +516,9 @@ class Transcription:
 
     @property
     def has_constraints_of_grasps(self) -> bool:
-        """Whether prescribed displacements are constraints instead of bounds."""
+        """Whether all prescribed displacements are constraints instead of bounds: because it was
+        requested, or because the pose of the body in its grasps is estimated.
+        """
         return self.has_grasp_constraints or self.nuisance.affects_grasps
 
     @property
@@ -518,17 +540,21 @@ class Transcription:
 
     @property
     def constraint_times(self) -> int:
-        """Number of grid times with constraints."""
+        """Number of grid times with constraints: N, or N − 1 if the start is given and row 0 has no
+        equation.
+        """
         return self.grid_times - self.dynamics.first_row
 
     @property
     def constraint_count(self) -> int:
-        """Number of constraints."""
+        """Number of scaled constraints of this experiment: `constraint_times` ·
+        `constraints_per_time`.
+        """
         return self.constraint_times * self.constraints_per_time
 
     @property
     def columns(self) -> slice:
-        """Slice of its positions in z."""
+        """Slice of its scaled positions in z, grid time by grid time."""
         return slice(
             self.offsets.position, self.offsets.position + self.variable_count
         )
@@ -540,7 +566,7 @@ class Transcription:
 
     @property
     def parameter_indices(self) -> Index:
-        """Indices of its (q, φ) in p."""
+        """Indices (nq + k,) of its (q, φ) in p."""
         return np.concatenate(
             [np.arange(self.nq), self.nuisance_indices.indices]
         )
@@ -562,7 +588,9 @@ class Transcription:
     def _prescribed_positions(
         self, prescribed: PrescribedDisplacements
     ) -> Array:
-        """Return the prescribed positions (N, 3n) of the grasped dofs [m], NaN elsewhere."""
+        """Return an array (N, 3n) with the positions [m] of the dofs that `prescribed` contains,
+        NaN elsewhere.
+        """
         goals = np.full((self.grid_times, self.dof_count), np.nan)
         goals[:, prescribed.dofs] = prescribed.positions_m
         return goals
@@ -586,14 +614,16 @@ class Transcription:
         forces = at_last.linearise(at_rest, np.zeros_like(at_rest))
         last = StencilRow.from_dynamics(dynamics, dynamics.row_count - 1)
         block = last.block(
-            forces.by_position[0], forces.by_velocity[0], pattern
+            forces.by_position[0], forces.by_velocity[0], pattern=pattern
         )
         stiffness = np.abs(block[pattern.diagonal[self.free_dofs]]).mean()
         return self.length_m * float(stiffness)
 
     def start_positions(self) -> Array | None:
-        """Return the stated initial positions (3n,) [m], or None if they follow as an
-        equilibrium.
+        """Return the initial positions (3n,) [m]; None if the experiment starts in equilibrium.
+
+        They are those stated in the experiment, by default the undeformed shape in the pose of the
+        grasps at the first time.
         """
         experiment = self.experiment
         if experiment.start == "equilibrium":
@@ -631,7 +661,8 @@ class Transcription:
         )
 
     def dynamic_columns(self, first_phi: int) -> Index:
-        """Return the indices in z of the parameters that change the motion.
+        """Return the indices in z of the parameters that change the motion: all of q, then φ; in
+        the order of `dynamic_parameters`.
 
         Parameters
         ----------
@@ -647,14 +678,14 @@ class Transcription:
 
     @property
     def has_histories(self) -> bool:
-        """Whether its body or a force on it has history variables."""
+        """Whether its body (viscoelastic memory) or a force on it has history variables."""
         return self.body.has_memory or bool(
             self.dynamics.forces.terms_with_internal_variables
         )
 
     def equations_at(self, q: Array, phi: Array) -> EquationsAtParameters:
-        """Return the equations of motion at shared parameters q (nq,) and nuisance
-        parameters φ (k,).
+        """Return the equations of motion, on all N grid times, at shared parameters q (nq,) and
+        nuisance parameters φ (k,).
         """
         p = np.concatenate([q, phi[self.nuisance.motion_indices]])
         u, by_p = self.inputs.evaluate_at(p)
@@ -686,8 +717,9 @@ class Transcription:
         )
 
     def corrected_experiment(self, phi: Array) -> Experiment:
-        """Return the experiment with gravity, grasps, loads and actuators as estimated by φ
-        (k,), in the body's frame.
+        """Return the experiment with gravity, grasps, loads, actuators and their times as estimated
+        by φ (k,), in the body's frame; the experiment itself if no nuisance parameter changes the
+        motion.
         """
         if not len(self.nuisance.motion_indices):
             return self.experiment
@@ -715,8 +747,8 @@ class Transcription:
         return self.nuisance.with_times(changed, phi)
 
     def with_prescribed_positions(self, x: Array, phi: Array) -> Array:
-        """Return positions x (N, 3n) [m] with the prescribed dofs at the positions to which their
-        grasps move at φ (k,).
+        """Return a copy of positions x (N, 3n) [m] in which each dof is, while a grasp prescribes
+        it, at the position to which its grasp moves at φ (k,).
         """
         goals = self._prescribed_positions(
             self.prescribed_motion.evaluate_at(phi)
@@ -750,9 +782,18 @@ class Transcription:
     def _scaled_constraints(
         self, x: Array, residual: Array, equations: EquationsAtParameters
     ) -> Array:
-        """Return the scaled constraints (constraints,) at positions x (N, 3n) [m] with the residual
-        (N, 3n) of the equations of motion [N]; where a grasp prescribes a dof, the distance from
-        its prescribed position.
+        """Return the scaled constraints (constraints,) from the residual of the equations of
+        motion.
+
+        Parameters
+        ----------
+        x : (N, 3n) array
+            Positions [m].
+        residual : (N, 3n) array
+            Residuals c [N]; not modified.
+        equations : EquationsAtParameters
+            Provides the prescribed positions: where a grasp prescribes a dof, the constraint is the
+            distance from it, over `length_m`.
         """
         rows = residual / self.force_n
         goals = equations.dynamics.prescribed_m
@@ -761,12 +802,16 @@ class Transcription:
         return self.select_rows(rows)
 
     def select_rows(self, values: NDArray[T]) -> NDArray[T]:
-        """Select from values (N, 3n) those that belong to constraints, (constraints,)."""
+        """Return a copy of those of values (N, 3n) that belong to constraints, (constraints,), grid
+        time by grid time.
+        """
         return values[self.dynamics.first_row :, self.constrained_dofs].ravel()
 
     @cached_property
     def is_grasp_constraint(self) -> NDArray[np.bool_]:
-        """Mask (constraints,) of the constraints that prescribe a displacement."""
+        """Mask (constraints,) of the constraints that prescribe a displacement instead of an
+        equation of motion.
+        """
         grasped = self.dynamics.is_temporarily_prescribed.copy()
         grasped[:, self.prescribed_dofs] = True
         return self.select_rows(grasped)
@@ -796,7 +841,9 @@ class Transcription:
 
     @property
     def jacobian(self) -> BlockBand:
-        """Sparsity structure of ∂c/∂x by columns; row indices count within the segment."""
+        """Sparsity structure of ∂c/∂x by columns; row indices count from the first constraint of
+        this experiment.
+        """
         return self.motion_rows.structure
 
     def constraints_and_jacobian(
@@ -806,8 +853,9 @@ class Transcription:
         forces: Linearisation,
         values: Array,
     ) -> tuple[Array, Array]:
-        """Evaluate the constraints and their derivatives; history variables are treated as
-        constant.
+        """Evaluate the constraints and their derivatives.
+
+        History variables are treated as constant; their contribution is that of `history_vjp`.
 
         Parameters
         ----------
@@ -818,12 +866,12 @@ class Transcription:
         forces : Linearisation
             Forces and their derivatives at the evaluations of x.
         values : (jacobian.nnz,) array
-            Entries of ∂c/∂x, overwritten.
+            Entries of ∂c/∂x for scaled positions, in the order of `jacobian`; overwritten.
 
         Returns
         -------
-        ((constraints,) array, (constraints, len(moving)) array)
-            Scaled constraints c, and ∂c/∂(q, φ) by the parameters of `dynamic_parameters`.
+        ((constraints,) array, (constraints, m) array)
+            Scaled constraints c, and ∂c/∂(q, φ) by the m parameters of `dynamic_parameters`.
         """
         dynamics = equations.dynamics
         self.motion_rows.fill(
@@ -840,7 +888,7 @@ class Transcription:
         if equations.mass_depends_on_parameters:
             all_rows = slice(None)
             by_p -= equations.inertia_derivatives(
-                all_rows, dynamics.acceleration(x), all_rows
+                all_rows, dynamics.acceleration(x), dofs=all_rows
             )
         by_p /= self.force_n
         dynamics.zero_prescribed_forces(by_p)
@@ -868,7 +916,13 @@ class Transcription:
             Weights of the scaled constraints of this experiment.
         reaction_weights : (N, 3n) array or 0
             Additional weights of the residuals c [1/N], applied to the complete force balance
-            including dofs that are prescribed at that time.
+            including dofs that are prescribed at that time. A number means none.
+
+        Returns
+        -------
+        RowWeights
+            The given multipliers, and the weights of the residuals c and of the forces. Weights of
+            grasp constraints are in the multipliers alone.
         """
         dynamics = self.dynamics
         t = self.dynamics.tables
@@ -892,7 +946,7 @@ class Transcription:
     def history_vjp(
         self, x: Array, equations: EquationsAtParameters, weights: Array
     ) -> tuple[Array, Array]:
-        """Vector–Jacobian product of the forces through the history variables.
+        """Vector–Jacobian product of the forces through the history variables; zero without any.
 
         Parameters
         ----------
@@ -901,13 +955,13 @@ class Transcription:
         equations : EquationsAtParameters
             Equations of motion at the parameters.
         weights : (N, 3n) array
-            Weights of the forces F at the evaluations.
+            Weights of the forces F at the evaluations [1/N].
 
         Returns
         -------
-        ((N, 3n) array, (len(moving),) array)
-            Derivatives of Σ weights · F through history variables alone, by x and by the parameters
-            of `dynamic_parameters`.
+        ((N, 3n) array, (m,) array)
+            Derivatives of Σ weights · F through history variables alone, by x [1/m] and by the m
+            parameters of `dynamic_parameters`.
         """
         dynamics = equations.dynamics
         by_x = np.zeros_like(x)
@@ -950,7 +1004,9 @@ class Transcription:
 
     @cached_property
     def _skew_hessian(self) -> BlockBand:
-        """Structure of `hessian` for adding the contribution of the skew part of ∂²φ/∂x∂v."""
+        """Structure that adds the contribution of the skew part of ∂²φ/∂x∂v to the values of
+        `hessian`.
+        """
         blocks = self._hessian_blocks(
             lambda p, q, pp, qq: (pp * q - qq * p, 0 * q)
         )
@@ -963,7 +1019,7 @@ class Transcription:
 
     @cached_property
     def _rate_hessian(self) -> BlockBand:
-        """Structure of `hessian` for adding the contribution of ∂²φ/∂v²."""
+        """Structure that adds the contribution of ∂²φ/∂v² to the values of `hessian`."""
         blocks = self._hessian_blocks(lambda p, q, pp, qq: (q * qq, 0 * q))
         return BlockBand(
             self.dof_count,
@@ -975,11 +1031,15 @@ class Transcription:
 
     @property
     def _hessian_starts(self) -> Index:
+        """Row of the Hessian, including the nq rows of q, at which each grid time begins, (N,)."""
         return self.nq + np.arange(self.grid_times) * self.dof_count
 
     def _hessian_blocks(self, factors: Factors) -> list[BandBlock]:
         """Return the blocks ∂²φ/∂x_{t−distance}∂x_t of the Hessian of a potential φ of the
-        evaluation states.
+        evaluation states (here not the nuisance parameters).
+
+        There is one block for each distance in time from 0 to the largest lag at which the Hessian
+        may have entries; that of distance 0 has the upper triangle alone.
 
         Parameters
         ----------
@@ -1017,7 +1077,7 @@ class Transcription:
         self, distance: int, factors: Factors
     ) -> list[BlockTerm]:
         """Return the terms of the Hessian's block between rows at a distance in time, a sum over
-        the evaluations k = t + i.
+        the evaluations k = t + i; terms whose factors are all zero are left out.
 
         Parameters
         ----------
@@ -1056,7 +1116,11 @@ class Transcription:
         lifted_histories: Sequence[WeightedHistory] = (),
         has_observation_curvature: bool = True,
     ) -> tuple[Array, list[Array]]:
-        """Second derivatives of loss_weight · loss + multipliers · c of this segment.
+        """Second derivatives of loss_weight · loss + multipliers · c of this segment, in scaled
+        variables.
+
+        The priors of φ are included for those φ that no earlier experiment has, and the priors of q
+        are not.
 
         Parameters
         ----------
@@ -1071,7 +1135,8 @@ class Transcription:
         loss_weight : float
             Factor of the loss.
         values : (hessian.nnz,) array
-            Derivatives of the constraints in the columns of x, overwritten.
+            Derivatives of the constraints in the columns of x, in the order of `hessian`;
+            overwritten. Those of the loss are in the second result.
         lifted_histories : sequence of (history, array)
             History variables that are lifted, each with the weights μ_k of its values h_k in the
             Lagrangian, Σ μ_k h_k.
@@ -1102,7 +1167,7 @@ class Transcription:
         if skew.size:
             self._skew_hessian.fill(values, skew, skew, self.body.threads)
         by_x, twice = equations.weighted_second_derivatives(
-            x, curvature, weights.rows
+            x, curvature, row_weights=weights.rows
         )
         of_q = self.length_m * by_x[..., : self.nq]
         values[band.top_positions] = of_q.reshape(band.top_positions.shape)
@@ -1152,16 +1217,19 @@ class Transcription:
         weights: Array,
         lifted_histories: Sequence[WeightedHistory],
     ) -> SecondDerivatives:
-        """Return the weighted second derivatives of the forces at all N evaluations, including a
-        stated initial state.
+        """Return the second derivatives of Σ weights · F at all N evaluations, including that of a
+        stated initial state, and of Σ μ · h of the lifted history variables.
+
+        The result is overwritten by the next call.
 
         Parameters
         ----------
         x : (N, 3n) array
             Positions [m].
         equations : EquationsAtParameters
+            Equations of motion at the parameters.
         weights : (N, 3n) array
-            Weights of the forces.
+            Weights of the forces [1/N].
         lifted_histories : sequence of WeightedHistory
             Lifted history variables, with weights of their equations.
         """
@@ -1179,8 +1247,9 @@ class Transcription:
 
     @cached_property
     def state_dependent_nuisance(self) -> Index:
-        """Indices in (q, φ of the motion) of the nuisance parameters with a mixed second
-        derivative with the state.
+        """Indices in (q, φ that change the motion), see `dynamic_parameters`, of the nuisance
+        parameters for which the equations of motion have mixed second derivatives with positions or
+        velocities.
         """
         return self.nq + np.flatnonzero(
             self.inputs.is_coupled_to_state[self.nq :]
@@ -1193,7 +1262,7 @@ class Transcription:
 
     @property
     def hessian_diagonal_positions(self) -> Index:
-        """Positions of the diagonal entries of x in the values of `hessian`."""
+        """Positions (N · 3n,) of the diagonal entries of x in the values of `hessian`."""
         dofs = np.arange(self.dof_count)
         return self.hessian.positions(
             np.arange(self.grid_times), 0, dofs, dofs
@@ -1202,9 +1271,11 @@ class Transcription:
     def additional_hessian_entries(
         self, first_phi: int
     ) -> list[tuple[Index, Index]]:
-        """Return rows and columns in z of the Hessian's entries besides `hessian`, upper triangle.
+        """Return rows and columns in z of the Hessian's entries besides those of `hessian` and of q
+        with q, upper triangle.
 
-        In order: the loss by x and φ; the motion by q and φ; the motion by x and φ; φ by φ.
+        The list has four groups: the loss by x and φ; the motion by q and φ; the motion by x and φ;
+        φ by φ. An entry may occur in several groups; the values of all are summed.
 
         Parameters
         ----------
@@ -1243,7 +1314,8 @@ class Transcription:
 def _state_factors(
     p: Array, q: Array, p_second: Array, q_second: Array
 ) -> tuple[Array, Array]:
-    """Coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v in the block of two positions.
+    """Return the coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v in the block of two positions, in the second
+    derivative of a potential φ of one evaluation.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.observables import ObservedMotion, ReactionForces
-from collocation_sysid.program.simulation import simulate
+from collocation_sysid.program.simulation import simulate, with_wrenches
 from collocation_sysid.program.wrench.wrench_observable import LOW_PASS
 from collocation_sysid.recording import Experiment, PoseSequence
 
@@ -305,3 +305,14 @@ def test_a_frame_that_is_carried_along_is_off_as_the_poses_are(rng):
     assert (
         relative_error(found, (residual(1e-4) - residual(-1e-4)) / 2e-4) < 1e-5
     )
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_another_number_of_wrenches_than_sensors_is_refused(count):
+    cube = sensing(hung_cube())
+    samples = np.ones((len(cube.t_s), 6))
+    measured = with_wrenches(cube, [samples]).grasps[0].wrench
+    assert measured is not None
+    assert (measured.values == 1).all()
+    with pytest.raises(ValueError, match="argument"):
+        with_wrenches(cube, [samples] * count)

@@ -51,7 +51,9 @@ class ContactSummary:
 
 
 def smallest_gaps(contact: Contact, x: Array) -> Array:
-    """Return the smallest gap [m] of each contact point (i,) in a motion x (T, 3n)."""
+    """Return the smallest gap [m] of each contact point (i,) in a motion x (T, 3n) [m], T ≥ 1;
+    negative inside the obstacle.
+    """
     chunks = (x[first : first + AT_ONCE] for first in range(0, len(x), AT_ONCE))
     gaps = (
         contact.law_of_contact.gaps(contact.points.vectors(chunk)).min(axis=0)
@@ -102,7 +104,8 @@ class FrictionSummary:
     Attributes
     ----------
     used : float
-        Largest ratio of the total friction force to its limit.
+        Largest ratio of the total friction force to its limit, over the times whose limit is above
+        the share `GRAZE` of the largest; 0 without contact.
     slipping : float
         Share of slipping points, weighted by their friction limits, over the motion.
     dissipated_j : float
@@ -117,8 +120,17 @@ class FrictionSummary:
 def friction_summaries(
     experiment: Experiment, dynamics: Dynamics, x: Array
 ) -> dict[str, FrictionSummary]:
-    """Return the friction with each obstacle that has friction, by the name of the obstacle, along
-    positions x (T, 3n) [m]; empty without friction.
+    """Return the friction with each obstacle that has friction, by the name of the obstacle; empty
+    without friction.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    dynamics : Dynamics
+        Equations of motion at the parameters, whose time step must be that of x.
+    x : (N, 3n) array
+        Positions at all grid times [m].
     """
     xi, nu = dynamics.evaluation_states(x)
     summaries = {}
@@ -133,7 +145,7 @@ def friction_summaries(
             [contact.friction_sums(row) for row in rows], axis=1
         )
         limit_n, slipping_n, *rub_n, power_w = sums
-        # Of a mere graze nothing is said.
+        # At times of little contact the ratio of both forces is meaningless.
         is_firm = limit_n > GRAZE * limit_n.max(initial=0.0)
         used = np.linalg.norm(rub_n, axis=0)[is_firm] / limit_n[is_firm]
         summaries[contact.law_of_contact.obstacle.name] = FrictionSummary(
@@ -149,8 +161,8 @@ def friction_summaries(
 def contact_summaries_of_parts(
     iterates: Iterable[ExperimentIterate],
 ) -> Iterator[ContactSummary]:
-    """Yield the contact summaries of each obstacle of each experiment, at the positions of its
-    iterate.
+    """Yield the contact summaries of each obstacle of each experiment, experiment by experiment, at
+    the positions of its iterate.
     """
     for part in iterates:
         t_s = part.equations.dynamics.t_s[: len(part.x)]
@@ -160,7 +172,9 @@ def contact_summaries_of_parts(
 def contact_summaries(
     experiment: Experiment, x: Array, t_s: Array
 ) -> Iterator[ContactSummary]:
-    """Yield the contact summary of each obstacle for positions x (T, 3n) [m] at times (T,) [s]."""
+    """Yield the contact summary of each obstacle for positions x (T, 3n) [m] at times `t_s` (T,)
+    [s].
+    """
     for contact, obstacle in zip(
         contact_terms(experiment), experiment.obstacles, strict=True
     ):
@@ -186,7 +200,7 @@ def contact_summaries(
             obstacle.name,
             gap_m=smallest_gap_m,
             face_count=int(count.max()) / law.surface.points_per_face,
-            # Of a triangle with sides alike.
+            # Edge of an equilateral triangle with this area.
             face_mm=1e3 * float(np.sqrt(4 / np.sqrt(3) * face_m2)),
             is_initially_in_contact=bool(count[0])
             and len(obstacle.poses.t_s) > 1,

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -60,8 +61,8 @@ class ContactCandidates:
     def from_indices(
         law: ContactLaw, pattern: SymmetricPattern, chosen: bytes
     ) -> ContactCandidates:
-        """Build the candidates of an obstacle; the last few are cached, because successive steps
-        are similar.
+        """Build the candidates of an obstacle; the last 64 are cached by their arguments, because
+        successive steps are similar.
 
         Parameters
         ----------
@@ -70,7 +71,7 @@ class ContactCandidates:
         pattern : SymmetricPattern
             Pattern of the matrices.
         chosen : bytes
-            Indices of the points, an array of int64 as bytes.
+            Indices of the points among all contact points, an array of int64 as bytes.
         """
         some = np.frombuffer(chosen, dtype=np.int64)
         points = law.surface.points
@@ -91,7 +92,8 @@ class ContactCandidates:
     def inputs(
         self, contact: Contact, xi: Array, nu: Array, theta: Array
     ) -> tuple[Array, Array]:
-        """Return the inputs (k, i) and the data (d, i) of the law's `point_force_function` at the i
+        """Return the inputs (3 or 6, i), positions and with velocity dependence velocities relative
+        to the obstacle's frame, and the data (d, i) of the law's `point_force_function` at the i
         candidates.
 
         Parameters
@@ -121,7 +123,7 @@ class ContactCandidates:
 
     def assemble(self, push: Array, size: int) -> Array:
         """Return forces (size,) [N] on the dofs of a body from forces `push` (3, i) [N] on the i
-        candidates.
+        candidates; the reaction on the obstacle is left out.
         """
         on_nodes = self.weights[:, :, None] * push.T[:, None]
         summed = np.bincount(
@@ -130,8 +132,29 @@ class ContactCandidates:
         return np.asarray(summed, dtype=float)
 
 
+class LinearisedContact(NamedTuple):
+    """Contact forces in a time step and their derivative by the unknown positions.
+
+    Attributes
+    ----------
+    force : (3n,) array
+        Forces [N].
+    symmetric : (m,) array
+        Lower triangle of the symmetric part of the derivative [N/m].
+    skew : (m,) or (0,) array
+        Lower triangle of its skew part [N/m]; empty without friction or other velocity dependence.
+    """
+
+    force: Array
+    symmetric: Array
+    skew: Array
+
+
 class StepContact:
     """Contact in one time step of a body with constants θ (k,).
+
+    Obstacles are treated as fixed in the derivatives. The candidates are stored, and searched again
+    when the state has changed too much.
 
     Attributes
     ----------
@@ -166,7 +189,9 @@ class StepContact:
         self._half_s = max((each.step_s for each in contacts), default=0.0) / 2
 
     def force(self, xi: Array, nu: Array) -> Array:
-        """Return the contact forces (3n,) [N] at ξ and ν, each (1, 3n)."""
+        """Return the contact forces (3n,) [N] at ξ [m] and ν [m/s], each (1, 3n); zero without
+        contact.
+        """
         force = np.zeros(xi.size)
         for candidates, u, data in self._candidates(xi[0], nu[0]):
             force += candidates.assemble(
@@ -176,24 +201,15 @@ class StepContact:
 
     def linearise(
         self, xi: Array, nu: Array, rates: tuple[float, float]
-    ) -> tuple[Array, Array, Array]:
-        """Return the contact forces and their derivative.
+    ) -> LinearisedContact:
+        """Return the contact forces at ξ and ν, and their derivative by the unknown positions.
 
         Parameters
         ----------
         xi, nu : (1, 3n) arrays
             State [m] and velocity [m/s].
         rates : (float, float)
-            Derivatives of ξ and of ν by the unknown positions.
-
-        Returns
-        -------
-        (3n,) array
-            Forces [N].
-        (m,) array
-            Lower triangle of the symmetric part of the derivative by the unknown positions.
-        (m,) or (0,) array
-            Lower triangle of its skew part; empty without friction or other velocity dependence.
+            Derivatives of ξ and of ν [1/s] by the unknown positions.
         """
         force = np.zeros(xi.size)
         has_friction = any(
@@ -225,7 +241,7 @@ class StepContact:
                     weights=(counts[touch] * blocks).ravel(),
                     minlength=len(part),
                 )
-        return force, symmetric, skew
+        return LinearisedContact(force, symmetric, skew=skew)
 
     def _candidates(
         self, xi: Array, nu: Array
@@ -249,7 +265,9 @@ class StepContact:
                 )
                 if len(chosen):
                     candidates = ContactCandidates.from_indices(
-                        each.law_of_contact, self._pattern, chosen.tobytes()
+                        each.law_of_contact,
+                        self._pattern,
+                        chosen=chosen.tobytes(),
                     )
                     self._candidates_of_contacts.append((each, candidates))
         for contact, candidates in self._candidates_of_contacts:

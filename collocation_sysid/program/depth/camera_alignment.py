@@ -8,6 +8,8 @@ Medioni 1992).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -17,7 +19,7 @@ from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from .depth_camera_model import DepthCameraModel
 from .visible_surface import GRAZING, VisibleSurface
 
-# Points of the surface that are associated with the cloud.
+# Number of random points of the surface that are associated with the cloud.
 SAMPLES = 250
 # Iterations, with a gate that narrows geometrically.
 ITERATIONS = 25
@@ -29,14 +31,35 @@ SLIDING = 0.2
 INDEPENDENT = 10000
 # Rotations from which the search starts, about each axis in both directions [rad].
 TURNED = 0.2
-# Starts that are followed to the end.
-LEAST_POINTS_SHARE = 2
-# Points of a cloud that are used; more only cost time.
+# Number of starts that are iterated further after each half of the gates.
+CONTINUED_STARTS = 2
+# Largest number of points of a cloud that are used, approximately; more only cost time.
 ENOUGH = 2000
 
 
+class AlignedPose(NamedTuple):
+    """Error of a camera's pose after some iterations of the alignment.
+
+    Attributes
+    ----------
+    rotation : Rotation
+        Rotation about the camera's pivot, in its stated frame.
+    translation_m : (3,) array
+        Translation in its stated frame [m].
+    mismatch : float
+        Mean squared distance of the surface's points from the cloud over that of the gate, at most
+        one per point; one before the first iteration, or if no point faces the camera.
+    """
+
+    rotation: Rotation
+    translation_m: Array
+    mismatch: float = 1.0
+
+
 def thinned(cloud: Array) -> Array:
-    """Return at most about 2,000 points of a cloud (P, k), evenly spread over its order."""
+    """Return every k-th point of a cloud (P, c), evenly spread over its order, so that at most
+    `ENOUGH` remain; the complete cloud (k = 1) if it has fewer.
+    """
     return cloud[:: 1 + len(cloud) // ENOUGH]
 
 
@@ -44,22 +67,23 @@ def align_camera(
     camera: DepthCameraModel, surface: VisibleSurface, x: Array, image: int
 ) -> tuple[Array, Array]:
     """Return the rotation vector (3,) [rad] and translation (3,) [m] of the camera error that align
-    its points with a shape.
+    the points of an image with a shape, see `DepthCameraModel.with_pose`.
 
     The search starts from the stated pose, and from the pose that puts the cloud at the middle of
     the shape, each also rotated in both directions about each axis; the best result is returned.
-    Points of other things should be far away compared with the gate.
+    Points of other things should be far away compared with the gate. Random points are the same in
+    each call.
 
     Parameters
     ----------
     camera : DepthCameraModel
-        Model of the camera.
+        Model of the camera; its points, stated poses and priors are used.
     surface : VisibleSurface
         Surface of the body.
     x : (n, 3) array
         Surface nodes [m].
     image : int
-        Index of the image.
+        Index of the image, which must have points.
     """
     rotations, translations = camera.poses
     corners = ((x - translations[image]) @ rotations[image])[
@@ -96,20 +120,26 @@ def align_camera(
         else np.zeros(3),
     ]
     candidates = [
-        (1.0, Rotation.from_rotvec(turn), shift)
+        AlignedPose(Rotation.from_rotvec(turn), shift)
         for turn in rotation_vectors
         for shift in shifts
     ]
     for half in np.array_split(gates, 2):
         candidates = [
-            iterate_alignment(camera, tree, places, normals, half, *start)
-            for _, *start in candidates
+            iterate_alignment(
+                camera,
+                tree,
+                places=places,
+                normals=normals,
+                gates=half,
+                start=start,
+            )
+            for start in candidates
         ]
-        candidates = sorted(candidates, key=lambda each: each[0])[
-            :LEAST_POINTS_SHARE
-        ]
-    _, turn, shift = candidates[0]
-    return turn.as_rotvec(), shift
+        candidates.sort(key=lambda each: each.mismatch)
+        candidates = candidates[:CONTINUED_STARTS]
+    best = candidates[0]
+    return best.rotation.as_rotvec(), best.translation_m
 
 
 def iterate_alignment(
@@ -118,9 +148,8 @@ def iterate_alignment(
     places: Array,
     normals: Array,
     gates: Array,
-    rotation: Rotation,
-    translation_m: Array,
-) -> tuple[float, Rotation, Array]:
+    start: AlignedPose,
+) -> AlignedPose:
     """Iterate the alignment from one start.
 
     Parameters
@@ -133,16 +162,16 @@ def iterate_alignment(
         Points of the surface with their normals, in the camera's stated frame.
     gates : array
         Gate of each iteration [m].
-    rotation : Rotation
-        Initial rotation.
-    translation_m : (3,) array
-        Initial translation [m].
+    start : AlignedPose
+        Initial rotation and translation.
 
     Returns
     -------
-    (float, Rotation, (3,) array)
-        Mean squared distance over the gate, limited to one per point; rotation; and translation.
+    AlignedPose
+        Pose after the last step, with the mismatch before it.
     """
+    rotation = start.rotation
+    translation_m = start.translation_m
     pivot = camera.pivot_m
     prior = np.concatenate(
         [camera.prior_weights(row) for row in (DEPTH_TURN, DEPTH_SHIFT)]
@@ -203,11 +232,11 @@ def iterate_alignment(
         )[0]
         rotation = Rotation.from_rotvec(step[:3]) * rotation
         translation_m = translation_m + step[3:]
-    return mismatch, rotation, translation_m
+    return AlignedPose(rotation, translation_m, mismatch=mismatch)
 
 
 def _cross_product_matrices(vectors: Array) -> Array:
-    """Return the matrices (P, 3, 3) of cross products with vectors (P, 3)."""
+    """Return the skew matrices (P, 3, 3) with M w = v × w for vectors v (P, 3)."""
     x, y, z = vectors.T
     none = np.zeros_like(x)
     return np.stack([[none, -z, y], [z, none, -x], [-y, x, none]]).transpose(

@@ -26,6 +26,7 @@ from ...recording.nuisance import (
     cayley_rotation,
 )
 
+# Kinds of nuisance parameters of a depth camera.
 OF_CAMERA = (
     DEPTH_TURN,
     DEPTH_SHIFT,
@@ -34,7 +35,7 @@ OF_CAMERA = (
     DEPTH_TIME,
     DEPTH_EDGE,
 )
-# One over the deviation of what counts as exact.
+# One over the prior standard deviation of a pose error that is not estimated [1/rad, 1/m].
 EXACT = 1e6
 
 
@@ -67,47 +68,57 @@ class DepthCameraModel:
     def from_experiment(
         cls, experiment: Experiment, camera_index: int, nuisance: NuisanceMap
     ) -> DepthCameraModel:
-        """Build the model of camera `camera_index` (index) of an experiment."""
+        """Build the model of the camera with index `camera_index` of an experiment, with its
+        nuisance parameters in `nuisance`.
+        """
         depth = experiment.depths[camera_index]
         rotations, translations = depth.camera.pose_at(depth.sample_times_s[:1])
         pivot_m = (
             experiment.body.nodes_m.mean(axis=0) - translations[0]
         ) @ rotations[0]
         size_m = float(np.linalg.norm(np.ptp(experiment.body.nodes_m, axis=0)))
-        return cls(depth, camera_index, nuisance, pivot_m, size_m)
+        return cls(
+            depth,
+            camera_index,
+            nuisance=nuisance,
+            pivot_m=pivot_m,
+            size_m=size_m,
+        )
 
     @cached_property
     def depth_expressions(self) -> dict[tuple[int, int], Any]:
-        """Generated functions of its depth residuals, shared by all copies of the
-        measurement model.
+        """Cache of the generated functions of its depth residuals, shared by all copies of the
+        measurement model; empty at first.
         """
         return {}
 
     @cached_property
     def outline_expressions(self) -> dict[tuple[int, int], Any]:
-        """Generated functions of its outline residuals, shared by all copies of the
-        measurement model.
+        """Cache of the generated functions of its outline residuals, shared by all copies of the
+        measurement model; empty at first.
         """
         return {}
 
     @cached_property
     def parameter_indices(self) -> Index:
-        """Indices in φ of the camera's nuisance parameters."""
+        """Indices in φ of the camera's nuisance parameters, of all kinds in `OF_CAMERA`; empty if
+        none is estimated.
+        """
         return self.nuisance.indices_of_rows(
             *OF_CAMERA, component=self.camera_index
         )
 
     @cached_property
     def poses(self) -> tuple[Array, Array]:
-        """Rotations (S, 3, 3) and translations (S, 3) [m] from the camera's frame to the
-        world, at each image.
+        """Stated rotations (S, 3, 3) and translations (S, 3) [m] from the camera's frame to the
+        world, at each of S images, without estimated errors.
         """
         return self.depth.camera.pose_at(self.depth.sample_times_s)
 
     @cached_property
     def rays(self) -> list[Array]:
-        """For each image, directions (P, 3) in which points move as their depth grows;
-        zeros for point clouds.
+        """For each image, directions (P, 3) in the camera's frame in which points move per metre as
+        their depth grows; zeros for point clouds without a camera matrix.
         """
         clouds = self.depth.points_m
         pinhole = self.depth.camera.matrix is not None
@@ -116,8 +127,11 @@ class DepthCameraModel:
     def corrected_expression(
         self, point: ca.SX, ray: ca.SX, values: Mapping[NuisanceRow, ca.SX]
     ) -> ca.SX:
-        """Return the expression of a point in the camera's stated frame, corrected by the estimated
-        errors.
+        """Return the expression (3,) of a point in the camera's stated frame [m], corrected by the
+        estimated errors.
+
+        Scale and bias of the depth are applied first, then the rotation about `pivot_m`, then the
+        translation.
 
         Parameters
         ----------
@@ -140,7 +154,9 @@ class DepthCameraModel:
 
     @cached_property
     def _correction(self) -> GeneratedFunction:
-        """Generated function of `corrected_expression`."""
+        """Generated function `corrected_expression` of the camera's nuisance parameters; its data
+        are a point and its ray (6,).
+        """
 
         def expression(own: ca.SX, data: ca.SX) -> ca.SX:
             values = self.nuisance.values_by_row(own, self.parameter_indices)
@@ -151,7 +167,7 @@ class DepthCameraModel:
         )
 
     def world_points(self, phi: Array, image: int) -> Array:
-        """Return the points (P, 3) of an image in the world [m].
+        """Return the measured points (P, 3) of an image in the world [m], corrected at φ.
 
         Parameters
         ----------
@@ -195,8 +211,8 @@ class DepthCameraModel:
         return (middle_m - translations[sample]) @ rotations[sample]
 
     def to_camera_m(self, phi: Array, points_m: Array, sample: int) -> Array:
-        """Return points (P, 3) of the world in the camera's frame at φ and the image with index
-        `sample` [m]: the inverse of `to_world` without bias.
+        """Return points (P, 3) of the world [m] in the camera's frame at φ and the image with index
+        `sample` [m]: the inverse of `to_world` without bias of the depth, but with its scale.
         """
         basis = np.vstack([np.zeros(3), np.eye(3)])
         corner, *axes = self.to_world(phi, basis, np.zeros((4, 3)), sample)
@@ -211,7 +227,9 @@ class DepthCameraModel:
         }
 
     def parameters_from(self, physical_values: Mapping[str, float]) -> Array:
-        """Return φ (k,) with the given values in physical units by label; others are zero."""
+        """Return φ (k,) of the experiment with the given values in physical units by label; entries
+        without a value are zero, and unknown labels are ignored.
+        """
         values = [
             physical_values.get(entry.label, 0.0)
             for entry in self.nuisance.entries
@@ -228,7 +246,7 @@ class DepthCameraModel:
 
     def prior_weights(self, row: NuisanceRow) -> Array:
         """Return one over the prior standard deviations (3,) of the camera's rotation [1/rad] or
-        translation [1/m], whichever `row` states; a large number if it is exact.
+        translation [1/m], for `row` DEPTH_TURN or DEPTH_SHIFT; `EXACT` if it is not estimated.
         """
         places = self.nuisance.indices_of_rows(row, component=self.camera_index)
         return (
@@ -238,7 +256,9 @@ class DepthCameraModel:
         )
 
     def clock_shift_s(self, phi: Array) -> float:
-        """Return by how much images are taken later than their times state [s]."""
+        """Return by how much images are taken later than stated [s] at φ (k,); 0 if it is not
+        estimated.
+        """
         places = self.nuisance.indices_of_rows(
             DEPTH_TIME, component=self.camera_index
         )
@@ -247,8 +267,8 @@ class DepthCameraModel:
     def with_pose(
         self, phi: Array, rotation_vector: Array, shift_m: Array
     ) -> Array:
-        """Return φ (k,) with another rotation error `rotation_vector` (3,) [rad] and translation
-        error `shift_m` (3,) of the camera; an error that is not estimated is ignored.
+        """Return a copy of φ (k,) with another rotation error `rotation_vector` (3,) [rad] and
+        translation error `shift_m` (3,) of the camera; an error that is not estimated is ignored.
         """
         updated = phi.copy()
         angle = np.linalg.norm(rotation_vector)

@@ -17,7 +17,7 @@ from ...common.array_types import Array, root_mean
 from .depth_residual import HUBER, DepthResidual
 from .surface_correspondences import SurfaceCorrespondences, initial_gate_m
 
-# Fewest samples of a motion between which a cubic spline is drawn; lines between fewer.
+# Fewest samples of a motion that are interpolated by a cubic spline; fewer are by lines.
 FEWEST_FOR_SPLINE = 4
 
 
@@ -33,22 +33,23 @@ class DepthError:
     points : int
         Number of points that are compared.
     compared_points : int
-        Number of points in the images, including those of other things.
+        Number of all points in the images, including those that are not compared because they
+        belong to other things.
     rms_m : float or None
-        Root mean square distance of the compared points; None without any.
+        Root mean square distance of the compared points [m]; None without any.
     reach_m : float
-        Points farther from the surface are taken to belong to something else.
+        Points farther from the surface are taken to belong to something else [m].
     gate_m : float
-        Gate stated in the problem, at most `reach_m`.
+        Gate stated in the problem [m], at most `reach_m`.
     share_beyond_gate : float
-        Share of the compared points that are farther from the surface than `gate_m`.
+        Share of the compared points that are farther from the surface than `gate_m`; 0 without any.
     rms_within_gate_m : float or None
-        Root mean square distance of the points within `gate_m`; None without any.
+        Root mean square distance of the points within `gate_m` [m]; None without any.
     sigmas : float
-        Root mean square distance over the stated σ.
+        Root mean square distance over the stated σ; 0 without any.
     tame_sigmas : float
         Root mean square distance over the stated σ, with distances beyond Huber's threshold
-        shortened as in a fit, so that a few outliers do not make a prediction wrong.
+        shortened as in a fit, so that a few outliers do not make a prediction wrong; 0 without any.
     """
 
     points: int
@@ -91,7 +92,7 @@ class SurfaceComparison:
     def from_fit(
         cls, residual: DepthResidual, x: Array, values: Array, phi: Array
     ) -> SurfaceComparison:
-        """Compare the points with the correspondences of a fit.
+        """Return the comparison with the correspondences of a fit, which are not renewed.
 
         Parameters
         ----------
@@ -107,20 +108,21 @@ class SurfaceComparison:
         return cls(
             residual.correspondences,
             residual.surface_shapes(x, phi),
-            residual.signed_distances_m(values, phi),
-            phi,
+            signed_distances_m=residual.signed_distances_m(values, phi),
+            phi=phi,
         )
 
     @classmethod
     def from_motion(
         cls, residual: DepthResidual, t_s: Array, positions_m: Array, phi: Array
     ) -> SurfaceComparison:
-        """Associate the points with a motion and compare them.
+        """Associate the points with a motion and compare them; images after its end are compared
+        with its last positions.
 
         Parameters
         ----------
         residual : DepthResidual
-            Measurement model of the camera.
+            Measurement model of the camera; its correspondences are not used.
         t_s : (T,) array
             Times of the motion [s].
         positions_m : (T, n, 3) array
@@ -143,7 +145,10 @@ class SurfaceComparison:
             view, body, shapes_m=shapes_m, phi=phi, gate_m=reach_m, settled=True
         )
         return cls(
-            sighting, shapes_m, sighting.signed_distances_m(shapes_m, phi), phi
+            sighting,
+            shapes_m,
+            signed_distances_m=sighting.signed_distances_m(shapes_m, phi),
+            phi=phi,
         )
 
     @cached_property
@@ -175,7 +180,8 @@ def _positions_at_observable(
     residual: DepthResidual, t_s: Array, positions_m: Array
 ) -> Array:
     """Return positions (R, 3n) at the times of a measurement's observable, interpolated from
-    positions (N, …) at times `t_s` (N,); outside these times the end positions.
+    positions `positions_m` (T, …) at times `t_s` (T,) by a cubic spline, or by lines between fewer
+    than `FEWEST_FOR_SPLINE`; outside these times the end positions.
     """
     position_rows = positions_m.reshape(len(t_s), -1)
     at_s = np.clip(residual.observable_s, t_s[0], t_s[-1])

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,11 +41,11 @@ OUTSIDE_PX = 1.5
 # If at least this many pixels show background per pixel without depth, the sensor measures its
 # background, and missing depths are failures.
 LEAST_BACKGROUND_SHARE = 0.1
-# What pixels show, compared with a point of the outline.
+# Class of a pixel, compared with a point of the outline: it shows the body.
 BODY = 0
-# The pixel does not tell whether the body is there.
+# Class of a pixel that is no evidence whether the body is there.
 UNKNOWN = 1
-# The body is not there.
+# Class of a pixel that shows that the body is not there.
 EMPTY = 2
 
 
@@ -52,16 +53,23 @@ EMPTY = 2
 class Outline:
     """Points of a body's outline and planes through the camera that they should lie in.
 
-    Arrays have S samples of E points at most; those beyond are not `is_compared`.
+    Arrays have S samples of E points at most, of which those that do not exist are zero and not
+    `is_compared`.
 
     Attributes
     ----------
-    nodes, weights : (S, E, v) of the surface's nodes in each outline point
-    normals : (S, E, 3) of the planes, in the world, outwards from the body
-    points, rays : (S, E, 3) a point of each plane in the camera's frame, and zeros
-    pixel_m : (S, E) width of a pixel at the outline point, along the plane's normal [m]
-    places_m : (S, E, 3) outline points on the undeformed body
-    is_compared : (S, E) outline points whose edge is known
+    nodes, weights : (S, E, v) arrays
+        Indices of the v surface nodes of each outline point's face, and their shape functions.
+    normals : (S, E, 3) array
+        Unit normals of the planes in the world, outwards from the body.
+    points, rays : (S, E, 3) arrays
+        A point of each plane in the camera's frame [m], and zeros.
+    pixel_m : (S, E) array
+        Width of a pixel at the outline point, along the plane's normal [m].
+    places_m : (S, E, 3) array
+        Outline points on the undeformed body [m].
+    is_compared : (S, E) array of bool
+        Outline points whose edge is known.
     """
 
     nodes: Index
@@ -86,17 +94,23 @@ class Outline:
     ) -> Outline:
         """Associate the outlines of shapes with the edges in the images of a camera.
 
+        A camera without images gives an outline without compared points.
+
         Parameters
         ----------
         camera : DepthCameraModel
+            Model of the camera.
         surface : VisibleSurface
+            Surface of the body.
         body : Body
+            The body.
         shapes_m : (S, n, 3) array
             Positions of the surface's nodes at the times of the images [m].
         phi : (k,) array
             Nuisance parameters, with the pose of the camera.
         gate_m : float
-            Pixels whose depth differs by less from that of the outline point may show the body [m].
+            Pixels whose depth differs by at most this from that of the outline point may show the
+            body [m].
         """
         corners = surface.faces.shape[1]
         edges = []
@@ -143,17 +157,40 @@ class Outline:
         )
 
 
+class _NearestEdges(NamedTuple):
+    """Edges nearest to P pixels that show nothing.
+
+    Attributes
+    ----------
+    edges : (P, 2) array
+        Edges u, v, half a pixel from the middle of the nearest other pixel.
+    outwards : (P, 2) array
+        Unit vectors from the edge to the pixel; (1, 0) or (1, 1) where there is no edge.
+    exists : (P,) array of bool
+        Whether there is such an edge.
+    """
+
+    edges: Array
+    outwards: Array
+    exists: NDArray[np.bool_]
+
+
 @dataclass(frozen=True, eq=False)
 class _OutlinePoints:
     """Points (P) where the body ends in the view of a camera.
 
     Attributes
     ----------
-    faces : (P,) of the surface
-    weights : (P, v) of its nodes
-    depth_m : (P,) along the optical axis
-    pixels : (P, 2) u and v
-    outwards : (P, 2) unit normals of the outline in the image, away from the body
+    faces : (P,) array
+        Indices of the surface's faces.
+    weights : (P, v) array
+        Shape functions of the faces' nodes.
+    depth_m : (P,) array
+        Depths along the optical axis [m].
+    pixels : (P, 2) array
+        Pixels u and v.
+    outwards : (P, 2) array
+        Unit normals of the outline in the image, away from the body.
     """
 
     faces: Index
@@ -187,15 +224,20 @@ def no_depth_is_empty(
 ) -> bool:
     """Return whether pixels without depth show that nothing is there.
 
+    It is as the problem states (`Depth.background`); for "auto", whether fewer than the share
+    `LEAST_BACKGROUND_SHARE` of the number of pixels without depth show a background behind the
+    body.
+
     Parameters
     ----------
     camera : DepthCameraModel
+        Model of the camera.
     image_m : (rows, columns) array
         Depths [m], NaN where missing.
     sample : int
         Index of the image.
     size_m : float
-        Diagonal of the body [m]; what is farther behind its middle is background.
+        Diagonal of the body [m]; pixels that are farther behind its middle show background.
     """
     if camera.depth.background != "auto":
         return camera.depth.background == "empty"
@@ -225,7 +267,7 @@ def _outline_points(
     """
     eye_m = camera_in.eye_m(phi, sample)
     camera = camera_in.depth.camera
-    own_m = camera_in.to_camera_m(phi, shape_m, sample)
+    own_m = camera_in.to_camera_m(phi, shape_m, sample=sample)
     if eye_m is None or (own_m[:, 2] <= 0).any():
         return None
     facing = surface.is_facing(shape_m, eye_m)
@@ -257,7 +299,9 @@ def _outline_points(
     at_second = corners[edge] == ends[edge, 1:]
     shares = at_first * (1 - share)[:, None] + at_second * share[:, None]
     faces, places = surface.to_faces(front_triangle[edge], shares)
-    weights, points_m, _ = surface.evaluate(shape_m, faces, places)
+    surface_points = surface.evaluate(shape_m, faces, places)
+    weights = surface_points.weights
+    points_m = surface_points.points_m
     pixels = camera.distorted_pixels(own_m)
     tangents_px = pixels[ends[edge, 1]] - pixels[ends[edge, 0]]
     length_px = np.linalg.norm(tangents_px, axis=1)
@@ -266,7 +310,7 @@ def _outline_points(
         / np.maximum(length_px, 1e-9)[:, None]
     )
     centres = pixels[corners[edge]].mean(axis=1)
-    at_m = camera_in.to_camera_m(phi, points_m, sample)
+    at_m = camera_in.to_camera_m(phi, points_m, sample=sample)
     places_px = camera.distorted_pixels(at_m)
     inwards = np.sum(normals * (places_px - centres), axis=1) < 0
     outwards = np.where(inwards[:, None], -normals, normals)
@@ -288,7 +332,9 @@ def _outline_points(
 
 
 def _first_of_each_cube(points_m: Array, edge_m: float) -> Index:
-    """Indices of the first of the points (P, 3) in each cube of a grid with edges [m]."""
+    """Return the indices, ascending, of the first of the points (P, 3) in each cube of a grid with
+    edges of `edge_m` [m].
+    """
     _, first = np.unique(
         np.floor(points_m / edge_m).astype(np.int64), axis=0, return_index=True
     )
@@ -296,8 +342,8 @@ def _first_of_each_cube(points_m: Array, edge_m: float) -> Index:
 
 
 def _covered(points: Array, triangles: Array) -> NDArray[np.bool_]:
-    """Return whether each of points (P, 2) of an image lies within, or on the border of, any of its
-    triangles (T, 3, 2), (P,).
+    """Return the mask (P,) of points (P, 2) of an image that lie within, or on the border of, any
+    of its triangles (T, 3, 2).
     """
     covered = np.zeros(len(points), dtype=bool)
     if not len(triangles):
@@ -332,11 +378,12 @@ def _edges(
     sample: int,
 ) -> dict[str, NDArray]:
     """Return the planes through the edges in an image that belong to points of an outline, by
-    attribute name of `Outline`.
+    attribute name of `Outline`, with "faces" (P,) in place of "nodes".
 
     Parameters
     ----------
     camera_in : DepthCameraModel
+        Model of the camera.
     points : _OutlinePoints
         The P points of the outline.
     image_m : (rows, columns) array
@@ -381,10 +428,10 @@ def _edges(
         is_nothing = (image_m > points.depth_m.max() + gate_m) | (
             np.isnan(image_m) & empty
         )
-        edges[is_beyond], outwards[is_beyond], has_nearest = _nearest_edges(
-            is_nothing, points.pixels[is_beyond]
-        )
-        is_beyond[is_beyond] = has_nearest
+        nearest_edges = _nearest_edges(is_nothing, points.pixels[is_beyond])
+        edges[is_beyond] = nearest_edges.edges
+        outwards[is_beyond] = nearest_edges.outwards
+        is_beyond[is_beyond] = nearest_edges.exists
     return {
         "faces": points.faces,
         "weights": points.weights,
@@ -409,10 +456,23 @@ def _classify_pixels(
     gate_m: float,
     is_missing_empty: bool,
 ) -> NDArray[np.int64]:
-    """Classify pixels (…, 2) of an image beside a body at given depths as BODY, UNKNOWN or EMPTY.
+    """Classify pixels of an image beside a body as BODY, UNKNOWN or EMPTY.
 
-    Pixels outside the image are UNKNOWN. `is_missing_empty` states whether a missing depth (NaN)
-    means that nothing is there.
+    A pixel whose depth differs by at most `gate_m` shows the body, a farther one is empty, a nearer
+    one unknown. Pixels outside the image are unknown.
+
+    Parameters
+    ----------
+    image_m : (rows, columns) array
+        Depths [m]; NaN where missing.
+    pixels : (…, 2) array
+        Pixels u, v; rounded.
+    depth_m : array
+        Depths of the body there [m], of a shape that broadcasts to that of the pixels.
+    gate_m : float
+        Largest difference of depth [m].
+    is_missing_empty : bool
+        Whether a missing depth means that nothing is there; otherwise it is unknown.
     """
     column, row = np.moveaxis(np.round(pixels).astype(np.int64), -1, 0)
     inside = (
@@ -430,9 +490,7 @@ def _classify_pixels(
     return shown
 
 
-def _nearest_edges(
-    nothing: NDArray[np.bool_], pixels: Array
-) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _nearest_edges(nothing: NDArray[np.bool_], pixels: Array) -> _NearestEdges:
     """Return the edges nearest to pixels (P, 2).
 
     Parameters
@@ -441,15 +499,13 @@ def _nearest_edges(
         Pixels of the image that show nothing, among them `pixels`.
     pixels : (P, 2) array
         Pixels u, v.
-
-    Returns
-    -------
-    ((P, 2) array, (P, 2) array, (P,) array of bool)
-        Edges, half a pixel from the middle of the nearest other pixel; unit vectors from the edge
-        to the pixel; and whether there is such an edge.
     """
     if nothing.all():
-        return pixels, np.ones_like(pixels), np.zeros(len(pixels), dtype=bool)
+        return _NearestEdges(
+            pixels,
+            np.ones_like(pixels),
+            exists=np.zeros(len(pixels), dtype=bool),
+        )
     places: Array = np.asarray(
         distance_transform_edt(
             nothing, return_distances=False, return_indices=True
@@ -462,7 +518,7 @@ def _nearest_edges(
     has_edge = length > 0
     way[has_edge] /= length[has_edge, None]
     way[~has_edge] = [1.0, 0.0]
-    return nearest + 0.5 * way, way, has_edge
+    return _NearestEdges(nearest + 0.5 * way, way, exists=has_edge)
 
 
 def _planes(
@@ -480,6 +536,7 @@ def _planes(
     Parameters
     ----------
     camera_in, camera : DepthCameraModel, DepthCamera
+        Model of the camera, and its stated properties.
     edges : (P, 2) array
         Pixels u, v of the edges.
     outwards : (P, 2) array
@@ -522,7 +579,9 @@ def _planes(
 def _concatenated_rays(
     camera: DepthCamera, pixels: Sequence[Array]
 ) -> list[Array]:
-    """Return the rays (P, 3) of several sets of pixels (P, 2), computed in one call."""
+    """Return the points (P, 3) at depth one on the rays of several sets of pixels (P, 2), one array
+    per set, computed in one call.
+    """
     return np.split(
         camera.points_at_unit_depth(np.concatenate(pixels)), len(pixels)
     )

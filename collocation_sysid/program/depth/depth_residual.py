@@ -50,7 +50,8 @@ GROWING = 1.2
 
 @dataclass(frozen=True, eq=False)
 class DepthResidual(MeasurementResidual):
-    """Measurement model of the points of a depth camera, with one number each.
+    """Measurement model of the points of a depth camera, with one number each: the distance from
+    the surface, whose measured value is zero.
 
     Attributes
     ----------
@@ -104,7 +105,7 @@ class DepthResidual(MeasurementResidual):
             node_count=len(correspondences.body.nodes_m),
         )
         chart = MarkerAssociation.from_exact_places(
-            correspondences.body, placement, points_m
+            correspondences.body, placement, points_m=points_m
         )
         samples, points = correspondences.is_compared.shape
         return cls(
@@ -134,7 +135,9 @@ class DepthResidual(MeasurementResidual):
 
     @property
     def correspondences_in_use(self) -> SurfaceCorrespondences | Outline:
-        """Corresponding points of surface and image that are compared."""
+        """Corresponding points of surface and image that this model compares; those of the outline
+        in a subclass.
+        """
         return self.correspondences
 
     @cached_property
@@ -160,7 +163,12 @@ class DepthResidual(MeasurementResidual):
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all images: indices of the surface nodes, and the data of the expression."""
+        """Stencil of all images: indices of the surface nodes, and the data of the expression.
+
+        The data are, in this order: distances of the neighbouring times from the image [s], shape
+        functions, normal in the world and in the camera's frame, translation of the camera along
+        the normal [m], measured point [m] and ray in the camera's frame.
+        """
         pairs = self.correspondences_in_use
         times = self._neighbour_times
         samples, points = pairs.is_compared.shape
@@ -202,20 +210,21 @@ class DepthResidual(MeasurementResidual):
 
     @property
     def first_row(self) -> int:
-        """Index of the last time of the observable that the first image is computed from."""
+        """Index of the last time of the observable from which the first image is computed."""
         return int(self._neighbour_times[0, -1])
 
     def aligned_correspondences(
         self, x: Array, phi: Array
     ) -> SurfaceCorrespondences:
-        """Align the camera with the first rows of a motion and find the correspondences.
+        """Align the camera with the first rows of a motion and return the correspondences.
 
         Parameters
         ----------
         x : (rows, 3n) array
             First rows [m]; if they do not reach the first image, the last row is used for it.
+            Images that they do not reach keep their shapes.
         phi : (k,) array
-            Nuisance parameters.
+            Nuisance parameters; not modified.
         """
         correspondences = self.correspondences
         shapes = self.surface_shapes(x, phi)
@@ -225,7 +234,10 @@ class DepthResidual(MeasurementResidual):
             [shapes, correspondences.shapes_m[len(shapes) :]]
         )
         return SurfaceCorrespondences.from_alignment(
-            correspondences.camera, correspondences.body, all_shapes, phi
+            correspondences.camera,
+            correspondences.body,
+            shapes_m=all_shapes,
+            phi=phi,
         )
 
     @property
@@ -237,14 +249,15 @@ class DepthResidual(MeasurementResidual):
         return float(self.observable_s[self._neighbour_times[first, -1]])
 
     def expression(self, values_in: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the distance of a point behind the surface along the normal [m].
+        """Return the distance (1,) of a point behind the surface along the normal [m], positive
+        inside the body.
 
         Parameters
         ----------
         values_in : (3, nodes · times) SX
             Positions of the nodes of the point's face at the neighbouring times [m].
         phi : SX
-            Nuisance parameters of the camera.
+            Nuisance parameters of the camera, in prior standard deviations.
         data : SX
             Data of the point, see `_stencil`.
         """
@@ -261,7 +274,7 @@ class DepthResidual(MeasurementResidual):
         times = ca.vertsplit(offsets)
         in_time = ca.vertcat(*lagrange_weights(clock_shift, times))
         surface = values_in @ ca.kron(in_time, weights)
-        corrected = view.corrected_expression(point, ray, values)
+        corrected = view.corrected_expression(point, ray, values=values)
         return (
             ca.dot(normal, surface)
             - ca.dot(in_camera, corrected)
@@ -270,7 +283,8 @@ class DepthResidual(MeasurementResidual):
 
     def rough_residuals(self, x: Array, phi: Array) -> Array:
         """Return the distances from visible parts of the surface to the points of the first image
-        (P,), in standard deviations, at positions x (rows, 3n) and φ.
+        (P,), in standard deviations, at positions x (rows, 3n) [m] and φ (k,); x must reach the
+        first image.
         """
         shapes = self.surface_shapes(x, phi)
         return (
@@ -280,8 +294,8 @@ class DepthResidual(MeasurementResidual):
 
     @property
     def loss_of_distant_points(self) -> float:
-        """Loss of the points beyond the gate, each counted as if its distance were the
-        stated gate.
+        """Loss of the points beyond the gate of the present correspondences, each counted as if its
+        distance were the stated gate.
         """
         depth = self.correspondences.camera.depth
         deviations = depth.gate_m / depth.sigma_m
@@ -295,7 +309,8 @@ class DepthResidual(MeasurementResidual):
 
     @cached_property
     def _patch_indices(self) -> NDArray[np.int64]:
-        """Patch (S, E) of each compared point, −1 for others.
+        """Index of the patch (S, E) of each compared point, −1 for others: a cube of the undeformed
+        body. There are at most `PATCHES`.
 
         Residuals of neighbouring points are correlated; their means over patches nearly are not.
         """
@@ -316,7 +331,7 @@ class DepthResidual(MeasurementResidual):
     @cached_property
     def _pooling(self) -> tuple[sp.csr_array, NDArray[np.int64]]:
         """Sparse matrix (S · 3M, S · E) from points to patches, with entries 1/√count, and the
-        counts (S, 3M) of points.
+        counts (S, 3M) of points; the number of patches is rounded up to a multiple of three.
         """
         samples, points = self._patch_indices.shape
         patches = GROUP * -(
@@ -333,7 +348,9 @@ class DepthResidual(MeasurementResidual):
 
     @cached_property
     def pooled_groups(self) -> PooledResiduals:
-        """Patches of the surface, in groups of three."""
+        """Patches of the surface, in groups of three, with σ of a single point; a patch is compared
+        in images in which it has points, and its place is the mean of its points in all images.
+        """
         means, counts = self._pooling
         name = self.names[0]
         count = counts.shape[1] // GROUP
@@ -367,12 +384,13 @@ class DepthResidual(MeasurementResidual):
     # In pictures ------------------------------------------------------------------------------
 
     def signed_distances_m(self, values: Array, phi: Array) -> Array:
-        """Return how far points (s, E) are behind the surface [m]; NaN where they are not compared.
+        """Return how far points (s, E) of the first s images are behind the surface [m]; NaN where
+        they are not compared.
 
         Parameters
         ----------
         values : (n, e, 3) array
-            Positions of the surface nodes [m].
+            Positions of the surface nodes at the first n times of the observable [m].
         phi : (k,) array
             Nuisance parameters.
         """
@@ -385,7 +403,7 @@ class DepthResidual(MeasurementResidual):
 
     def surface_shapes(self, x: Array, phi: Array) -> Array:
         """Return the surface nodes (s, n, 3) [m] at the times of those first s images for which the
-        first rows x (rows, 3n) suffice, with the clock shift of φ.
+        first rows x (rows, 3n) [m] suffice, with the clock shift of φ (k,); s may be 0.
         """
         clock_shift = self.correspondences.camera.clock_shift_s(phi)
         known = int((self._neighbour_times[:, -1] < len(x)).sum())

@@ -34,7 +34,7 @@ class OutlineResidual(DepthResidual):
     @classmethod
     def from_depth(cls, depth: DepthResidual) -> OutlineResidual:
         """Return the measurement model of the outlines for the camera, images and correspondences
-        of a depth measurement model.
+        of a depth measurement model, with its Huber threshold.
         """
         used = depth.correspondences.outline.is_compared
         samples, points = used.shape
@@ -67,7 +67,9 @@ class OutlineResidual(DepthResidual):
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all images as for depth, with the width of a pixel as last datum."""
+        """Stencil of all images as for depth, with the width of a pixel [m] as last datum; one
+        where there is no edge.
+        """
         places, data = super()._stencil
         width_m = np.where(
             self.correspondences_in_use.is_compared,
@@ -89,18 +91,18 @@ class OutlineResidual(DepthResidual):
         return outside_m / data[count] - inside_px
 
     def signed_distances_px(self, values: Array, phi: Array) -> Array:
-        """Return how far outline points (s, E) are outside of their edges [pixels]; NaN where there
-        is no edge.
+        """Return how far outline points (s, E) of the first s images are outside of their edges
+        [pixels]; NaN where there is no edge.
 
         Parameters
         ----------
         values : (n, e, 3) array
-            Positions of the surface nodes at the times of the observable [m].
+            Positions of the surface nodes at the first n times of the observable [m].
         phi : (k,) array
             Nuisance parameters in units of their priors.
         """
         return self.signed_distances_m(values, phi)
 
     def rough_residuals(self, x: Array, phi: Array) -> Array:
-        """Return no residual: before anything is fitted, distances to the points suffice."""
+        """Return an empty array: before anything is fitted, the distances to the points suffice."""
         return np.zeros(0)

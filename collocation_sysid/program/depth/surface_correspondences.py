@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,9 @@ from .depth_camera_model import DepthCameraModel
 from .depth_outline import Outline
 from .visible_surface import GRAZING, VisibleSurface
 
-# Share of the distance perpendicular to the normal beyond which a point lies beyond an edge.
-LARGEST_OFFSET_EDGES = 0.5
+# Share of a point's distance that is perpendicular to the normal, above which it lies beyond an
+# edge of the visible surface.
+LARGEST_LATERAL_SHARE = 0.5
 # Gate before anything is fitted, relative to the diagonal of the body.
 WIDE = 0.25
 # Later gate, relative to the median distance of the points.
@@ -45,8 +46,8 @@ FRONT = 0.5
 
 
 def initial_gate_m(shape_m: Array) -> float:
-    """Return the largest distance of points from a surface with nodes (n, 3) before
-    anything is fitted [m].
+    """Return the largest distance of points from a surface before anything is fitted [m]: the share
+    `WIDE` of the diagonal of the bounding box of its nodes `shape_m` (n, 3) [m].
     """
     return WIDE * float(np.linalg.norm(np.ptp(shape_m, axis=0)))
 
@@ -54,6 +55,9 @@ def initial_gate_m(shape_m: Array) -> float:
 @dataclass(frozen=True, eq=False)
 class SurfaceCorrespondences:
     """Points of a camera and corresponding points of the surface, in S images of at most E points.
+
+    Only points within the gate are contained; arrays of images with fewer points are padded with
+    zeros, and the padding is not `is_compared`.
 
     Attributes
     ----------
@@ -64,11 +68,13 @@ class SurfaceCorrespondences:
     surface : VisibleSurface
         Surface of the body.
     nodes, weights : (S, E, v) arrays
-        Nodes of the surface, and shape functions of the corresponding points.
+        Indices of the v surface nodes of each corresponding point's face, and their shape
+        functions.
     normals : (S, E, 3) array
-        Normals of the surface in the world.
+        Unit vectors in the world along which distances are measured: normals of the surface, and
+        for a point beyond an edge of the visible surface the direction to it.
     points, rays : (S, E, 3) arrays
-        Measured points, and directions of their depths, in the camera's frame.
+        Measured points [m], and directions of their depths, in the camera's frame.
     places_m : (S, E, 3) array
         Corresponding points on the undeformed body [m].
     is_compared : (S, E) array of bool
@@ -76,7 +82,7 @@ class SurfaceCorrespondences:
     gate_m : float
         Points farther from the surface are taken to belong to something else [m].
     excluded_counts : mapping of str to int
-        Number of points that are not compared, by reason.
+        Number of points that are not compared, by reason (`EXCLUSION_REASONS`).
     shapes_m : (S, n, 3) array
         Surface nodes for which the correspondences were found [m].
     start_values : mapping of str to float
@@ -125,13 +131,13 @@ class SurfaceCorrespondences:
         body : Body
             The body.
         shapes_m : (S, n, 3) array
-            Surface nodes at the images [m].
+            Surface nodes at all S images [m].
         phi : (k,) array
             Nuisance parameters, with the pose of the camera.
         gate_m : float
             Largest distance of points from the surface [m].
         settled : bool
-            Whether to leave out points that the body hides.
+            Whether to leave out points that the body hides; stored as `has_converged`.
         """
         skin = VisibleSurface.from_body(body, camera.depth)
         images = [
@@ -177,15 +183,16 @@ class SurfaceCorrespondences:
         own["outline"] = Outline.from_shapes(
             camera, skin, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
         )
-        return cls(camera, body, skin, **own, **arrays)
+        return cls(camera, body, surface=skin, **own, **arrays)
 
     @classmethod
     def from_alignment(
         cls, camera: DepthCameraModel, body: Body, shapes_m: Array, phi: Array
     ) -> SurfaceCorrespondences:
-        """Align the camera with the first shape, then find the correspondences.
+        """Align the camera with the shape of the first image that has points, then find the
+        correspondences, also of hidden points, within a gate that suits their distances.
 
-        The alignment is rejected if it differs from the stated pose by more than four prior
+        The alignment is rejected if it differs from the stated pose by more than `FARTHEST` prior
         standard deviations.
 
         Parameters
@@ -195,16 +202,16 @@ class SurfaceCorrespondences:
         body : Body
             The body.
         shapes_m : (S, n, 3) array
-            Surface nodes at the images [m].
+            Surface nodes at all S images [m].
         phi : (k,) array
-            Nuisance parameters, for those that the alignment does not estimate.
+            Nuisance parameters, for those that the alignment does not estimate; not modified.
         """
         first = camera.depth.first_sample_with_points
         skin = VisibleSurface.from_body(body, camera.depth)
         turn, shift_m = align_camera(
             camera, skin, x=shapes_m[first], image=first
         )
-        moved = camera.with_pose(phi, turn, shift_m)
+        moved = camera.with_pose(phi, turn, shift_m=shift_m)
         is_implausible = (
             np.abs(moved[camera.parameter_indices]).max(initial=0.0) > FARTHEST
         )
@@ -220,7 +227,7 @@ class SurfaceCorrespondences:
         return cls.from_shapes(camera, body, shapes_m, phi, gate_m)
 
     def updated(self, shapes_m: Array, phi: Array) -> SurfaceCorrespondences:
-        """Update the correspondences.
+        """Return the correspondences of other shapes and camera poses.
 
         Parameters
         ----------
@@ -232,7 +239,8 @@ class SurfaceCorrespondences:
         Returns
         -------
         SurfaceCorrespondences
-            The new correspondences; self if neither shapes, camera nor gate have changed.
+            The new correspondences; self if they have converged, the gate is unchanged, and neither
+            surface nor measured points have moved by more than the share `SAME` of σ.
         """
         known = len(shapes_m)
         all_shapes_m = np.concatenate([shapes_m, self.shapes_m[known:]])
@@ -262,22 +270,24 @@ class SurfaceCorrespondences:
         )
 
     def distance_to_cloud_m(self, x: Array, phi: Array) -> Array:
-        """Return the distances (P,) from visible parts of a shape x (n, 3) to the points of the
-        first image [m].
+        """Return the distances (P,) [m] to the points of the first image from the middles of those
+        flat triangles of a shape x (n, 3) [m] that the camera sees at φ (k,), not at a grazing
+        angle.
 
         Distances are limited to `initial_gate_m` of the body.
         """
         view = self.camera
         is_facing = self.surface.is_facing(
-            x, self.camera.eye_m(phi, 0), GRAZING
+            x, self.camera.eye_m(phi, 0), minimum_cosine=GRAZING
         )
         middles = x[self.surface.plane_triangles[is_facing]].mean(axis=1)
         distances_m, _ = KDTree(view.world_points(phi, 0)).query(middles)
         return np.minimum(distances_m, initial_gate_m(self.body.nodes_m))
 
     def next_gate_m(self, shapes_m: Array, phi: Array) -> float:
-        """Return the gate for the next search [m]: narrower if the points are near enough to the
-        surfaces (S, n, 3), else the present one.
+        """Return the gate for the next search [m]: six times the median distance of the compared
+        points from the surfaces (S, n, 3) [m] at φ (k,), at least that of the problem, if this is
+        smaller than the present one by the factor `NARROWER`; otherwise the present one.
         """
         gate_m = max(
             self._expected_distance_m(shapes_m, phi), self.camera.depth.gate_m
@@ -285,7 +295,7 @@ class SurfaceCorrespondences:
         return gate_m if gate_m <= NARROWER * self.gate_m else self.gate_m
 
     def _expected_distance_m(self, shapes_m: Array, phi: Array) -> float:
-        """Return six times the median distance of the compared points from the surface [m];
+        """Return `SPREAD` times the median distance of the compared points from the surface [m];
         infinite without any.
         """
         distances_m = self.signed_distances_m(shapes_m, phi)
@@ -297,9 +307,10 @@ class SurfaceCorrespondences:
         )
 
     def signed_distances_m(self, shapes_m: Array, phi: Array) -> Array:
-        """Return how far points (S, E) are behind shapes (S, n, 3), along the normals [m].
+        """Return how far points (S, E) are behind shapes (s, n, 3) of the first s ≤ S images, along
+        `normals` [m], at φ (k,).
 
-        NaN where a point is not compared.
+        NaN where a point is not compared, and for the other images.
         """
         distances_m = np.full(self.is_compared.shape, np.nan)
         for k, x in enumerate(shapes_m):
@@ -310,6 +321,24 @@ class SurfaceCorrespondences:
             behind_m = np.sum(self.normals[k] * (surface - measured), axis=1)
             distances_m[k] = np.where(self.is_compared[k], behind_m, np.nan)
         return distances_m
+
+
+class _NearestPoints(NamedTuple):
+    """Points of a cloud, and the points of a surface nearest to them.
+
+    Attributes
+    ----------
+    indices : (k,) array
+        Indices of the points in the cloud.
+    faces : (k,) array
+        Face of each nearest point.
+    barycentric : (k, 3) array
+        Its barycentric coordinates on the face.
+    """
+
+    indices: Index
+    faces: Index
+    barycentric: Array
 
 
 def _match_image(
@@ -327,8 +356,11 @@ def _match_image(
     Parameters
     ----------
     camera : DepthCameraModel
+        Model of the camera.
     surface : VisibleSurface
+        Surface of the body.
     body : Body
+        The body.
     sample : int
         Index of the image.
     x : (n, 3) array
@@ -345,16 +377,20 @@ def _match_image(
     -------
     dict of arrays
         Arrays of the points within the gate, by attribute name of `SurfaceCorrespondences`; and
-        "reasons", the numbers of points left out in the order of `EXCLUSION_REASONS`.
+        "reasons", the numbers of points left out in the order of `EXCLUSION_REASONS`, each by the
+        first reason that applies.
     """
     depth = camera.depth
     cloud = camera.depth.clouds[sample]
     world = camera.world_points(phi, sample)
     eye_m = camera.eye_m(phi, sample)
-    indices, faces, places = _nearest_facing(
-        world, surface, x=x, eye_m=eye_m, gate_m=gate_m
-    )
-    weights, feet, normals = surface.evaluate(x, faces, places)
+    nearest = _nearest_facing(world, surface, x=x, eye_m=eye_m, gate_m=gate_m)
+    indices = nearest.indices
+    faces = nearest.faces
+    surface_points = surface.evaluate(x, faces, nearest.barycentric)
+    weights = surface_points.weights
+    feet = surface_points.points_m
+    normals = surface_points.normals
     ways = normals if eye_m is None else eye_m - feet
     is_frontal = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(
         ways, axis=1
@@ -364,8 +400,8 @@ def _match_image(
     lateral = np.linalg.norm(
         offsets - np.sum(offsets * normals, axis=1)[:, None] * normals, axis=1
     )
-    # A point beyond an edge of what the camera sees pulls that along the way to it.
-    is_beyond_edge = lateral > LARGEST_OFFSET_EDGES * distance + depth.sigma_m
+    # The distance of a point beyond an edge of the visible surface is along the way to the edge.
+    is_beyond_edge = lateral > LARGEST_LATERAL_SHARE * distance + depth.sigma_m
     normals[is_beyond_edge] = (
         offsets[is_beyond_edge] / distance[is_beyond_edge, None]
     )
@@ -374,7 +410,9 @@ def _match_image(
         measured = cloud[indices, 3:] @ camera.poses[0][sample].T
         has_similar_normal = np.sum(normals * measured, axis=1) >= GRAZING
     if settled:
-        is_visible = ~surface.is_hidden(x, eye_m, feet, FRONT * depth.spacing_m)
+        is_visible = ~surface.is_hidden(
+            x, eye_m, points_m=feet, front_m=FRONT * depth.spacing_m
+        )
     is_within_gate = distance <= gate_m
     remaining = np.cumprod(
         [
@@ -412,9 +450,10 @@ def _nearest_facing(
     x: Array,
     eye_m: Array | None,
     gate_m: float,
-) -> tuple[Index, Index, Array]:
-    """Return indices of points near a shape, and the nearest points of faces towards the camera:
-    faces and barycentric coordinates.
+) -> _NearestPoints:
+    """Return the points near a shape, and the nearest points of faces towards the camera.
+
+    There are none if no face is towards the camera.
 
     Parameters
     ----------
@@ -434,15 +473,20 @@ def _nearest_facing(
     in_box = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
     facing = np.flatnonzero(surface.is_facing(x, eye_m))
     if not len(facing) or not len(in_box):
-        return in_box[:0], in_box[:0], np.zeros((0, 3))
-    return in_box, *surface.nearest_points(x, world[in_box], facing)
+        return _NearestPoints(
+            in_box[:0], in_box[:0], barycentric=np.zeros((0, 3))
+        )
+    faces, barycentric = surface.nearest_points(
+        x, world[in_box], candidates=facing
+    )
+    return _NearestPoints(in_box, faces, barycentric=barycentric)
 
 
 def initial_correspondences(
     experiment: Experiment,
 ) -> tuple[SurfaceCorrespondences, ...]:
-    """Return the correspondences of an experiment's depth cameras with the undeformed body
-    in its grasps.
+    """Return the correspondences of each depth camera of an experiment with the undeformed body in
+    its grasps, after an alignment of the camera; an empty tuple without cameras.
     """
     if not experiment.depths:
         return ()
@@ -455,7 +499,7 @@ def initial_correspondences(
         nothing = np.zeros(nuisance.size)
         sightings.append(
             SurfaceCorrespondences.from_alignment(
-                view, experiment.body, shapes_m, nothing
+                view, experiment.body, shapes_m=shapes_m, phi=nothing
             )
         )
     return tuple(sightings)

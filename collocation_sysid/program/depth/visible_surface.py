@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,20 +19,58 @@ from ...recording.placement import nearest_points_of_triangles
 
 # Number of triangles, nearest by their middles, among which the nearest point is searched.
 NEARBY = 10
-# Newton steps to the nearest point on a curved face.
+# Largest number of Newton steps to the nearest point on a curved face.
 SETTLING = 3
-# Changes of barycentric coordinates that end these steps.
+# Change of barycentric coordinates below which these steps end.
 STILL = 1e-6
 # Cosine between normal and view below which a point is seen at a grazing angle; measured normals
 # may be off by as much.
 GRAZING = 0.3
 
-# Flat triangles that stand for a face of three nodes, or of six with those on ab, bc, ca.
+# Barycentric coordinates of the nodes of a face: corners a, b, c, then the middles of ab, bc, ca.
 CORNERS = np.vstack([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]])
+# Flat triangles, by the nodes at their corners, that stand for a face of three or of six nodes.
 TRIANGLES_OF_FACE = {
     3: np.array([[0, 1, 2]]),
     6: np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
 }
+
+
+class SurfacePoints(NamedTuple):
+    """Points on faces of a deformed surface.
+
+    Attributes
+    ----------
+    weights : (P, v) array
+        Shape functions of the v nodes of each point's face.
+    points_m : (P, 3) array
+        Positions [m].
+    normals : (P, 3) array
+        Outward unit normals; zero on a degenerate face.
+    """
+
+    weights: Array
+    points_m: Array
+    normals: Array
+
+
+class _SurfaceTangents(NamedTuple):
+    """Points on faces of a deformed surface, and tangents there.
+
+    Attributes
+    ----------
+    weights : (P, v) array
+        Shape functions of the v nodes of each point's face.
+    points_m : (P, 3) array
+        Positions [m].
+    tangents : (P, 2, 3) array
+        Derivatives of the position by the first and the second barycentric coordinate [m], the
+        third changing by the opposite amount.
+    """
+
+    weights: Array
+    points_m: Array
+    tangents: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +80,10 @@ class VisibleSurface:
     Attributes
     ----------
     nodes : (n,) array
-        Nodes of the body on the surface.
+        Indices of the body's nodes on the surface, ascending.
     faces : (F, 3) or (F, 6) array
-        Indices into `nodes` of each face.
+        Indices into `nodes` of each face: three corners, then for six nodes the middles of its
+        edges.
     is_selected : (F,) array of bool
         Faces that the camera may see according to the problem.
     """
@@ -54,8 +94,8 @@ class VisibleSurface:
 
     @classmethod
     def from_body(cls, body: Body, depth: Depth) -> VisibleSurface:
-        """Build the surface of a body, with the faces that a depth camera may see according
-        to the problem.
+        """Build the surface of a body, with the faces that a depth camera may see according to the
+        problem; all of them if it does not state any.
         """
         triangles = body.mesh.surface
         chosen = np.ones(len(triangles), dtype=bool)
@@ -65,7 +105,7 @@ class VisibleSurface:
         nodes, faces = np.unique(
             body.nodes.nodes_of_faces(triangles), return_inverse=True
         )
-        return cls(nodes, faces.reshape(len(triangles), -1), chosen)
+        return cls(nodes, faces.reshape(len(triangles), -1), is_selected=chosen)
 
     def initial_positions_m(
         self, experiment: Experiment, depth: Depth
@@ -126,7 +166,7 @@ class VisibleSurface:
 
     def evaluate(
         self, x: Array, faces: Index, barycentric: Array
-    ) -> tuple[Array, Array, Array]:
+    ) -> SurfacePoints:
         """Evaluate points on faces of a deformed surface.
 
         Parameters
@@ -137,35 +177,30 @@ class VisibleSurface:
             Faces.
         barycentric : (P, 3) array
             Barycentric coordinates on them.
-
-        Returns
-        -------
-        ((P, v) array, (P, 3) array, (P, 3) array)
-            Shape functions of the nodes, points [m], and outward unit normals.
         """
-        weights, points, tangents = self._evaluate_tangents(
-            x, faces, barycentric=barycentric
-        )
-        normals = np.cross(tangents[:, 0], tangents[:, 1])
+        at = self._evaluate_tangents(x, faces, barycentric=barycentric)
+        normals = np.cross(at.tangents[:, 0], at.tangents[:, 1])
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
-        return weights, points, normals
+        return SurfacePoints(at.weights, at.points_m, normals=normals)
 
     def _evaluate_tangents(
         self, x: Array, faces: Index, barycentric: Array
-    ) -> tuple[Array, Array, Array]:
-        """Return shape functions, points, and tangents (P, 2, 3) along the faces; arguments
-        as in `evaluate`.
-        """
+    ) -> _SurfaceTangents:
+        """Return points on faces and tangents along the faces; arguments as in `evaluate`."""
         weights, slopes = face_shape_functions(barycentric, self.faces.shape[1])
         corners = x[self.faces[faces]]
         tangents = np.einsum(
             "pak,pai->pki", slopes[:, :, :2] - slopes[:, :, 2:], corners
         )
-        return weights, np.einsum("pa,pai->pi", weights, corners), tangents
+        return _SurfaceTangents(
+            weights,
+            np.einsum("pa,pai->pi", weights, corners),
+            tangents=tangents,
+        )
 
     def subdivided_triangles(self, x: Array, divisions: int = 4) -> Array:
         """Return the corners (F · divisions², 3, 3) [m] of triangles on a surface deformed to x (n,
-        3) [m], with each side of a face divided into `divisions`.
+        3) [m], with each side of a face divided into `divisions`; those of a face are consecutive.
         """
         i, j = np.indices((divisions, divisions)).reshape(2, -1)
         up = i + j < divisions
@@ -178,15 +213,14 @@ class VisibleSurface:
         )
         places = np.stack([1 - of_b - of_c, of_b, of_c], axis=-1).reshape(-1, 3)
         faces = np.repeat(np.arange(len(self.faces)), len(places))
-        points = self.evaluate(x, faces, np.tile(places, (len(self.faces), 1)))[
-            1
-        ]
-        return points.reshape(-1, 3, 3)
+        barycentric = np.tile(places, (len(self.faces), 1))
+        return self.evaluate(x, faces, barycentric).points_m.reshape(-1, 3, 3)
 
     def is_facing(
         self, x: Array, eye_m: Array | None, minimum_cosine: float = 0.0
     ) -> NDArray[np.bool_]:
-        """Return the mask (F·k,) of flat triangles that face a camera.
+        """Return the mask (F·k,) of flat triangles that face a camera; other parts of the body may
+        still hide them.
 
         Parameters
         ----------
@@ -195,7 +229,7 @@ class VisibleSurface:
         eye_m : (3,) array or None
             Position of the camera [m]; None, for a point cloud without camera, gives all.
         minimum_cosine : float
-            Smallest cosine between the normal and the direction to the camera.
+            The cosine between the normal and the direction to the camera must be larger.
         """
         if eye_m is None:
             return np.ones(len(self.plane_triangles), dtype=bool)
@@ -210,16 +244,19 @@ class VisibleSurface:
     ) -> NDArray[np.bool_]:
         """Return the mask (P,) of points that another part of the surface hides from a camera.
 
+        Only parts that face the camera and are completely in front of it hide points.
+
         Parameters
         ----------
         x : (n, 3) array
             Node positions [m].
         eye_m : (3,) array or None
-            Position of the camera [m]; None gives none.
+            Position of the camera [m]; for None no point is hidden.
         points_m : (P, 3) array
             Points [m].
         front_m : float
-            A part hides a point if it is at least so much nearer to the camera [m].
+            A part hides a point if it is more than this nearer to the camera along the optical axis
+            [m].
         """
         behind = np.zeros(len(points_m), dtype=bool)
         if eye_m is None or not len(points_m):
@@ -253,7 +290,7 @@ class VisibleSurface:
         of_b = _cross_2d(way, c - a) / double_area
         of_c = _cross_2d(b - a, way) / double_area
         shares = np.column_stack([1 - of_b - of_c, of_b, of_c])
-        # What is linear on a triangle is one over the depth in the plane.
+        # In the projection, one over the depth is linear on a triangle.
         hit = (
             1 / np.sum(shares / depths[corners[triangle]], axis=1)
             < away[point] - front_m
@@ -266,13 +303,16 @@ class VisibleSurface:
     ) -> tuple[Index, Array]:
         """Return the nearest points of some flat triangles, and of the curved faces they belong to.
 
+        Triangles are searched among the `NEARBY` nearest by their middles; on curved faces the
+        point is corrected by a few Newton steps, without leaving the face.
+
         Parameters
         ----------
         x : (n, 3) array
             Node positions [m].
         points : (P, 3) array
             Points [m].
-        candidates : array
+        candidates : (c,) array
             Indices of the flat triangles, at least one.
 
         Returns
@@ -313,11 +353,12 @@ class VisibleSurface:
         )
         moving = np.arange(len(points) if self.faces.shape[1] > 3 else 0)
         for _ in range(SETTLING):
-            # Faces are curved: what is nearest on the flat triangle is beside what is on them.
-            _, feet, tangents = self._evaluate_tangents(
+            # Faces are curved: the nearest point of a face is beside that of the flat triangle.
+            at = self._evaluate_tangents(
                 x, faces[moving], barycentric=places[moving]
             )
-            by_a, by_b = tangents.transpose(1, 0, 2)
+            feet = at.points_m
+            by_a, by_b = at.tangents.transpose(1, 0, 2)
             aa, ab, bb = (
                 np.sum(u * v, axis=1)
                 for u, v in ((by_a, by_a), (by_a, by_b), (by_b, by_b))

@@ -16,6 +16,7 @@ from ..linear_algebra.factorisation import NONE
 from ..linear_algebra.lapack import one_blas_thread
 from .newton_solver import (
     NewtonFailure,
+    NewtonLinearisation,
     NewtonSolver,
     follow_path,
     simulation_error,
@@ -82,6 +83,7 @@ def _solve_equilibrium(
     Parameters
     ----------
     experiment : Experiment
+        Its grasps, obstacles and start.
     forces : Forces
         Forces at that time.
     goals_m : (3n,) array
@@ -91,11 +93,12 @@ def _solve_equilibrium(
     start : (3n,) array or None
         Guess [m]; None to start from the body carried by its grasps.
     solver : NewtonSolver
+        Newton's method with the prescribed dofs of that time.
 
     Raises
     ------
-    NewtonFailure
-        If no equilibrium is found.
+    SimulationError
+        If no stable equilibrium is found.
     """
     zero_velocity = np.zeros((1, len(goals_m)))
     shape = experiment.rigid_positions([at_s])[0]
@@ -108,13 +111,15 @@ def _solve_equilibrium(
         def residual(state: Array) -> Array:
             return loaded.total(state, zero_velocity)[0]
 
-        def linearise(state: Array) -> tuple[Array, Array, Array]:
+        def linearise(state: Array) -> NewtonLinearisation:
             # Nothing moves: there is no skew part.
             at = loaded.linearise(state, zero_velocity)
             report_state(
                 lambda: _describe_state(share, at.force[0][solver.free])
             )
-            return at.force[0], -at.by_position[0], NONE
+            return NewtonLinearisation(
+                at.force[0], -at.by_position[0], skew=NONE
+            )
 
         # Grasps that are off are there at the end: the way there may be any.
         goal = (
@@ -167,7 +172,8 @@ def _describe_state(share: float, force_n: Array) -> str:
 
 
 def _without_contact(forces: Forces, shape: Array) -> Array:
-    """Return a shape (n, 3) with each obstacle retracted by its deepest penetration [m].
+    """Return a copy of a shape (n, 3) [m] with the frame of each obstacle moved out of the body by
+    its deepest penetration.
 
     Deep inside a curved obstacle, contact forces are not stable; the obstacle must approach from
     outside.
@@ -184,12 +190,23 @@ def _without_contact(forces: Forces, shape: Array) -> Array:
 def _partial_displacement(
     experiment: Experiment, displaced_m: Array, time_s: float, share: float
 ) -> Array:
-    """Return positions (n, 3) with the grasps moved by a share of their displacement from the
-    carried body [m].
+    """Return a copy of positions with the grasps that hold moved by a share of their displacement
+    from the carried body.
 
     Each grasp rotates about the middle of its nodes, which moves along a line, so that no grasp is
     squeezed or sheared at large rotations. Obstacles have their final rotation already. Other nodes
     keep their positions.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    displaced_m : (n, 3) array
+        Positions of the carried body, at share 0 [m].
+    time_s : float
+        Time whose poses are reached at share 1 [s].
+    share : float
+        Share of the displacement, from 0 to 1.
     """
     positions = displaced_m.copy()
     for grasp in experiment.grasps:
@@ -225,7 +242,8 @@ def initial_state(
     prescribed_m: Array | None = None,
 ) -> tuple[Array, Array]:
     """Return initial positions x_0 [m] and velocities v_0 [m/s], each (3n,), by the experiment's
-    start rule.
+    start rule: an equilibrium, stated positions, or the undeformed body in its grasps. Both are new
+    arrays; velocities are zero unless stated.
 
     Parameters
     ----------
@@ -238,7 +256,8 @@ def initial_state(
     guess : (3n,) array, optional
         First guess of an equilibrium [m].
     prescribed_m : (3n,) array, optional
-        Prescribed positions [m], NaN at free dofs; those of the experiment by default.
+        Prescribed positions of an equilibrium [m], NaN at free dofs; those of the experiment by
+        default.
 
     Raises
     ------

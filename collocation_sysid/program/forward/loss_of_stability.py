@@ -74,7 +74,9 @@ class StabilityLoss:
 
     @property
     def is_surface_instability(self) -> bool:
-        """Whether the stretch is near the one at which surfaces wrinkle."""
+        """Whether the surface is compressed to near the stretch at which it wrinkles: by at most
+        the factor `NEAREST_FACTOR` above `critical_stretch`.
+        """
         return (
             self.smaller_stretch < 1
             and self.smaller_stretch <= NEAREST_FACTOR * self.critical_stretch
@@ -106,11 +108,11 @@ class StabilityLoss:
 def explain_failure(
     experiment: Experiment, theta: Array, error: SimulationError
 ) -> SimulationError:
-    """Return the error of a static simulation with the mode in which the body loses its stability,
-    as a new error; the same error if there is no state, no such mode, or the mode cannot be
-    computed.
-    A homogeneous specimen has no mode: its message names the test and the strain.
+    """Return the error of a static simulation with the mode in which the body loses its stability.
 
+    It is a new error, with the mode as `stability_loss`. For a homogeneous specimen, which has no
+    mode, the message names the test and the strain. The same error is returned if it has no state,
+    there is no such mode, or the mode cannot be computed.
     """
     if error.state_m is None:
         return error
@@ -155,8 +157,8 @@ def find_stability_loss(
 ) -> StabilityLoss | None:
     """Return the mode in which a body is about to lose its stability, or None.
 
-    None where the lowest eigenvalue is not small compared with that of the undeformed body, and
-    where no grasp prevents rigid motions.
+    None where the lowest eigenvalue is at least the share `LEAST_REDUCTION` of that of the
+    undeformed body in its grasps, and where no grasp prevents rigid motions.
 
     Parameters
     ----------
@@ -168,6 +170,11 @@ def find_stability_loss(
         Positions at the end of the stable path [m].
     time_s : float
         Time of loads and poses [s].
+
+    Raises
+    ------
+    ArpackError, RuntimeError, numpy.linalg.LinAlgError
+        If the eigenvalues cannot be computed.
     """
     forces = Forces.from_experiment(experiment, time_s, theta)
     is_prescribed = experiment.is_prescribed([time_s])[0].ravel()
@@ -176,12 +183,12 @@ def find_stability_loss(
         forces,
         experiment.rigid_positions([time_s])[0].ravel(),
         free=free,
-        translation_m=0.0,
+        distance_1_s2=0.0,
     )
     if not reference > 0:
         return None
     value, shape = _lowest(
-        forces, x, free=free, translation_m=SHIFT * reference
+        forces, x, free=free, distance_1_s2=SHIFT * reference
     )
     if not value < LEAST_REDUCTION * reference:
         return None
@@ -201,9 +208,10 @@ def find_stability_loss(
 
 
 def _lowest(
-    forces: Forces, x: Array, free: Index, translation_m: float
+    forces: Forces, x: Array, free: Index, distance_1_s2: float
 ) -> tuple[float, Array]:
-    """Return the lowest eigenvalue [1/s²] of K φ = λ M φ near a shift below zero, and φ (free,).
+    """Return the eigenvalue λ [1/s²] of K φ = λ M φ that is nearest to a shift at or below zero,
+    the lowest one near the end of a stable path, and φ (free,).
 
     Parameters
     ----------
@@ -213,8 +221,8 @@ def _lowest(
         Positions [m].
     free : (free,) array of int
         Free dofs.
-    translation_m : float
-        Negative of the shift [1/s²].
+    distance_1_s2 : float
+        Distance of the shift below zero [1/s²].
     """
     state = x.reshape(1, -1)
     stiffness = -forces.linearise(state, np.zeros_like(state)).by_position[0]
@@ -224,7 +232,7 @@ def _lowest(
     )
     start = np.random.default_rng(0).normal(size=len(free))
     values, vectors = eigsh(
-        matrix, 1, sigma=-translation_m, which="LM", v0=start
+        matrix, 1, sigma=-distance_1_s2, which="LM", v0=start
     )
     return float(values[0]), np.asarray(root @ vectors[:, 0])
 
@@ -232,7 +240,19 @@ def _lowest(
 def _on_surface(
     points_m: Array, positions_m: Array, mode: Array, surface: Index
 ) -> StabilityLoss:
-    """Return the mode with stretches and wavelength on the surface's triangles (F, 3)."""
+    """Return the mode with stretches and wavelength on the surface's triangles.
+
+    Of the faces that move with the mode, the decisive one has the smallest λ_1² λ_2.
+
+    Parameters
+    ----------
+    points_m, positions_m : (n, 3) arrays
+        Undeformed and deformed nodes [m].
+    mode : (n, 3) array
+        Displacements of the nodes.
+    surface : (F, 3) array
+        Corners of the surface's triangles.
+    """
     edges_m, moved_m, differences = (
         np.stack(
             [each[surface[:, k]] - each[surface[:, 0]] for k in (1, 2)], axis=1

@@ -35,12 +35,14 @@ from ..observables import ReactionForces
 from .initial_equilibrium import initial_state
 from .newton_solver import (
     NewtonFailure,
+    NewtonLinearisation,
     NewtonOptions,
     NewtonSolver,
     NewtonSolvers,
     simulation_error,
 )
 
+# Called with the share of the work that is done, between 0 and 1.
 Progress = Callable[[float], None]
 
 
@@ -65,9 +67,41 @@ class _State:
     v: Array
     a: Array
     previous_histories: tuple[PreviousState, ...] = ()
-    contact_n: Array | None = (
-        None  # (3n,) mean over the step that led here, where there is contact
-    )
+    contact_n: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class NewmarkMotion:
+    """Motion simulated by Newmark's method.
+
+    Attributes
+    ----------
+    positions_m : (T, 3n) array
+        Positions at the samples [m].
+    velocities_m_s : (T, 3n) array
+        Velocities at the samples [m/s].
+    reactions : ReactionForces
+        Reaction forces on the sensed dofs at all steps, without derivatives.
+    """
+
+    positions_m: Array
+    velocities_m_s: Array
+    reactions: ReactionForces
+
+
+@dataclass(frozen=True, eq=False)
+class _PrescribedMotion:
+    """Motion of the p prescribed dofs at one time.
+
+    Attributes
+    ----------
+    positions_m, velocities_m_s, accelerations_m_s2 : (p,) arrays
+        Positions [m], velocities [m/s] and accelerations [m/s²], ascending by dof.
+    """
+
+    positions_m: Array
+    velocities_m_s: Array
+    accelerations_m_s2: Array
 
 
 @one_blas_thread()
@@ -78,7 +112,7 @@ def simulate_newmark(
     options: NewtonOptions | None,
     progress: Progress | None,
     sensed: Index,
-) -> tuple[Array, Array, ReactionForces]:
+) -> NewmarkMotion:
     """Simulate an experiment by Newmark's method.
 
     Parameters
@@ -95,15 +129,6 @@ def simulate_newmark(
         Called with the share of the samples done.
     sensed : (g,) array
         Dofs whose reaction forces are wanted.
-
-    Returns
-    -------
-    (T, 3n) array
-        Positions at the samples [m].
-    (T, 3n) array
-        Velocities at the samples [m/s].
-    ReactionForces
-        Reaction forces on the sensed dofs at all steps.
 
     Raises
     ------
@@ -144,11 +169,141 @@ def simulate_newmark(
     # Contact at a time is the mean over the steps before and after it.
     reactions_and_positions[0, 1:-1] -= (means_n[1:-1] + means_n[2:]) / 2
     reactions_and_positions[0, [0, -1]] -= means_n[[0, -1]]
-    return x, v, ReactionForces(*reactions_and_positions)
+    reactions, positions = reactions_and_positions
+    return NewmarkMotion(
+        x, v, reactions=ReactionForces(reactions, position_m=positions)
+    )
+
+
+class _StepEquations:
+    """Equations of motion of one Newmark step as functions of the positions at its end.
+
+    Attributes
+    ----------
+    contact : StepContact
+        Contact in the step.
+    mass_kg : (3n,) array
+        Masses of the dofs [kg].
+
+    Parameters
+    ----------
+    state : _State
+        State at the begin of the step.
+    step_s : float
+        Length of the step [s].
+    forces : Forces
+        Forces at the end of the step, without contact.
+    contact : StepContact
+        Contact in the step.
+    prescribed_dofs : (p,) array
+        Prescribed dofs.
+    prescribed : _PrescribedMotion
+        Their motion at the end of the step.
+    """
+
+    def __init__(
+        self,
+        state: _State,
+        step_s: float,
+        forces: Forces,
+        contact: StepContact,
+        prescribed_dofs: Index,
+        prescribed: _PrescribedMotion,
+    ) -> None:
+        self.contact = contact
+        self.mass_kg = forces.mass.inertia_kg[0]
+        self._state = state
+        self._step_s = step_s
+        self._forces = forces
+        self._prescribed_dofs = prescribed_dofs
+        self._prescribed = prescribed
+        # Derivative of the velocity at the end by the position at the end.
+        slope = 2.0 / step_s
+        self._slope = slope
+        self._known_v = -slope * state.x - state.v
+        self._known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
+
+    def extrapolation(self) -> Array:
+        """Return a guess (3n,) of the positions at the end [m], at constant acceleration including
+        that of the previous contact.
+        """
+        state = self._state
+        h = self._step_s
+        mass = self.mass_kg
+        guess = state.x + h * state.v + 0.5 * h * h * state.a
+        if state.contact_n is not None:
+            guess += (
+                0.5 * h * h * state.contact_n / np.where(mass > 0, mass, np.inf)
+            )
+        return self.with_prescribed_positions(guess)
+
+    def with_prescribed_positions(self, x: Array) -> Array:
+        """Return a copy of positions x (3n,) [m] with the prescribed dofs at their positions at the
+        end of the step.
+        """
+        moved = x.copy()
+        moved[self._prescribed_dofs] = self._prescribed.positions_m
+        return moved
+
+    def kinematics(self, x: Array) -> tuple[Array, Array]:
+        """Return velocities [m/s] and accelerations [m/s²], (3n,) each, at the end of the step at
+        positions x (3n,) [m]; the accelerations include those due to contact.
+        """
+        v = self._slope * x + self._known_v
+        a = self._slope**2 * x + self._known_a
+        # Finite differences of a grasp's motion ring under this rule; its own motion does not.
+        v[self._prescribed_dofs] = self._prescribed.velocities_m_s
+        a[self._prescribed_dofs] = self._prescribed.accelerations_m_s2
+        return v, a
+
+    def middle_state(self, x: Array) -> tuple[Array, Array]:
+        """Return the mean position ξ [m] and velocity ν [m/s] of the step, (1, 3n) each, if it ends
+        at x (3n,) [m].
+        """
+        before = self._state.x
+        return (before + x)[None] / 2, (x - before)[None] / self._step_s
+
+    def residual(self, x: Array) -> Array:
+        """Return the force balance F + 2 C − M a (3n,) [N] at the end positions x (3n,) [m]."""
+        v, a = self.kinematics(x)
+        balance = self._forces.total(x, v)[0] - self.mass_kg * a
+        if not self.contact.acts:
+            return balance
+        return balance + 2 * self.contact.force(*self.middle_state(x))
+
+    def linearise(self, x: Array) -> NewtonLinearisation:
+        """Return the force balance (3n,) [N] at x (3n,) [m], and its derivative by x."""
+        v, a = self.kinematics(x)
+        slope = self._slope
+        at = self._forces.linearise(x, v)
+        matrix = -(at.by_position[0] + slope * at.by_velocity[0])
+        matrix[self._forces.pattern.diagonal] += slope**2 * self.mass_kg
+        skew = -at.by_position_skew[0]
+        if at.by_velocity_skew.size:
+            skew = skew - slope * at.by_velocity_skew[0]
+        balance = at.force[0] - self.mass_kg * a
+        if self.contact.acts:
+            contact = self.contact.linearise(
+                *self.middle_state(x), (0.5, 1 / self._step_s)
+            )
+            balance = balance + 2 * contact.force
+            matrix -= 2 * contact.symmetric
+            skew = skew - 2 * contact.skew
+        return NewtonLinearisation(balance, matrix, skew=skew)
 
 
 class _Stepper:
-    """Newmark steps of one experiment."""
+    """Newmark steps of one experiment.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    theta : (k,) array
+        Constants of the body.
+    options : NewtonOptions or None
+        Options of Newton's method; None means defaults.
+    """
 
     def __init__(
         self,
@@ -163,7 +318,14 @@ class _Stepper:
         self.solvers = NewtonSolvers(experiment, options)
 
     def initial_state(self) -> _State:
-        """Return the initial state of the experiment."""
+        """Return the initial state of the experiment, with accelerations in balance with the
+        forces.
+
+        Raises
+        ------
+        SimulationError
+            If no stable equilibrium is found, where the experiment starts in one.
+        """
         time_s = float(self.experiment.t_s[0])
         solver = self._solver(time_s)
         x, v = initial_state(self.experiment, self._forces(time_s), solver)
@@ -187,12 +349,15 @@ class _Stepper:
         return self._balanced(state, time_s, dofs=solver.free)
 
     def advance(self, state: _State, target_s: float) -> _State:
-        """Return the state at `target_s`; where Newton's method fails, in shorter steps.
+        """Return the state at `target_s` [s]; where Newton's method fails, in steps that are
+        halved.
+
+        Loads and holding grasps are those of `target_s` throughout.
 
         Raises
         ------
-        SimulationError or NewtonFailure
-            If the shortest step fails.
+        SimulationError
+            If a step fails after `max_halvings` halvings.
         """
         step = target_s - state.t_s
         smallest = step * 0.5**self.options.max_halvings
@@ -217,7 +382,9 @@ class _Stepper:
     def reactions_and_positions(
         self, state: _State, dofs: Index
     ) -> tuple[Array, Array]:
-        """Return the reaction forces without contact on dofs [N], and their positions [m]."""
+        """Return the reaction forces without contact on dofs (g,) [N], and their positions (g,)
+        [m].
+        """
         if not len(dofs):
             return np.zeros(0), np.zeros(0)
         reaction = self._mass(state.t_s) * state.a - self._force(
@@ -235,8 +402,8 @@ class _Stepper:
         return forces.total(state.x, state.v)[0]
 
     def _forces(self, load_s: float, step_s: float = 0.0) -> Forces:
-        """Return the forces under the loads at a time; contact is averaged over a step of
-        `step_s` if it is not zero.
+        """Return the forces under the loads at the time `load_s` [s]; contact is averaged over a
+        step of `step_s` [s], or evaluated at the state if that is zero.
         """
         return Forces.from_experiment(
             self.experiment, load_s, self.theta, step_s=step_s
@@ -245,8 +412,9 @@ class _Stepper:
     def _contact_n(
         self, x: Array, v: Array, load_s: float, step_s: float = 0.0
     ) -> Array:
-        """Return the contact forces (3n,) [N] at positions x and velocities v, (3n,) each, and the
-        time `load_s`; averaged over a step of `step_s` about this state, unless that is zero.
+        """Return the contact forces (3n,) [N] at positions x and velocities v, (3n,) each, under
+        the loads at the time `load_s`; averaged over a step of `step_s` [s] about this state,
+        unless that is zero. Contact as a complementarity problem is left out.
         """
         forces = self._forces(load_s, step_s)
         total_n = np.zeros_like(x)
@@ -264,7 +432,7 @@ class _Stepper:
         )
 
     def _mass(self, time_s: float) -> Array:
-        """Return the masses (3n,) at a time [kg]."""
+        """Return the masses (3n,) of all dofs at a time [kg]."""
         return (
             Weight.from_experiment(self.experiment, time_s)
             .with_theta(self.theta)
@@ -287,7 +455,8 @@ class _Stepper:
         self, state: _State, load_s: float, dofs: NDArray[np.int64]
     ) -> _State:
         """Return the state with the accelerations of some dofs (indices) computed from the forces
-        on them, without contact, under the loads at the time `load_s`.
+        on them, without contact, under the loads at the time `load_s`; the other accelerations are
+        kept.
         """
         acceleration = state.a.copy()
         acceleration[dofs] = (
@@ -298,8 +467,13 @@ class _Stepper:
     def _step(
         self, solver: NewtonSolver, state: _State, end_s: float, load_s: float
     ) -> _State:
-        """Return the state after one step to `end_s`, with loads and grasps of the time
+        """Return the state after one step to `end_s` [s], with loads and grasps of the time
         `load_s`.
+
+        Raises
+        ------
+        NewtonFailure
+            If Newton's method does not converge.
         """
         h = end_s - state.t_s
         forces, touching = insert_previous_states(
@@ -307,69 +481,27 @@ class _Stepper:
             state.previous_histories,
             interval_s=h,
         ).without_contact()
-        contact = StepContact(touching, self.theta, pattern=forces.pattern)
-        mass = forces.mass.inertia_kg[0]
-        x_prescribed, v_prescribed, a_prescribed = self._prescribed_motion(
-            solver, end_s, step_s=h, holding_s=load_s
+        equations = _StepEquations(
+            state,
+            h,
+            forces=forces,
+            contact=StepContact(touching, self.theta, pattern=forces.pattern),
+            prescribed_dofs=solver.is_prescribed,
+            prescribed=self._prescribed_motion(
+                solver, end_s, step_s=h, holding_s=load_s
+            ),
         )
-        slope = 2.0 / h
-        known_v = -slope * state.x - state.v
-        known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
-
-        def kinematics(x: Array) -> tuple[Array, Array]:
-            v = slope * x + known_v
-            a = slope**2 * x + known_a
-            # Finite differences of a grasp's motion ring under this rule; its own motion does not.
-            v[solver.is_prescribed] = v_prescribed
-            a[solver.is_prescribed] = a_prescribed
-            return v, a
-
-        def middle(x: Array) -> tuple[Array, Array]:
-            return (state.x + x)[None] / 2, (x - state.x)[None] / h
-
-        def residual(x: Array) -> Array:
-            v, a = kinematics(x)
-            balance = forces.total(x, v)[0] - mass * a
-            return (
-                balance + 2 * contact.force(*middle(x))
-                if contact.acts
-                else balance
-            )
-
-        def linearise(x: Array) -> tuple[Array, Array, Array]:
-            v, a = kinematics(x)
-            at = forces.linearise(x, v)
-            matrix = -(at.by_position[0] + slope * at.by_velocity[0])
-            matrix[forces.pattern.diagonal] += slope**2 * mass
-            skew = -at.by_position_skew[0]
-            if at.by_velocity_skew.size:
-                skew = skew - slope * at.by_velocity_skew[0]
-            balance = at.force[0] - mass * a
-            if contact.acts:
-                contact_force, symmetric, askew = contact.linearise(
-                    *middle(x), (0.5, 1 / h)
-                )
-                balance = balance + 2 * contact_force
-                matrix -= 2 * symmetric
-                skew = skew - 2 * askew
-            return balance, matrix, skew
-
-        guess = state.x + h * state.v + 0.5 * h * h * state.a
-        if state.contact_n is not None:
-            guess += (
-                0.5 * h * h * state.contact_n / np.where(mass > 0, mass, np.inf)
-            )
-        guess[solver.is_prescribed] = x_prescribed
+        guess = equations.extrapolation()
         if not solver.has_no_inverted_element(guess):
-            guess = state.x.copy()
-            guess[solver.is_prescribed] = x_prescribed
-        x = solver.solve(guess, residual, linearise)
-        v, a = kinematics(x)
+            guess = equations.with_prescribed_positions(state.x)
+        x = solver.solve(guess, equations.residual, equations.linearise)
+        v, a = equations.kinematics(x)
         contact_n = None
-        if contact.acts:
-            xi, nu = middle(x)
+        if equations.contact.acts:
+            mass = equations.mass_kg
+            xi, nu = equations.middle_state(x)
             contact_n = self._contact_n(xi[0], nu[0], load_s=load_s, step_s=h)
-            # Held dofs have the acceleration of the grasp.
+            # Prescribed dofs have the acceleration of the grasp.
             free = solver.free
             a[free] -= (
                 2 * contact_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
@@ -392,9 +524,12 @@ class _Stepper:
         time_s: float,
         step_s: float,
         holding_s: float,
-    ) -> tuple[Array, Array, Array]:
-        """Return position, velocity and acceleration of the solver's prescribed dofs at `time_s`,
-        by central differences over `step_s`; grasps are those that hold at `holding_s`.
+    ) -> _PrescribedMotion:
+        """Return the motion of the solver's prescribed dofs at `time_s`, by central differences
+        over `step_s` [s]; grasps are those that hold at `holding_s`.
+
+        At the ends of a grasp's time, differences are one-sided and the acceleration is zero if
+        there is no later pose.
         """
         experiment = self.experiment
         nodes_m = self.experiment.body.nodes_m
@@ -402,7 +537,7 @@ class _Stepper:
         for grasp in experiment.grasps:
             if not grasp.is_active(holding_s):
                 continue
-            # What it does before it holds and after it has let go means nothing.
+            # Its poses before it holds and after it has let go do not matter.
             first = max(grasp.from_s, float(experiment.t_s[0]))
             last = min(grasp.until_s, float(experiment.t_s[-1]))
             times = np.clip(
@@ -423,4 +558,4 @@ class _Stepper:
         now, velocity, acceleration = motion.reshape(3, -1)[
             :, solver.is_prescribed
         ]
-        return now, velocity, acceleration
+        return _PrescribedMotion(now, velocity, accelerations_m_s2=acceleration)

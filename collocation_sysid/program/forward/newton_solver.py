@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,19 +17,58 @@ from ..linear_algebra.factorisation import Factor, Factoriser
 from ..stopwatch import Stopwatch
 from .retraction import Retraction, add_increment
 
-Residual = Callable[[Array], Array]
-# Residual, and the lower triangles of the symmetric and the skew part of its slope's negative.
-Linearise = Callable[[Array], tuple[Array, Array, Array]]
 T = TypeVar("T")
 
-# With the factor of the previous iterate, a last step must be shorter by this factor.
-STALE = 0.01
+# Share of the tolerance below which a step that was computed with the factor of the previous
+# iterate is the last one.
+OLD_FACTOR_SHARE = 0.01
 # Chord steps are continued while each is shorter than the last by this factor.
 FAST = 0.1
 # Largest number of chord steps with one factor.
-OFTEN = 8
+LARGEST_CHORD_STEP_COUNT = 8
 # Chord steps end when the expected remaining error is this share of the tolerance.
 LEAST_RESIDUAL_SHARE = 1e-5
+
+
+class NewtonLinearisation(NamedTuple):
+    """Residual r and its derivative at a state x.
+
+    Attributes
+    ----------
+    residual : (3n,) array
+        Residual [N].
+    symmetric : (m,) array
+        Lower triangle of the symmetric part of −∂r/∂x [N/m].
+    skew : (m,) or (0,) array
+        Lower triangle of the skew part of −∂r/∂x; empty for a symmetric derivative.
+    """
+
+    residual: Array
+    symmetric: Array
+    skew: Array
+
+
+# Residual (3n,) of a state (3n,).
+Residual = Callable[[Array], Array]
+Linearise = Callable[[Array], NewtonLinearisation]
+
+
+class _Iterate(NamedTuple):
+    """Iterate of Newton's method.
+
+    Attributes
+    ----------
+    x : (3n,) array
+        State [m].
+    factor : Factor
+        Factor with which the step was computed; that of the previous iterate for a last step.
+    step : (free,) array
+        Newton step from x [m].
+    """
+
+    x: Array
+    factor: Factor
+    step: Array
 
 
 @dataclass(frozen=True)
@@ -56,7 +95,7 @@ class NewtonOptions:
 
 
 class NewtonFailure(Exception):
-    """Newton's method did not converge.
+    """Newton's method did not converge; its text is the reason.
 
     Parameters
     ----------
@@ -78,6 +117,8 @@ class NewtonFailure(Exception):
 class NewtonSolver:
     """Newton's method with backtracking on the free dofs of a body, for one set of prescribed dofs.
 
+    The factor of the last solution is stored and reused by the next call of `solve`.
+
     Attributes
     ----------
     free, is_prescribed : arrays
@@ -91,7 +132,7 @@ class NewtonSolver:
         Options; defaults otherwise.
     stopwatch : Stopwatch, optional
         Accumulates the time spent.
-    is_prescribed : (n, 3) array of bool, optional
+    prescribed : (n, 3) or (3n,) array of bool, optional
         Prescribed coordinates; by default those at the experiment's first time.
     """
 
@@ -139,12 +180,11 @@ class NewtonSolver:
         residual : callable
             Residual (3n,) of x.
         linearise : callable
-            Residual (3n,), and lower triangles of the symmetric part (m,) and of the skew part,
-            (m,) or (0,), of −∂residual/∂x.
+            `NewtonLinearisation` at x.
         keep_definite : bool
             If true, solve for a stable equilibrium: accept states only while −∂residual/∂x is
-            positive definite.
-        prescribed_m : (held,) array, optional
+            positive definite, and factorise at every iterate.
+        prescribed_m : (prescribed,) array, optional
             Positions of the prescribed dofs [m]. The free dofs first follow to first order, because
             moving prescribed dofs alone would crush adjacent elements.
 
@@ -156,7 +196,8 @@ class NewtonSolver:
         Raises
         ------
         NewtonFailure
-            If the method does not converge.
+            If the method does not converge, a matrix is singular, or an element is inverted at the
+            start.
         """
         x = (
             x.copy()
@@ -165,37 +206,39 @@ class NewtonSolver:
         )
         self._require_upright(x)
         if not keep_definite:
-            # What these lead to without end may be far off: the search then begins where they did.
+            # If they do not converge, the search begins at x: their last state may be far off.
             improved, done = self._simplified_newton(
                 x, residual, linearise=linearise
             )
             if done:
                 return improved
-        value, *matrix = self._timed(linearise, x)
-        factor = self._factorise(matrix, x, keep_definite)
-        step = self._step(factor, value)
+        at = self._timed(linearise, x)
+        factor = self._factorise(at, x, keep_definite)
+        iterate = _Iterate(x, factor, step=self._step(factor, at.residual))
         for _ in range(self.options.max_iterations):
-            if self._is_last(step):
-                self._last_factor = factor
-                x[self.free] += step
-                return x
-            x, factor, step = self._backtrack(
-                x,
-                step,
-                factor=factor,
-                residual=residual,
+            if self._is_last(iterate.step):
+                self._last_factor = iterate.factor
+                iterate.x[self.free] += iterate.step
+                return iterate.x
+            iterate = self._backtrack(
+                iterate,
+                residual,
                 linearise=linearise,
                 keep_definite=keep_definite,
             )
         raise NewtonFailure(
-            x,
+            iterate.x,
             f"Newton's method took more than {self.options.max_iterations} iterations",
         )
 
     def _simplified_newton(
         self, x: Array, residual: Residual, linearise: Linearise
     ) -> tuple[Array, bool]:
-        """Iterate with few factorisations (simplified Newton method); the last factor is stored.
+        """Iterate with few factorisations (simplified Newton method); the last factor is stored,
+        and x is not modified.
+
+        It ends without a solution when a new factor does not improve the state, or cannot be
+        computed.
 
         Returns
         -------
@@ -213,9 +256,9 @@ class NewtonSolver:
                 if improved is x and is_own:
                     break
                 x = improved
-            _, *matrix = self._timed(linearise, x)
+            at = self._timed(linearise, x)
             try:
-                self._last_factor = self._factorise(matrix, x, False)
+                self._last_factor = self._factorise(at, x, keep_definite=False)
                 is_own = True
             except NewtonFailure:
                 break
@@ -224,7 +267,7 @@ class NewtonSolver:
     def _chord_steps(
         self, x: Array, residual: Residual, factor: Factor
     ) -> tuple[Array, bool]:
-        """Iterate with a given factor while steps shrink fast.
+        """Iterate with a given factor while steps shrink fast; x is not modified.
 
         Returns
         -------
@@ -235,7 +278,7 @@ class NewtonSolver:
         improved = x.copy()
         before = None
         done = False
-        for _ in range(OFTEN):
+        for _ in range(LARGEST_CHORD_STEP_COUNT):
             step = self._step(factor, self._timed(residual, improved))
             length = float(np.linalg.norm(step))
             rate = length / before if before else 1.0
@@ -256,12 +299,13 @@ class NewtonSolver:
         self, x: Array, goal: Array, linearise: Linearise
     ) -> Array:
         """Return the state x (3n,) [m] with the prescribed dofs at `goal` (prescribed,), and the
-        free dofs in equilibrium to first order.
+        free dofs in equilibrium to first order; only the prescribed dofs change if they are there
+        already, up to the tolerance.
 
         Raises
         ------
         NewtonFailure
-            If the matrix at x is singular or not positive definite, or an element of x is inverted.
+            If the matrix at x is singular, or an element of x is inverted.
         """
         state = x.copy()
         way = np.zeros_like(x)
@@ -269,34 +313,27 @@ class NewtonSolver:
         state[self.is_prescribed] = goal
         if not self._is_last(way):
             self._require_upright(x)
-            value, *matrix = self._timed(linearise, x)
-            coupling = self.pattern.products(matrix[0][None], way[None])[0]
-            factor = self._factorise(matrix, x, keep_definite=False)
-            state[self.free] += self._step(factor, value - coupling)
+            at = self._timed(linearise, x)
+            coupling = self.pattern.products(at.symmetric[None], way[None])[0]
+            factor = self._factorise(at, x, keep_definite=False)
+            state[self.free] += self._step(factor, at.residual - coupling)
         return state
 
     def _backtrack(
         self,
-        x: Array,
-        step: Array,
-        factor: Factor,
+        iterate: _Iterate,
         residual: Residual,
         linearise: Linearise,
         keep_definite: bool,
-    ) -> tuple[Array, Factor, Array]:
-        """Return the next iterate (3n,), its factor and the Newton step (free,) there, with the
-        first of the halved steps that is acceptable.
+    ) -> _Iterate:
+        """Return the next iterate, with the first of the halved steps that is acceptable.
 
         Parameters
         ----------
-        x : (3n,) array
-            Present iterate [m].
-        step : (free,) array
-            Newton step at x [m].
-        factor : Factor
-            Factor at x.
+        iterate : _Iterate
+            Present iterate; not modified.
         residual, linearise : callable
-            Functions of the state.
+            Functions of the state, see `solve`.
         keep_definite : bool
             Whether the matrix must be positive definite.
 
@@ -305,7 +342,9 @@ class NewtonSolver:
         NewtonFailure
             If no step is acceptable.
         """
-        length = np.linalg.norm(step)
+        x = iterate.x
+        factor = iterate.factor
+        length = np.linalg.norm(iterate.step)
         share = 1.0
         update = (
             self._retraction
@@ -314,24 +353,26 @@ class NewtonSolver:
         )
         for _ in range(self.options.max_backtracks):
             increment = np.zeros_like(x)
-            increment[self.free] = share * step
+            increment[self.free] = share * iterate.step
             trial = update(x, increment)
             if self.has_no_inverted_element(trial):
                 # A whole step is mostly taken: it is evaluated with its derivatives at once.
-                if share == 1:
-                    value, *matrix = self._timed(linearise, trial)
-                else:
-                    value = self._timed(residual, trial)
-                    matrix = None
+                at = self._timed(linearise, trial) if share == 1 else None
+                value = (
+                    self._timed(residual, trial) if at is None else at.residual
+                )
                 next_step = self._step(factor, value)
                 if np.linalg.norm(next_step) <= (1 - share / 4) * length:
-                    if self._is_last(next_step, STALE) and not keep_definite:
-                        return trial, factor, next_step
-                    if matrix is None:
-                        value, *matrix = self._timed(linearise, trial)
+                    is_last = self._is_last(next_step, OLD_FACTOR_SHARE)
+                    if is_last and not keep_definite:
+                        return _Iterate(trial, factor, step=next_step)
+                    if at is None:
+                        at = self._timed(linearise, trial)
                     try:
-                        own = self._factorise(matrix, trial, keep_definite)
-                        return trial, own, self._step(own, value)
+                        own = self._factorise(at, trial, keep_definite)
+                        return _Iterate(
+                            trial, own, step=self._step(own, at.residual)
+                        )
                     except NewtonFailure:
                         pass
             share /= 2
@@ -341,7 +382,9 @@ class NewtonSolver:
 
     @cached_property
     def _retraction(self) -> Retraction:
-        """Retraction that applies increments towards an equilibrium."""
+        """Retraction that applies increments towards an equilibrium and displaces the prescribed
+        dofs exactly; computed on first use.
+        """
         prescribed = np.zeros(self.pattern.size, dtype=bool)
         prescribed[self.is_prescribed] = True
         return Retraction(self.body, prescribed.reshape(-1, 3))
@@ -354,14 +397,14 @@ class NewtonSolver:
         return bool(np.abs(step).max(initial=0.0) <= tolerance)
 
     def _factorise(
-        self, matrix: Sequence[Array], x: Array, keep_definite: bool
+        self, at: NewtonLinearisation, x: Array, keep_definite: bool
     ) -> Factor:
-        """Return the factor of a matrix on the free dofs.
+        """Return the factor of −∂residual/∂x on the free dofs.
 
         Parameters
         ----------
-        matrix : (symmetric, skew)
-            Lower triangles of both parts, the second empty for a symmetric matrix.
+        at : NewtonLinearisation
+            Derivative at x.
         x : (3n,) array
             State, for the failure.
         keep_definite : bool
@@ -374,7 +417,7 @@ class NewtonSolver:
         """
         try:
             with self.stopwatch.solving():
-                factor = self.factoriser.factorise(matrix[0], matrix[1])
+                factor = self.factoriser.factorise(at.symmetric, at.skew)
         except np.linalg.LinAlgError as error:
             raise NewtonFailure(
                 x, f"the equations are singular: {error}"
@@ -384,28 +427,32 @@ class NewtonSolver:
         return factor
 
     def _step(self, factor: Factor, residual: Array) -> Array:
-        """Return the Newton step of the free dofs."""
+        """Return the Newton step (free,) [m] of the free dofs for a residual (3n,)."""
         with self.stopwatch.solving():
             return factor.solve(residual[self.free])
 
     def _timed(self, function: Callable[[Array], T], x: Array) -> T:
-        """Evaluate a function at x, and measure the time."""
+        """Return `function(x)`; its time is added to the evaluations of the stopwatch."""
         with self.stopwatch.evaluating():
             return function(x)
 
     def has_no_inverted_element(self, x: Array) -> bool:
-        """Whether no element is inverted at x (3n,)."""
+        """Return whether det F is positive at all quadrature points at x (3n,) [m]."""
         return bool(self.body.volume_ratios(x).min() > 0)
 
     def _require_upright(self, x: Array) -> None:
-        """Raise NewtonFailure if an element is inverted at x (3n,)."""
+        """Raise NewtonFailure if an element is inverted (det F ≤ 0 at a quadrature point) at x
+        (3n,) [m].
+        """
         if not self.has_no_inverted_element(x):
             raise NewtonFailure(
                 x, "an element is inverted before the first iteration"
             )
 
     def worst_element(self, x: Array) -> int:
-        """Return the index of the element with the smallest det F at x (3n,)."""
+        """Return the index of the element with the smallest det F at any of its quadrature points
+        at x (3n,) [m].
+        """
         return int(self.body.volume_ratios(x)[0].min(axis=1).argmin())
 
 
@@ -423,11 +470,17 @@ def follow_path(
     solve : callable
         Returns x(s) from a first guess and s; raises NewtonFailure.
     x : (3n,) array
-        x(0).
+        x(0) [m]; not modified.
     halvings : int
         The smallest increment is 0.5 to this power.
     guess : (3n,) array, optional
         Guess of x(1), which is tried first; if it fails and `halvings` is 0, the failure is raised.
+        Without it, or if it fails, the path begins at x(0).
+
+    Returns
+    -------
+    (3n,) array
+        x(1).
 
     Raises
     ------
@@ -487,8 +540,8 @@ class NewtonSolvers:
         self._known: dict[bytes, NewtonSolver] = {}
 
     def for_prescribed(self, is_prescribed: NDArray[np.bool_]) -> NewtonSolver:
-        """Return the solver for a set of prescribed coordinates (n, 3) bool; it is created on the
-        first call and stored.
+        """Return the solver for a set of prescribed coordinates (n, 3) or (3n,) bool; it is created
+        on the first call and stored.
         """
         key = is_prescribed.tobytes()
         if key not in self._known:

@@ -82,7 +82,9 @@ class Retraction:
         self._axes = [known[column.tobytes()] for column in prescribed.T]
 
     def __call__(self, x: Array, increment: Array) -> Array:
-        """Return the positions (3n,) after an increment (3n,) of the positions x (3n,) [m]."""
+        """Return the positions (3n,) [m] after an increment (3n,) of the positions x (3n,) [m],
+        neither of which is modified; the deformation gradients of x must be regular.
+        """
         moved = (x + increment).reshape(-1, 3)
         right = self._gradient.T @ (
             self._weights[:, None] * self._target(x, increment)
@@ -132,5 +134,7 @@ def _axis(normal: sp.csc_array, prescribed: NDArray[np.bool_]) -> _Axis:
 
 
 def add_increment(x: Array, increment: Array) -> Array:
-    """Return x + δ: the update of a time step, in which a body rotates little."""
+    """Return x + `increment`, the update of a time step, in which a body rotates little; same
+    arguments as `Retraction.__call__`.
+    """
     return x + increment

@@ -25,6 +25,7 @@ from ..stopwatch import Stopwatch
 from .initial_equilibrium import initial_state
 from .newton_solver import (
     NewtonFailure,
+    NewtonLinearisation,
     NewtonOptions,
     NewtonSolver,
     NewtonSolvers,
@@ -32,6 +33,7 @@ from .newton_solver import (
     simulation_error,
 )
 
+# Called with the share of the work that is done, between 0 and 1.
 Progress = Callable[[float], None]
 
 
@@ -91,7 +93,7 @@ def continue_simulation(
     dynamics : Dynamics
         Discrete equations of motion at the parameters.
     known : (k, 3n) array, optional
-        First rows [m]; by default the start of the experiment is computed.
+        First rows [m], at least one; by default the start of the experiment is computed.
     options : NewtonOptions, optional
         Options of Newton's method.
     progress : callable, optional
@@ -99,66 +101,45 @@ def continue_simulation(
     stopwatch : Stopwatch, optional
         Accumulates the time spent.
     approximate_solution : (N, 3n) array, optional
-        Trajectory at other parameters, as the first guess of equilibria.
+        Trajectory at other parameters, as the first guess of equilibria; not used for the steps of
+        a motion.
 
     Returns
     -------
     (r, 3n) array
-        The rows computed, including `known`; all N if nothing failed.
+        The rows computed, including `known`; all N if nothing failed, and possibly none.
     SimulationError or None
-        Why the simulation stopped early.
+        Why the simulation stopped early; it is not raised.
     """
-    if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
-        failure = SimulationError(massless, float(dynamics.t_s[0]))
-        return np.zeros(
-            (0, dynamics.body.pattern.size)
-        ) if known is None else known, failure
-    if (
-        unreachable := dynamics.body.rest_shape_failure(dynamics.theta)
-    ) is not None:
-        failure = RestShapeError(unreachable)
-        return np.zeros(
-            (0, dynamics.body.pattern.size)
-        ) if known is None else known, failure
+    x = np.zeros((dynamics.row_count, dynamics.body.pattern.size))
+    failure = _body_failure(dynamics)
+    if failure is not None:
+        return x[:0] if known is None else known, failure
     solvers = NewtonSolvers(experiment, options, stopwatch=stopwatch)
     is_prescribed = ~np.isnan(dynamics.prescribed_m)
-    x = np.zeros((dynamics.row_count, dynamics.body.pattern.size))
     v0 = np.zeros(x.shape[1])
     if known is None:
+        guess = (
+            None if approximate_solution is None else approximate_solution[0]
+        )
         try:
-            at_start = dynamics.forces.at_times(slice(1))
-            start_guess = (
-                None
-                if approximate_solution is None
-                else approximate_solution[0]
-            )
-            solver = solvers.for_prescribed(is_prescribed[0])
-            goals_m = dynamics.prescribed_m[0]
             x[0], v0 = initial_state(
                 experiment,
-                at_start,
-                solver=solver,
-                guess=start_guess,
-                prescribed_m=goals_m,
+                dynamics.forces.at_times(slice(1)),
+                solver=solvers.for_prescribed(is_prescribed[0]),
+                guess=guess,
+                prescribed_m=dynamics.prescribed_m[0],
             )
         except SimulationError as failure:
             return x[:0], failure
         known = x[:1]
     done = len(known)
     x[:done] = known
-    forces = np.zeros_like(x)  # total force at every evaluation so far
-    xi, nu = dynamics.evaluation_states(x)
-    first = dynamics.first_row
-    known_evaluations = done - dynamics.first_row
-    histories = dynamics.histories(x[:done])
+    # Total force at every evaluation so far.
+    forces, previous_histories = _forces_and_histories(
+        dynamics, x, row_count=done
+    )
     intervals = dynamics.interval_to_next_s
-    if known_evaluations > 0:
-        known_rows = slice(first, done)
-        forces[known_rows] = dynamics.forces_with_histories(
-            histories, known_rows
-        ).total(xi[:known_evaluations], nu[:known_evaluations])
-    dynamics.zero_prescribed_forces(forces)
-    previous_histories = tuple(history.final_state for history in histories)
     for t in range(done, dynamics.row_count):
         row = RowEquations(
             dynamics, x, forces=forces, t=t, previous=previous_histories
@@ -176,14 +157,12 @@ def continue_simulation(
                 solver, row, guess=guess, previous=x[t - 1], prescribed_m=goal
             )
         except NewtonFailure as failure:
-            time_s = float(dynamics.t_s[t])
-            static = dynamics.is_static
             return x[:t], simulation_error(
                 solver,
                 failure,
-                time_s=time_s,
+                time_s=float(dynamics.t_s[t]),
                 what=f"the step at row {t}",
-                static=static,
+                static=dynamics.is_static,
             )
         forces[t] = row.force(x[t])
         forces[t, dynamics.is_temporarily_prescribed[t]] = 0
@@ -201,9 +180,56 @@ def continue_simulation(
     return x, None
 
 
+def _body_failure(dynamics: Dynamics) -> SimulationError | None:
+    """Return the error for constants with which the body cannot be simulated at all, because a node
+    has no mass or there is no stress-free shape; None if there is no such reason.
+    """
+    massless = dynamics.body.mass_problem(dynamics.theta)
+    if massless is not None:
+        return SimulationError(massless, float(dynamics.t_s[0]))
+    unreachable = dynamics.body.rest_shape_failure(dynamics.theta)
+    if unreachable is not None:
+        return RestShapeError(unreachable)
+    return None
+
+
+def _forces_and_histories(
+    dynamics: Dynamics, x: Array, row_count: int
+) -> tuple[Array, tuple[PreviousState, ...]]:
+    """Return the forces at the evaluations of known rows, and the history variables after them.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Equations of motion.
+    x : (N, 3n) array
+        Positions [m], of which the first `row_count` rows are known.
+    row_count : int
+        Number of known rows, at least one.
+
+    Returns
+    -------
+    (N, 3n) array
+        Total forces [N]; zero before the first equation of motion, in rows that are not known, and
+        at dofs while a grasp that holds for a part of the time prescribes them.
+    tuple of PreviousState
+        One entry for each history; empty without any.
+    """
+    forces = np.zeros_like(x)
+    histories = dynamics.histories(x[:row_count])
+    evaluations = row_count - dynamics.first_row
+    if evaluations > 0:
+        xi, nu = dynamics.evaluation_states(x)
+        rows = slice(dynamics.first_row, row_count)
+        known_forces = dynamics.forces_with_histories(histories, rows)
+        forces[rows] = known_forces.total(xi[:evaluations], nu[:evaluations])
+    dynamics.zero_prescribed_forces(forces)
+    return forces, tuple(history.final_state for history in histories)
+
+
 def extrapolate(x: Array, first_step: Array) -> Array:
-    """Return an extrapolation of the next row from rows x (k, 3n); with one row, by
-    `first_step` (3n,).
+    """Return an extrapolation (3n,) of the next row from rows x (k, 3n): quadratic from three or
+    more rows, linear from two; from one row, x_0 + `first_step` (3n,) [m].
     """
     if len(x) > 2:
         return 3 * (x[-1] - x[-2]) + x[-3]
@@ -212,7 +238,8 @@ def extrapolate(x: Array, first_step: Array) -> Array:
 
 def _extrapolate_static(x: Array, prescribed: Index, goal: Array) -> Array:
     """Return an extrapolation (3n,) of the next equilibrium from equilibria x (k, 3n): the last
-    increment, scaled by that of the prescribed dofs towards `goal` (prescribed,).
+    increment, scaled by that of the prescribed dofs towards `goal` (prescribed,); the last
+    equilibrium if there is only one.
     """
     if len(x) < 2:
         return x[-1]
@@ -236,8 +263,8 @@ class RowEquations:
     forces : (N, 3n) array
         Total forces at the evaluations before t [N].
     t : int
-        Index of the row.
-    left : sequence
+        Index of the row, at least 1.
+    previous : sequence of PreviousState
         History variables after row t − 1; empty if there are none.
     """
 
@@ -284,8 +311,8 @@ class RowEquations:
         self.known -= row.mass_kg * row.r * dynamics.start_velocity_m_s
 
     def with_load_step(self, share: float) -> RowEquations:
-        """Return the row with loads between those of the previous sample (share 0) and its own
-        (share 1); rows of a motion have their complete loads.
+        """Return a copy of the row with loads between those of the previous sample (share 0) and
+        its own (share 1); rows of a motion have their complete loads.
         """
         scaled = copy(self)
         if self.forces_before is not None:
@@ -315,26 +342,28 @@ class RowEquations:
         """Return the constraints c_t (3n,) [N] at positions x_t (3n,) [m]."""
         return self.residual_from(self.force(x), x)
 
-    def linearise(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return c_t (3n,) [N] at x_t = `x` (3n,) [m], and the lower triangles of the symmetric and
-        the skew part of −∂c_t/∂x_t.
-        """
+    def linearise(self, x: Array) -> NewtonLinearisation:
+        """Return c_t (3n,) [N] at x_t = `x` (3n,) [m], and its derivative by x_t."""
         states = self.states(x)
         row = self.row
         at = self.rest.linearise(*states)
         matrix = row.block(
-            at.by_position[0], at.by_velocity[0], self.rest.pattern
+            at.by_position[0], at.by_velocity[0], pattern=self.rest.pattern
         )
         skew = row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
         if not self.contact.acts:
-            return self.residual_from(at.force[0], x), matrix, skew
-        force, symmetric, askew = self.contact.linearise(
-            *states, (row.p[0], row.q[0])
+            return NewtonLinearisation(
+                self.residual_from(at.force[0], x), matrix, skew=skew
+            )
+        contact = self.contact.linearise(*states, (row.p[0], row.q[0]))
+        matrix -= row.w[0] * contact.symmetric
+        if contact.skew.size:
+            skew -= row.w[0] * contact.skew
+        return NewtonLinearisation(
+            self.residual_from(at.force[0] + contact.force, x),
+            matrix,
+            skew=skew,
         )
-        matrix -= row.w[0] * symmetric
-        if askew.size:
-            skew -= row.w[0] * askew
-        return self.residual_from(at.force[0] + force, x), matrix, skew
 
 
 def solve_row(
@@ -344,8 +373,8 @@ def solve_row(
     previous: Array,
     prescribed_m: Array,
 ) -> Array:
-    """Solve one row; where Newton's method fails, apply the grasps' displacement (and a static
-    load) in smaller increments.
+    """Return the solution x_t (3n,) [m] of one row; where Newton's method fails, the grasps'
+    displacement (and a static load) is applied in smaller increments.
 
     Static rows stay on the branch of stable equilibria.
 
@@ -360,7 +389,7 @@ def solve_row(
     previous : (3n,) array
         Positions of the row before [m].
     prescribed_m : (h,) array
-        Prescribed positions of the prescribed dofs [m].
+        Prescribed positions of the h prescribed dofs [m].
 
     Raises
     ------
@@ -372,7 +401,7 @@ def solve_row(
     def solve(guess: Array, share: float) -> Array:
         start = guess.copy()
         step = row.with_load_step(share)
-        # To the last digit at the end: bounds hold it there.
+        # Exact at the end, because bounds of the collocation program are.
         goal = (
             prescribed_m
             if share == 1

@@ -20,6 +20,7 @@ from ...model.generated_functions import GeneratedFunction
 from ...model.recursion import Recursion
 
 T = TypeVar("T", bound=np.generic)
+# Unit of variables that are not scaled.
 ONE = np.ones(1)
 
 
@@ -39,6 +40,22 @@ class PatternIndices(NamedTuple):
     unit: Array = ONE
 
 
+class _HessianPairs(NamedTuple):
+    """Pairs of inputs of an expression with second derivatives.
+
+    Attributes
+    ----------
+    first, second : (h,) arrays
+        Indices among the k inputs; each pair occurs in both orders.
+    is_upper : (h, I) array of bool
+        Instances at which the pair is in the upper triangle of the Hessian by z.
+    """
+
+    first: Index
+    second: Index
+    is_upper: NDArray[np.bool_]
+
+
 @dataclass(frozen=True, eq=False)
 class ExpressionPattern:
     """An expression at I instances.
@@ -50,9 +67,9 @@ class ExpressionPattern:
     data : (d, I) array
         Data of the instances.
     inputs : PatternIndices, (k, I)
-        Variables that are the inputs u.
+        Variables that are the inputs u; the expression gets their physical values.
     rows : PatternIndices, (m, I)
-        Constraints that the values y are added to.
+        Constraints that the values y, divided by their units, are added to.
     """
 
     expression: GeneratedFunction
@@ -106,8 +123,8 @@ class ExpressionPattern:
         return cls(
             expression,
             one_dimensional(data, len(data)),
-            concatenated(inputs),
-            concatenated([rows]),
+            inputs=concatenated(inputs),
+            rows=concatenated([rows]),
         )
 
     @classmethod
@@ -129,15 +146,15 @@ class ExpressionPattern:
         ----------
         recursion : Recursion
             The recursion R.
-        data : array
-            Data of the recursion.
+        data : (d, …) array
+            Data of the recursion; broadcast to the shape of the instances.
         states : PatternIndices, (n, N, I)
-            States h.
+            States h at N evaluations.
         input_indices : PatternIndices, (i, N, I)
             Inputs s.
         constants : PatternIndices
-            Constants c.
-        rows : PatternIndices
+            Constants c, of a shape that broadcasts.
+        rows : PatternIndices, (n, N, I)
             Constraints.
         """
 
@@ -162,11 +179,13 @@ class ExpressionPattern:
         )
 
     def _input_values(self, z: Array) -> Array:
-        """Return the inputs (k, I) in physical units."""
+        """Return the inputs (k, I) in physical units from the variables z."""
         return self.inputs.unit * z[self.inputs.indices]
 
     def residuals(self, z: Array, count: int) -> Array:
-        """Return the contributions to the constraints (count,)."""
+        """Return the contributions to the scaled constraints (count,) at z; those without values y
+        are zero.
+        """
         return self._assemble(
             self.expression.evaluate(self._input_values(z), self.data), count
         )
@@ -180,7 +199,9 @@ class ExpressionPattern:
         return assembled
 
     def jacobian_entries(self) -> tuple[Index, Index]:
-        """Return constraint, and index in z, of each derivative that may be non-zero."""
+        """Return constraint, and index in z, of each derivative that may be non-zero, for all
+        instances; an entry may be repeated.
+        """
         y, u = np.nonzero(self.expression.jacobian_pattern)
         return self.rows.indices[y].ravel(), self.inputs.indices[u].ravel()
 
@@ -196,33 +217,40 @@ class ExpressionPattern:
         return self._assemble(value, count), slopes.ravel()
 
     @cached_property
-    def _hessian_pairs(self) -> tuple[Index, Index, NDArray[np.bool_]]:
-        """Pairs (i, j) of inputs with second derivatives, and a mask of the instances where
-        they are in the upper triangle.
-        """
+    def _hessian_pairs(self) -> _HessianPairs:
+        """Pairs of inputs with second derivatives."""
         i, j = np.nonzero(self.expression.hessian_pattern)
-        return i, j, self.inputs.indices[i] <= self.inputs.indices[j]
+        indices = self.inputs.indices
+        return _HessianPairs(i, j, is_upper=indices[i] <= indices[j])
 
     def hessian_entries(self) -> tuple[Index, Index]:
-        """Return rows and columns in z of the second derivatives, upper triangle."""
-        i, j, above = self._hessian_pairs
-        return self.inputs.indices[i][above], self.inputs.indices[j][above]
+        """Return rows and columns in z of the second derivatives, upper triangle; an entry may be
+        repeated.
+        """
+        pairs = self._hessian_pairs
+        indices = self.inputs.indices
+        return (
+            indices[pairs.first][pairs.is_upper],
+            indices[pairs.second][pairs.is_upper],
+        )
 
     def hessian_values(self, z: Array, multipliers: Array) -> Array:
-        """Return the second derivatives of multipliers (count,) · constraints, in the order
-        of `hessian_entries`.
+        """Return the second derivatives of multipliers (count,) · constraints by the scaled
+        variables, in the order of `hessian_entries`.
         """
-        i, j, above = self._hessian_pairs
+        i, j, is_upper = self._hessian_pairs
         unit = self.inputs.unit
         weights = multipliers[self.rows.indices] / self.rows.unit
         curvature = self.expression.weighted_hessian(
             self._input_values(z), self.data, weights
         )
-        return (curvature[i, j] * unit[i] * unit[j])[above]
+        return (curvature[i, j] * unit[i] * unit[j])[is_upper]
 
 
 def _at_evaluations(
     indices: PatternIndices, evaluations: Index
 ) -> PatternIndices:
-    """Return the indices of other evaluations; units must be the same at all evaluations."""
+    """Return the indices (k, E, …) at other evaluations, given by their indices (E,); units must be
+    the same at all evaluations.
+    """
     return PatternIndices(indices.indices[:, evaluations], indices.unit)

@@ -26,14 +26,16 @@ from .lifted_force_histories import LiftedForceHistory
 
 @dataclass(frozen=True, eq=False)
 class LiftedContactPressure(LiftedForceHistory):
-    """Lifted pressure variables b of one obstacle of one experiment."""
+    """Lifted pressure variables b of one obstacle of one experiment; their lower bound is 0."""
 
     kind = "pressure"
     lower_bound = 0.0  # type: ignore[override]
 
     @property
     def first_evaluation(self) -> int:
-        """Index of the evaluation that the first variables belong to."""
+        """Index of the evaluation that the first variables belong to: the first with an equation of
+        motion.
+        """
         return self.segment.dynamics.first_row
 
     @property
@@ -50,7 +52,9 @@ class LiftedContactPressure(LiftedForceHistory):
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Shape (1, evaluations, I) for I contact points."""
+        """Shape (1, evaluations, I): evaluations with an equation
+        of motion, and I contact points.
+        """
         return 1, self.segment.constraint_times, self._points.count
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
@@ -63,8 +67,8 @@ class LiftedContactPressure(LiftedForceHistory):
     def with_lifted(
         self, iterate: ExperimentIterate, z: Array
     ) -> ExperimentIterate:
-        """Return the iterate with the scaled pressures b (1, N, points) [m] taken from z; b is zero
-        at a stated initial state.
+        """Return a copy of the iterate with the scaled pressures b (1, N, I) [m] of this obstacle
+        taken from z; b is zero at a stated initial state.
         """
         b = np.zeros((1, self.segment.grid_times, self._points.count))
         b[:, self.first_evaluation :] = self.unit_m * z[self.columns].reshape(
@@ -90,7 +94,8 @@ class LiftedContactPressure(LiftedForceHistory):
         self, iterate: ExperimentIterate, multipliers: Array
     ) -> WeightedHistory:
         """Return the history and its weights μ (1, N, I) in the Lagrangian, such that multipliers ·
-        equations = Σ μ_k h_k with the unscaled equations h_k of evaluation k.
+        equations = Σ μ_k h_k with the unscaled equations h_k of evaluation k; `multipliers` are
+        those of all constraints g.
         """
         mu = np.zeros((1, self.segment.grid_times, self._points.count))
         mu[:, self.first_evaluation :] = (
@@ -119,8 +124,8 @@ class LiftedContactPressure(LiftedForceHistory):
     def jacobian_values(
         self, iterate: ExperimentIterate, z: Array
     ) -> tuple[Array, Array]:
-        """Return the scaled equations (count,) at an iterate and z, and the values of
-        `jacobian_entries`.
+        """Return the scaled equations (count,) at an iterate, and the values of `jacobian_entries`;
+        z is not used.
         """
         history = self._history_of(iterate)
         d = self._points.dofs

@@ -37,7 +37,7 @@ class LiftedForceHistory(LiftedVariables):
     Attributes
     ----------
     motion_history : int
-        Index of the history among those of the motion, `ExperimentIterate.histories_of_trajectory`.
+        Index of the history in `ExperimentIterate.histories`.
     force_index : int
         Index of the force, see `ForceHistory`.
     reactions : LiftedReactions or None
@@ -52,22 +52,22 @@ class LiftedForceHistory(LiftedVariables):
 
     @property
     def first_evaluation(self) -> int:
-        """Index of the evaluation that the first variables belong to."""
+        """Index of the evaluation that the first variables belong to, 1."""
         return 1
 
     @property
     def unit_m(self) -> float:
-        """Unit of the variables and of the equations [m]."""
+        """Unit of the variables and of the equations [m]: the mean edge length ℓ."""
         return self.segment.length_m
 
     @property
     def history_index(self) -> int:
-        """Index of the history among those of the motion."""
+        """Index of the history in `ExperimentIterate.histories`."""
         return self.motion_history
 
     @property
     def _points(self) -> ForcePoints:
-        """Points of the body at which the force acts."""
+        """Points of the body at which the force acts, in all I instances."""
         return self.segment.dynamics.forces.pointwise_term(self.force_index)[
             0
         ].points
@@ -83,8 +83,8 @@ class LiftedForceHistory(LiftedVariables):
         )
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled variables that satisfy the equations at the part's positions
-        and parameters.
+        """Return the scaled variables (count,) that satisfy the equations at the iterate's
+        positions and parameters; the iterate must not have lifted ones.
         """
         return (
             self._history_of(iterate).previous_state.before[:, 1:].ravel()
@@ -94,8 +94,8 @@ class LiftedForceHistory(LiftedVariables):
     def with_lifted(
         self, iterate: ExperimentIterate, z: Array
     ) -> ExperimentIterate:
-        """Return the iterate with b (n, N, I) taken from z; b is zero before the first
-        evaluation.
+        """Return a copy of the iterate with the history variables b (n, N, I) [m] of this force
+        taken from z; b is zero at evaluation 0.
         """
         later = z[self.columns].reshape(self.shape) * self.segment.length_m
         before = np.concatenate([np.zeros_like(later[:, :1]), later], axis=1)
@@ -108,8 +108,8 @@ class LiftedForceHistory(LiftedVariables):
         )
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
-        """Return the scaled equations (count,) at an iterate and z: b minus its value by the
-        recursion.
+        """Return the scaled equations (count,): the variables in z minus their values by the
+        recursion from those that the iterate contains.
         """
         predicted = (
             self._history_of(iterate)
@@ -123,10 +123,18 @@ class LiftedForceHistory(LiftedVariables):
     ) -> WeightedHistory:
         """Return the history and its weights in the Lagrangian.
 
+        Parameters
+        ----------
+        iterate : ExperimentIterate
+            The experiment at the variables.
+        multipliers : array
+            Multipliers of all constraints g.
+
         Returns
         -------
         (ForceHistory, (n, N, I) array)
-            The history, and μ such that multipliers · equations contains Σ μ_k h_k.
+            The history, and μ such that multipliers · equations contains Σ μ_k h_k; zero at the
+            last evaluation.
         """
         mu = -multipliers[self.rows].reshape(self.shape) / self.segment.length_m
         return self._history_of(iterate), np.concatenate(
@@ -134,7 +142,7 @@ class LiftedForceHistory(LiftedVariables):
         )
 
     def _history_of(self, iterate: ExperimentIterate) -> ForceHistory:
-        """Return the force history of a part."""
+        """Return the force history at an iterate."""
         history = iterate.histories[self.history_index]
         assert isinstance(history, ForceHistory)
         return history
@@ -322,7 +330,8 @@ class LiftedForceHistory(LiftedVariables):
         multipliers: Array,
         weights: RowWeights,
     ) -> Array:
-        """Return the values of `hessian_entries`; arguments as in
+        """Return the values of `hessian_entries`: second derivatives with b of multipliers · g,
+        including the forces in the equations of motion; arguments as in
         `LiftedVariables.hessian_values`.
         """
         history, mu = self.weighted_history(iterate, multipliers)

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -72,6 +73,27 @@ class _MotionEntries:
     rows: MotionEquations
 
 
+class _StressEntries(NamedTuple):
+    """Derivatives of the stresses of all branches by positions, K in total.
+
+    Attributes
+    ----------
+    positions : (K,) array
+        Column of each in `stress_jacobian`.
+    variables : (K,) array
+        History variable to which the stress belongs, among the width of all branches.
+    dofs : (K,) array
+        Dof by which it is differentiated.
+    branches : (K,) array
+        Index of the branch.
+    """
+
+    positions: Index
+    variables: Index
+    dofs: Index
+    branches: Index
+
+
 @dataclass(frozen=True, eq=False)
 class LiftedMemory(LiftedVariables):
     """Lifted history variables m of a viscoelastic body.
@@ -95,15 +117,15 @@ class LiftedMemory(LiftedVariables):
 
     @cached_property
     def unit_pa(self) -> Array:
-        """Unit (width,) of the history variables [Pa]: normal entries of dS/dε of a uniform
-        stretch, averaged over the part.
+        """Unit (width,) of the history variables [Pa]: normal entries of dS/dε of a uniform stretch
+        at the guess, averaged over the branch.
         """
         segment = self.segment
         body = self.segment.body
         theta = segment.constants.theta(segment.parameters.guess_q)
         rest = body.nodes_m.reshape(1, -1)
         memory = body.memory
-        change = np.abs(body.stresses.stress_jvp(rest, rest, theta)[0])
+        change = np.abs(body.stresses.stress_jvp(rest, rest, theta=theta)[0])
         normal = [
             change[b.points][: (b.points.stop - b.points.start) // 2]
             for b in memory.branches
@@ -114,8 +136,8 @@ class LiftedMemory(LiftedVariables):
     # Values -------------------------------------------------------------------------------------
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled variables (count,) that satisfy the recursion at the part's
-        positions and parameters.
+        """Return the scaled variables (count,) that satisfy the recursion at the iterate's
+        positions and parameters; the iterate must not have lifted ones.
         """
         return (
             _body_history(iterate).previous_variables[1:] / self.unit_pa
@@ -124,8 +146,8 @@ class LiftedMemory(LiftedVariables):
     def with_lifted(
         self, iterate: ExperimentIterate, z: Array
     ) -> ExperimentIterate:
-        """Return the iterate with the history variables (N, width) [Pa] taken from z; those of the
-        first evaluation are zero.
+        """Return a copy of the iterate with the history variables (N, width) [Pa] of the body taken
+        from z; those of the first evaluation are zero.
         """
         later = z[self.columns].reshape(self.shape) * self.unit_pa
         memory = np.concatenate([np.zeros((1, self.shape[1])), later])
@@ -138,14 +160,18 @@ class LiftedMemory(LiftedVariables):
         )
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
-        """Return the scaled equations r (count,) at the history variables of the part."""
+        """Return the scaled equations r (count,) at the history variables that the iterate
+        contains; z is not used.
+        """
         return (
             _body_history(iterate).recursion_residuals / self.unit_pa
         ).ravel()
 
     @property
     def history_index(self) -> int:
-        """Index of the history: that of the body is the first."""
+        """Index of the history in `ExperimentIterate.histories`, 0:
+        that of the body is the first.
+        """
         return 0
 
     def weighted_history(
@@ -153,10 +179,18 @@ class LiftedMemory(LiftedVariables):
     ) -> WeightedHistory:
         """Return the history and its weights in the Lagrangian.
 
+        Parameters
+        ----------
+        iterate : ExperimentIterate
+            The experiment at the variables.
+        multipliers : array
+            Multipliers of all constraints g.
+
         Returns
         -------
         (MemoryHistory, (N, width) array)
-            The history, and μ such that multipliers · r = −Σ μ_k (m_k − d_k m_{k−1} − a_k S_k).
+            The history, and μ such that multipliers · r = −Σ μ_k (m_k − d_k m_{k−1} − a_k S_k);
+            zero at the last evaluation.
         """
         return _body_history(iterate), self._history_weights(multipliers)
 
@@ -168,10 +202,8 @@ class LiftedMemory(LiftedVariables):
     # Entries ------------------------------------------------------------------------------------
 
     @cached_property
-    def _stress_entries(self) -> tuple[Index, Index, Index, Index]:
-        """Index arrays (K,) of the stress derivatives of all branches: position in
-        `stress_jacobian`, history variable in the row of all branches, dof and branch.
-        """
+    def _stress_entries(self) -> _StressEntries:
+        """Derivatives of the stresses of all branches, branch by branch."""
         entries = self.segment.body.stresses.jacobian_entries
         index_arrays = []
         for number, branch in enumerate(self.segment.body.memory.branches):
@@ -189,10 +221,9 @@ class LiftedMemory(LiftedVariables):
                     np.full(len(places), number),
                 )
             )
-        place, own, dof, number = (
-            np.concatenate(each) for each in zip(*index_arrays, strict=True)
+        return _StressEntries(
+            *(np.concatenate(each) for each in zip(*index_arrays, strict=True))
         )
-        return place, own, dof, number
 
     @cached_property
     def _motion_entries(self) -> list[_MotionEntries]:
@@ -200,7 +231,7 @@ class LiftedMemory(LiftedVariables):
         the entries of each.
         """
         entries = []
-        dofs = self._stress_entries[2]
+        dofs = self._stress_entries.dofs
         for rows in motion_equations(self.segment, self.reactions):
             slopes = np.flatnonzero(rows.row_of_dof[dofs] >= 0)
             entries.append(
@@ -226,8 +257,8 @@ class LiftedMemory(LiftedVariables):
 
     @staticmethod
     def _nonzero_lags(table: Array, first: int, stop: int) -> list[_Lag]:
-        """Return the lags of a stencil table (N, lags) with non-zero coefficients, for the
-        evaluations `first` … `stop` − 1.
+        """Return the lags of a stencil table (N, lags) that has a non-zero coefficient of them,
+        each for those of the evaluations `first` … `stop` − 1 that have a position at this lag.
         """
         columns = enumerate(table.T)
         return [
@@ -238,7 +269,9 @@ class LiftedMemory(LiftedVariables):
 
     @cached_property
     def _force_lags(self) -> list[_Lag]:
-        """Lags of c_{k+lag} by the forces at evaluation k."""
+        """Lags j of c_{k+j} by the forces at evaluation k, for the evaluations k with a past whose
+        row k + j exists.
+        """
         table = self.segment.dynamics.tables.w
         count = self.segment.grid_times
         lags = [
@@ -255,8 +288,8 @@ class LiftedMemory(LiftedVariables):
         return max(1, self.segment.dynamics.first_row)
 
     def _memory_columns(self, lag: _Lag, variables: Index) -> list[Index | int]:
-        """Return arrays whose sum are the columns (T, K) in z of history variables, which are given
-        by their indices (K,).
+        """Return arrays whose sum are the columns (T, K) in z of history variables m_{k−1} at the
+        evaluations k of a lag, which are given by their indices (K,).
         """
         return [
             self.offsets.variable,
@@ -265,8 +298,8 @@ class LiftedMemory(LiftedVariables):
         ]
 
     def _position_columns(self, lag: _Lag, dofs: Index) -> list[Index | int]:
-        """Return arrays whose sum are the columns (T, K) in z of the positions of dofs (K,), at the
-        lag.
+        """Return arrays whose sum are the columns (T, K) in z of the positions of dofs (K,) at the
+        times k − lag, for the evaluations k of a lag.
         """
         return [
             self.segment.offsets.position,
@@ -276,9 +309,10 @@ class LiftedMemory(LiftedVariables):
 
     def _jacobian_blocks(self) -> list[EntryBlock]:
         """Return the entries of r by q, by m_{k−1}, by m_{k−2} and by x, then those of the
-        motion by m.
+        equations of motion by m.
         """
-        _, own, dofs, _ = self._stress_entries
+        own = self._stress_entries.variables
+        dofs = self._stress_entries.dofs
         equations, variables = (
             np.arange(s.start, s.stop) for s in (self.rows, self.columns)
         )
@@ -320,7 +354,8 @@ class LiftedMemory(LiftedVariables):
         blocks = [
             EntryBlock([np.arange(self.segment.nq)[:, None]], [variables])
         ]
-        _, own, dofs, _ = self._stress_entries
+        own = self._stress_entries.variables
+        dofs = self._stress_entries.dofs
         for each in self._state_lags:
             blocks.append(
                 EntryBlock(
@@ -357,7 +392,9 @@ class LiftedMemory(LiftedVariables):
     def jacobian_values(
         self, iterate: ExperimentIterate, z: Array
     ) -> tuple[Array, Array]:
-        """Return the scaled equations r (count,), and the values of `jacobian_entries`."""
+        """Return the scaled equations r (count,), and the values of `jacobian_entries`, at the
+        history variables that the iterate contains; z is not used.
+        """
         history = _body_history(iterate)
         memory = iterate.segment.body.memory
         after = self.shape[0] - 1, self.shape[1]
@@ -378,8 +415,8 @@ class LiftedMemory(LiftedVariables):
     def _parameter_derivatives(
         self, history: MemoryHistory, theta_q: Array
     ) -> Array:
-        """Return the derivatives (nq, N − 1, width) of the scaled equations r by q; `theta_q` (k,
-        nq) are those of the constants.
+        """Return the derivatives (nq, N − 1, width) of the scaled equations r by q, from the
+        derivatives `theta_q` (k, nq) of the k constants θ by q.
         """
         memory = history.memory
         derivatives = np.empty((theta_q.shape[1], *self.shape))
@@ -402,15 +439,16 @@ class LiftedMemory(LiftedVariables):
         """Return the derivatives of the scaled equations r by the scaled positions through the
         stress, one array (T, K) for each of `_stress_lags`, with K as in `_stress_entries`.
         """
-        place, own, _, number = self._stress_entries
-        scale = -self.segment.length_m / self.unit_pa[own]
+        entries = self._stress_entries
+        scale = -self.segment.length_m / self.unit_pa[entries.variables]
         a = history.fading.a.T
 
         def slopes(times: slice) -> Array:
             derivatives = history.body.stresses.stress_jacobian(
                 history.xi[times], history.theta
             )
-            return derivatives[:, place] * a[times, number] * scale
+            selected = derivatives[:, entries.positions]
+            return selected * a[times, entries.branches] * scale
 
         return self._scaled_by_lag(self._stress_lags, slopes)
 
@@ -420,7 +458,7 @@ class LiftedMemory(LiftedVariables):
         """Return the derivatives of scaled equations of motion by the scaled m, one array (T, K)
         for each of `_force_lags`, with K as in `changes`; zero in rows whose dof is prescribed.
         """
-        place, own, dofs, _ = (
+        positions, own, dofs, _ = (
             each[changes.derivative_indices] for each in self._stress_entries
         )
         scale = self.unit_pa[own] / self.segment.force_n
@@ -433,7 +471,7 @@ class LiftedMemory(LiftedVariables):
             return np.where(
                 changes.rows.omits_prescribed & is_prescribed[times, dofs],
                 0.0,
-                scaled[:, place] * scale,
+                scaled[:, positions] * scale,
             )
 
         scaled = self._scaled_by_lag(self._force_lags, slopes)
@@ -466,15 +504,15 @@ class LiftedMemory(LiftedVariables):
         by_q = (
             d_q[:, 1:] * self._history_weights(multipliers)[1:] * self.unit_pa
         )
-        place, own, _, _ = self._stress_entries
-        scale = segment.length_m * self.unit_pa[own]
-        # f_H is linear in x and in H, so that its slope by both is that by H at the weights.
+        entries = self._stress_entries
+        scale = segment.length_m * self.unit_pa[entries.variables]
 
+        # f_H is linear in x and in H, so that its derivative by both is that by H at the weights.
         def slopes(times: slice) -> Array:
             derivatives = segment.body.stresses.memory_force_jacobian(
                 weights.forces[times], history.theta
             )
-            return derivatives[:, place] * scale
+            return derivatives[:, entries.positions] * scale
 
         values = [by_q, *self._scaled_by_lag(self._state_lags, slopes)]
         return np.concatenate([each.ravel() for each in values])
@@ -517,7 +555,7 @@ class LiftedMemory(LiftedVariables):
 
 
 def _body_history(iterate: ExperimentIterate) -> MemoryHistory:
-    """Return the viscoelastic history of a part."""
+    """Return the viscoelastic history of the body at an iterate, which must have one."""
     history = iterate.histories[0]
     assert isinstance(history, MemoryHistory)
     return history

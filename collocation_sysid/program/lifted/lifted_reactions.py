@@ -44,7 +44,7 @@ class LiftedReactions(LiftedVariables):
         Parameters
         ----------
         times : (T,) array
-            Grid times.
+            Indices of grid times with equations of motion.
         dofs : (k,) array
             Indices into `sensed_dofs`.
         """
@@ -75,7 +75,9 @@ class LiftedReactions(LiftedVariables):
 
     @cached_property
     def _motion_jacobian(self) -> MotionJacobian:
-        """Structure of ∂c/∂x, including forces on dofs while a grasp prescribes them."""
+        """Structure of ∂c/∂x at the sensed dofs, including forces on dofs while a grasp prescribes
+        them.
+        """
         segment = self.segment
         dynamics = self.segment.dynamics
         untaken = replace(
@@ -93,7 +95,9 @@ class LiftedReactions(LiftedVariables):
         )
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled reaction forces (count,) that follow from positions and parameters."""
+        """Return the scaled reaction forces (count,) that follow from the positions and parameters
+        of the iterate.
+        """
         return self._scaled(iterate.motion.reactions.reaction)
 
     def _scaled(self, newtons: Array) -> Array:
@@ -106,7 +110,9 @@ class LiftedReactions(LiftedVariables):
         )
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
-        """Return the scaled equations (count,)."""
+        """Return the scaled equations (count,): the variables in z minus the reaction forces that
+        follow from the iterate.
+        """
         return z[self.columns] - self.consistent_values(iterate)
 
     def jacobian_entries(self) -> tuple[Index, Index]:
@@ -161,7 +167,7 @@ class LiftedReactions(LiftedVariables):
         by_p = dynamics.combine(dynamics.tables.w, by_p)
         acceleration = dynamics.acceleration(iterate.x)[:, self.sensed_dofs]
         by_p -= setting.inertia_derivatives(
-            slice(None), acceleration, self.sensed_dofs
+            slice(None), acceleration, dofs=self.sensed_dofs
         )
         force = np.zeros(acceleration.shape)
         force[first:] = iterate.forces.force[:, self.sensed_dofs]
@@ -200,31 +206,31 @@ class MotionEquations(NamedTuple):
 def motion_equations(
     transcription: Transcription, reactions: LiftedReactions | None
 ) -> list[MotionEquations]:
-    """Return the equations of motion of an experiment, and those of its lifted reaction forces;
-    None without these.
+    """Return the sets of constraints of an experiment that contain forces: its equations of motion
+    and, unless `reactions` is None, the equations of its lifted reaction forces.
     """
-    kinds = [
-        (
-            transcription.free_dofs,
-            transcription.constrained_dofs,
-            transcription.offsets.row,
-            True,
+    constrained = transcription.constrained_dofs
+    free = transcription.free_dofs
+    row_of_dof = np.full(transcription.dof_count, -1)
+    row_of_dof[free] = np.searchsorted(constrained, free)
+    equations = [
+        MotionEquations(
+            row_of_dof,
+            first_row=transcription.offsets.row,
+            rows_per_time=len(constrained),
+            omits_prescribed=True,
         )
     ]
     if reactions is not None:
-        kinds.append(
-            (
-                reactions.sensed_dofs,
-                reactions.sensed_dofs,
-                reactions.offsets.row,
-                False,
-            )
-        )
-    equations = []
-    for moving, dofs, first, is_prescribed in kinds:
-        number = np.full(transcription.dof_count, -1)
-        number[moving] = np.searchsorted(dofs, moving)
+        sensed = reactions.sensed_dofs
+        row_of_dof = np.full(transcription.dof_count, -1)
+        row_of_dof[sensed] = np.arange(len(sensed))
         equations.append(
-            MotionEquations(number, first, len(dofs), is_prescribed)
+            MotionEquations(
+                row_of_dof,
+                first_row=reactions.offsets.row,
+                rows_per_time=len(sensed),
+                omits_prescribed=False,
+            )
         )
     return equations

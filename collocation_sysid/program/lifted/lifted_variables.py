@@ -65,11 +65,13 @@ class LiftedVariables(ABC):
     @property
     @abstractmethod
     def shape(self) -> tuple[int, ...]:
-        """Shape of the array of variables, and of that of the equations."""
+        """Shape of the array of variables, and of that of the equations; the last index is the
+        fastest in z and in g.
+        """
 
     @property
     def count(self) -> int:
-        """Number of variables, which is that of the equations."""
+        """Number of variables, which is that of the equations: the product of `shape`."""
         return int(np.prod(self.shape))
 
     @property
@@ -98,14 +100,16 @@ class LiftedVariables(ABC):
 
     @property
     def lower_bound(self) -> float:
-        """Lower bound of the variables."""
+        """Lower bound of the scaled variables; −∞ unless a subclass has one. There is no upper
+        bound.
+        """
         return -np.inf
 
     def with_lifted(
         self, iterate: ExperimentIterate, z: Array
     ) -> ExperimentIterate:
-        """Return the iterate with those quantities replaced that these variables of z determine;
-        the iterate itself if there are none.
+        """Return a copy of the iterate with those quantities replaced that these variables of z
+        determine; here the iterate itself, for groups that determine none.
         """
         return iterate
 
@@ -117,13 +121,15 @@ class LiftedVariables(ABC):
 
     @cached_property
     def patterns(self) -> tuple[ExpressionPattern, ...]:
-        """Expressions whose sum is the equations; row indices count from the group's first
-        equation.
+        """Expressions whose sum is the equations, with indices of rows from the group's first
+        equation on; empty for subclasses that override the methods below.
         """
         return ()
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
-        """Return the scaled equations (count,) at the iterate and z."""
+        """Return the scaled equations (count,) at the iterate and z,
+        zero where they are satisfied.
+        """
         return np.sum(
             [pattern.residuals(z, self.count) for pattern in self.patterns],
             axis=0,
@@ -131,7 +137,7 @@ class LiftedVariables(ABC):
 
     def jacobian_entries(self) -> tuple[Index, Index]:
         """Return rows in g and columns in z of the additional entries of ∂g/∂z, in the order of
-        their values.
+        their values; an entry may be repeated, and its values are summed.
         """
         rows, columns = concatenated_entries(
             pattern.jacobian_entries() for pattern in self.patterns
@@ -141,8 +147,8 @@ class LiftedVariables(ABC):
     def jacobian_values(
         self, iterate: ExperimentIterate, z: Array
     ) -> tuple[Array, Array]:
-        """Return the scaled equations (count,) at an iterate and z, and the values of
-        `jacobian_entries`.
+        """Return the scaled equations (count,) at the iterate and z, and the values of
+        `jacobian_entries`: derivatives by scaled variables.
         """
         evaluated = [
             pattern.jacobian_values(z, self.count) for pattern in self.patterns
@@ -151,8 +157,8 @@ class LiftedVariables(ABC):
         return np.sum(values, axis=0), np.concatenate(slopes)
 
     def hessian_entries(self) -> tuple[Index, Index]:
-        """Return rows and columns of the additional entries of the Lagrangian's Hessian,
-        upper triangle.
+        """Return rows and columns in z of the additional entries of the Lagrangian's Hessian, upper
+        triangle; an entry may be repeated, and its values are summed.
         """
         return concatenated_entries(
             pattern.hessian_entries() for pattern in self.patterns
@@ -189,44 +195,58 @@ class LiftedVariables(ABC):
     # What the loss has of the variables ---------------------------------------------------------
 
     def loss_gradient(self, iterate: ExperimentIterate) -> Array:
-        """Return the gradient of the loss by these variables (count,)."""
+        """Return the gradient of the loss by these scaled variables (count,); here zero, for groups
+        on which the loss does not depend.
+        """
         return np.zeros(self.count)
 
     # What multipliers weigh ---------------------------------------------------------------------
 
     def residual_weights(self, multipliers: Array) -> Array | float:
-        """Return the derivative (N, 3n) of multipliers · equations by the residual c in
-        newtons [1/N]; 0 if there is none.
+        """Return the derivative (N, 3n) of multipliers · equations by the residual c in newtons
+        [1/N]; 0 if the equations do not contain it.
+
+        Parameters
+        ----------
+        multipliers : (constraints,) array
+            Multipliers of all constraints g.
         """
         return 0.0
 
     @property
     def history_index(self) -> int | None:
-        """Index of the history among those of the motion, or None if the group is no history."""
+        """Index of the history in `ExperimentIterate.histories`, or None if the group is no
+        history.
+        """
         return None
 
     def weighted_history(
         self, iterate: ExperimentIterate, multipliers: Array
     ) -> WeightedHistory:
-        """Return the history, and the weights of each h_k in multipliers · equations.
+        """Return the history of the iterate, and the weights of each h_k in multipliers ·
+        equations.
 
         Raises
         ------
         NotImplementedError
-            If the group is no history.
+            If the group is no history (`history_index` is None).
         """
         raise NotImplementedError
 
     @property
     def entry_counts(self) -> tuple[int, int]:
-        """Numbers of additional entries of the Jacobian and of the Hessian."""
+        """Numbers of additional entries of the Jacobian, and of the
+        upper triangle of the Hessian.
+        """
         return len(self.jacobian_entries()[0]), len(self.hessian_entries()[0])
 
 
 def concatenated_entries(
     groups: Iterable[tuple[Index, Index]],
 ) -> tuple[Index, Index]:
-    """Concatenate rows, and columns, of several groups of entries; no group gives empty arrays."""
+    """Concatenate the rows, and the columns, of several groups of entries; without groups both are
+    empty.
+    """
     none = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     rows, columns = zip(none, *groups, strict=True)
     return np.concatenate(rows), np.concatenate(columns)

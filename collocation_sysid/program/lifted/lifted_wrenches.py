@@ -28,6 +28,7 @@ from .expression_patterns import ExpressionPattern, PatternIndices
 from .lifted_reactions import LiftedReactions
 from .lifted_variables import LiftedVariables
 
+# Identity: the value (6,) of a wrench.
 ITSELF = GeneratedFunction(lambda u, _: u, 6, data_size=0)
 
 
@@ -71,7 +72,9 @@ class LiftedWrench(LiftedVariables):
 
     @cached_property
     def _unit(self) -> Array:
-        """Unit (6,) of W and Y [N, N m], for which the mean loss has a curvature of about one."""
+        """Unit (6,) of W and Y [N, N m], for which the mean loss has a curvature of about one; that
+        of reaction forces for components that are not measured.
+        """
         count = max(1, int(self.residual.is_compared.sum()))
         sigmas = self.residual.observable_sigmas
         return np.where(
@@ -93,7 +96,9 @@ class LiftedWrench(LiftedVariables):
     def with_lifted(
         self, iterate: ExperimentIterate, z: Array
     ) -> ExperimentIterate:
-        """Return the iterate with the measured wrench (times, 2, 3) [N, N m] taken from z."""
+        """Return a copy of the iterate with the measured wrench Y (times, 2, 3) [N, N m] taken from
+        z, W without a low-pass.
+        """
         wrench = z[self._observable_columns].reshape(-1, 6) * self._unit
         return replace(
             iterate,
@@ -105,11 +110,13 @@ class LiftedWrench(LiftedVariables):
 
     @property
     def _observable_columns(self) -> slice:
-        """Slice of Y in z."""
+        """Slice of Y in z, of W without a low-pass."""
         return slice(self.columns.stop - self._wrench_size, self.columns.stop)
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled W and Y (count,) that follow from the iterate's motion."""
+        """Return the scaled W and, with a low-pass, Y (count,) that follow from the iterate's
+        motion.
+        """
         own = [
             self.observable.evaluate_unfiltered(
                 iterate.motion.reactions, iterate.phi
@@ -201,7 +208,9 @@ class LiftedWrench(LiftedVariables):
     # Loss ---------------------------------------------------------------------------------------
 
     def loss_gradient(self, iterate: ExperimentIterate) -> Array:
-        """Return the gradient of the loss by the scaled variables (count,)."""
+        """Return the gradient of the loss by the scaled variables (count,); zero for W if there is
+        a low-pass.
+        """
         own = np.zeros(self.count)
         by_observables, _ = iterate.loss_gradients[self.residual_index]
         own[self.count - self._wrench_size :] = (
@@ -219,7 +228,9 @@ class LiftedWrench(LiftedVariables):
 
     @cached_property
     def _loss_entries(self) -> tuple[Index, Index]:
-        """Rows and columns among (Y, φ) of the Hessian of the loss, upper triangle."""
+        """Rows and columns among (Y, φ) of the Hessian of the loss by (scaled Y, φ), upper
+        triangle, sorted by column.
+        """
         return self.residual.hessian_structure(self._unit_derivatives)
 
     def hessian_entries(self) -> tuple[Index, Index]:

@@ -32,6 +32,11 @@ def lift_variables(
         Index in z where the nuisance parameters of all experiments begin.
     offsets : LiftedOffsets
         Offsets of the first group.
+
+    Returns
+    -------
+    tuple of LiftedVariables
+        The groups in the order of their variables in z, and of their equations in g.
     """
     groups: list[LiftedVariables] = []
     for number, segment in enumerate(transcriptions):

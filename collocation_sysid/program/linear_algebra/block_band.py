@@ -78,7 +78,9 @@ class BlockBand:
         Compressed-column structure, rows ascending in each column.
     nnz : int
         Number of entries.
-    top_positions : (N · columns, top) array
+    starts : (N + 1,) array
+        Position of the first value of each column block, and the number of values.
+    top_positions : (N · columns, top_rows) array
         Positions of the top rows' values.
 
     Parameters
@@ -89,8 +91,8 @@ class BlockBand:
         First row of each row block, −1 where the block does not exist.
     blocks : sequence of BandBlock
         The blocks.
-    top : int
-        Number of rows above all blocks, in which every column has an entry (0 … top − 1).
+    top_rows : int
+        Number of rows above all blocks, in which every column has an entry (0 … `top_rows` − 1).
     adds : bool
         If true, `fill` adds to the values instead of overwriting them.
     """
@@ -120,7 +122,7 @@ class BlockBand:
                 b for b, here in zip(blocks, present, strict=True) if here
             ]
             self._slabs[present] = _ColumnBlock.from_blocks(
-                columns, chosen, top_rows
+                columns, chosen, top=top_rows
             )
         kinds = [self._slabs[tuple(present)] for present in exists]
         starts = np.concatenate(
@@ -153,28 +155,31 @@ class BlockBand:
 
         Parameters
         ----------
-        times : array
+        times : (T,) array
             Column times t.
         offset : int
             Row block minus column block.
         rows, columns : (e,) arrays
-            Entries within the block.
+            Entries within the block, the same at all times.
 
         Raises
         ------
         IndexError
             If an entry is not in the block.
+        ValueError
+            If there are no blocks at this offset at one of the times.
         """
         result = np.empty((len(times), len(rows)), dtype=np.int64)
         for slab in self._slabs.values():
             here = np.array([self._kinds[t] is slab for t in times], dtype=bool)
             if here.any():
-                places = slab.locate(offset, rows, columns)
+                places = slab.locate(offset, rows, columns=columns)
                 result[here] = self.starts[times[here], None] + places
         return result
 
     def fill(self, values: Array, a: Array, b: Array, threads: int) -> None:
-        """Write all block entries into `values`, in place; entries without terms become zero.
+        """Write all block entries into `values`, in place; entries without terms become zero. With
+        `adds`, add to the values instead.
 
         Parameters
         ----------
@@ -183,7 +188,7 @@ class BlockBand:
         a, b : (K, m) arrays
             Lower-triangle values A and B, rows contiguous, with the same row stride.
         threads : int
-            Number of threads.
+            Largest number of threads; one is used for few blocks.
         """
         run_in_slices(
             lambda start, stop: self._fill(start, stop, a, b, values),
@@ -224,10 +229,8 @@ class _ColumnBlock:
     entry_count: int
     column_ends: Index
     top_positions: Index
-    sorted_positions: (
-        Index  # sorted place of each entry, blocks stacked after the top rows
-    )
-    block_indices: Index  # row offset of each stacked entry
+    sorted_positions: Index
+    block_indices: Index
     rows: Index
 
     @classmethod
@@ -254,17 +257,19 @@ class _ColumnBlock:
         return cls(
             columns,
             top,
-            blocks,
-            len(order),
-            ends,
-            place[: top * columns].reshape(columns, top),
-            place,
-            level,
-            rows,
+            blocks=blocks,
+            entry_count=len(order),
+            column_ends=ends,
+            top_positions=place[: top * columns].reshape(columns, top),
+            sorted_positions=place,
+            block_indices=level,
+            rows=rows,
         )
 
     def row_indices(self, row_starts: Index, t: int) -> Index:
-        """Return the row in the matrix of every entry, for column block t."""
+        """Return the row in the matrix of every entry (entries,), in sorted order, for column block
+        t.
+        """
         base = np.array([row_starts[t + b.offset] for b in self.blocks] + [0])
         result = np.empty(self.entry_count, dtype=np.int64)
         result[self.sorted_positions] = base[self.block_indices] + self.rows
@@ -289,6 +294,8 @@ class _ColumnBlock:
         ------
         IndexError
             For entries that the block does not have.
+        ValueError
+            If there is no block at this offset.
         """
         k = [b.offset for b in self.blocks].index(offset)
         block = self.blocks[k]
@@ -386,16 +393,16 @@ def _make_plan(
 
 
 def skew_signs(pattern: SymmetricPattern) -> Array:
-    """Return the signs (nnz,) of a skew matrix's lower triangle in the entries of
-    `pattern.full`.
+    """Return the signs (nnz,) by which the entries of `pattern.full` of a skew matrix follow from
+    its lower triangle: 1 below the diagonal, −1 above, 0 on it.
     """
     rows, columns, _ = pattern.full
     return np.sign(rows - columns).astype(float)
 
 
 def full_skew_values(pattern: SymmetricPattern, skew: Array) -> Array:
-    """Return the entries (…, nnz) of the complete skew matrix in the order of
-    `pattern.full`; empty input gives empty output.
+    """Return the entries (…, nnz) of the complete skew matrix in the order of `pattern.full` from
+    its lower triangle (…, m); an empty array is returned as it is.
     """
     if not skew.size:
         return skew
@@ -444,14 +451,15 @@ class Submatrix:
         self._matrix = sp.csr_array(parts, shape=(len(rows), count))
 
     def extract(self, lower: Array, skew: Array) -> sp.csr_array:
-        """Return the submatrix (k, c); it is overwritten by the next call.
+        """Return the submatrix (k, c). The returned object is shared: its values are overwritten by
+        the next call.
 
         Parameters
         ----------
         lower : (m,) array
-            Lower triangle of the symmetric part.
+            Lower triangle of the symmetric part of the complete matrix.
         skew : (m,) or (0,) array
-            Lower triangle of the skew part.
+            Lower triangle of the skew part; empty for none.
         """
         if skew.size:
             both = np.concatenate([lower + skew, lower - skew])
@@ -464,8 +472,8 @@ class Submatrix:
 def full_matrix(
     pattern: SymmetricPattern, lower: Array, skew: Array
 ) -> sp.csc_array:
-    """Return the sparse matrix (3n, 3n) of the symmetric part `lower` (m,) and the skew
-    part `skew`, (m,) or (0,).
+    """Return the sparse matrix (3n, 3n) of the symmetric part with lower triangle `lower` (m,) and
+    the skew part with lower triangle `skew`, (m,) or (0,) for none.
     """
     matrix = pattern.matrix(lower)
     if skew.size:
@@ -488,6 +496,11 @@ def skew_block_band(
     ----------
     by_velocity : bool
         Whether the derivative by the velocity has a skew part too; if not, its terms are zero.
+
+    Returns
+    -------
+    BlockBand
+        Structure with the same positions as that of the symmetric parts; its `fill` adds.
     """
     own = [
         replace(

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -61,15 +61,18 @@ NONE = np.zeros(0)
 
 
 class Factor(Protocol):
-    """Factorised matrix on the free degrees of freedom."""
+    """Factorised matrix on the k free degrees of freedom."""
 
     @property
     def positive_definite(self) -> bool:
-        """Whether the matrix, or its symmetric part, is positive definite."""
+        """Whether the matrix, or the symmetric part of an unsymmetric one, is positive definite; of
+        an unsymmetric matrix whose symmetric part is not, whether all pivots are positive.
+        """
         ...
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Solve for right-hand sides (k,) or (k, m) in the order of the free dofs.
+        """Return the solution for right-hand sides (k,) or (k, m) in the order of the free dofs, in
+        the same shape; `right` is not modified.
 
         If `transposed`, solve with the transposed matrix.
         """
@@ -95,8 +98,8 @@ class _BandFactor:
     positive_definite: bool = True
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs; the matrix is
-        symmetric.
+        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs; `transposed`
+        has no effect on a symmetric matrix.
         """
         permuted = right[self.order]
         solved, _ = _pbtrs(self.band, permuted, lower=1)
@@ -175,7 +178,7 @@ class _RefinedFactor:
         solution = correction = self.symmetric.solve(right)
         size = last = np.abs(solution).max(axis=0, initial=TINY)
         shrinks = 1.0
-        # What the next correction would be is not worth another solution.
+        # The next correction would be about `shrinks` times the last.
         while (shrinks * last > ACCURACY * size).any():
             product = self.skew @ correction
             correction = self.symmetric.solve(
@@ -191,20 +194,48 @@ class _RefinedFactor:
         return solution
 
 
+class _UpperTriangle(NamedTuple):
+    """Upper triangle of a symmetric matrix in compressed rows.
+
+    Attributes
+    ----------
+    row_starts : (k + 1,) array
+        Index of the first entry of each row, and the number of entries.
+    columns : (e,) array
+        Column of each entry, ascending in each row.
+    lower_positions : (e,) array
+        Position of the value of each entry among those of the lower triangle.
+    """
+
+    row_starts: Index
+    columns: Index
+    lower_positions: Index
+
+
 @dataclass(frozen=True, eq=False)
 class _SparseFactor:
-    """Complete LU factorisation of a sparse matrix by SuperLU."""
+    """Complete LU factorisation of a sparse matrix by SuperLU.
+
+    Attributes
+    ----------
+    lu : SuperLU
+        The factorisation.
+    positive_definite : bool
+        See `Factor.positive_definite`.
+    """
 
     lu: SuperLU
     positive_definite: bool
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Solve for right-hand sides (k,) or (k, m)."""
+        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, of the
+        transposed matrix if `transposed`.
+        """
         return self.lu.solve(right, "T" if transposed else "N")
 
 
 class Factoriser:
-    """Symbolic analysis of a symmetric pattern restricted to free degrees of freedom.
+    """Symbolic analysis of a symmetric pattern restricted to k free degrees of freedom.
 
     Attributes
     ----------
@@ -272,7 +303,9 @@ class Factoriser:
     def cached(
         cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto"
     ) -> Factoriser:
-        """Return the analysis of a pattern; the last few are cached."""
+        """Return the analysis of a pattern; the last eight are cached. Arguments as in
+        `Factoriser`.
+        """
         return _cached_analysis(pattern, free.tobytes(), choice=choice)
 
     @cached_property
@@ -305,7 +338,9 @@ class Factoriser:
 
     @property
     def factor_size(self) -> int:
-        """Number of floating-point numbers in the factor of a symmetric matrix."""
+        """Number of floating-point numbers in the factor of a symmetric matrix; the matrix is
+        analysed if necessary.
+        """
         if self.is_banded:
             width = (
                 self.skyline.shape[1]
@@ -321,12 +356,16 @@ class Factoriser:
 
     @property
     def unsymmetric_factor_size(self) -> int:
-        """Number of floating-point numbers in the factor of an unsymmetric matrix."""
+        """Number of floating-point numbers in the factor of an unsymmetric matrix: twice that of a
+        symmetric one within a skyline, otherwise the same.
+        """
         return (2 if self.skyline else 1) * self.factor_size
 
     @cached_property
     def skyline(self) -> SkylineFactorisation | None:
-        """Skyline factorisation for narrow bands; None for others."""
+        """Skyline factorisation for bands up to `NARROW` wide; None for wider ones, other methods,
+        and without native code.
+        """
         if not self.is_banded or self.half_bandwidth > NARROW:
             return None
         return make_skyline(self._size, *self._ranks, self._free_entries)
@@ -352,21 +391,24 @@ class Factoriser:
         skew: Array = NONE,
         buffer: FactorMemory | None = None,
     ) -> Factor:
-        """Factorise a matrix.
+        """Factorise a matrix on the free dofs.
 
         Parameters
         ----------
         values : (m,) array
-            Lower triangle of the symmetric part.
+            Lower triangle of the symmetric part of the complete matrix; not modified.
         skew : (m,) or (0,) array
             Lower triangle of the skew part; empty if the matrix is symmetric.
         buffer : FactorMemory, optional
-            Memory for the factor; the factor is valid until it is used again.
+            Memory for a factor within the skyline; the factor is valid until it is used again.
+            Other methods ignore it.
 
         Raises
         ------
         numpy.linalg.LinAlgError
             If the matrix is singular or not finite.
+        MemoryError
+            If there is no memory for a supernodal factor.
         """
         skew = skew if skew.any() else NONE
         skyline_factor = self._factorise_in_skyline(values, skew, buffer=buffer)
@@ -387,7 +429,8 @@ class Factoriser:
                 self._superlu(values, pivot_below=0.1), False
             )
         if not definite:
-            # Where a body slides under friction it never is: the pivots of the whole tell then.
+            # Under friction the symmetric part is never definite: the pivots of the complete matrix
+            # decide.
             lu = self._superlu(values, pivot_below=0.1, skew=skew)
             return _SparseFactor(lu, _has_positive_pivots(lu))
 
@@ -406,7 +449,8 @@ class Factoriser:
 
     def _factorise_definite(self, values: Array) -> Factor | None:
         """Return the factor of a symmetric matrix (entries of the lower triangle), or None if it is
-        not positive definite.
+        not positive definite, or the skyline is used, which `_factorise_in_skyline` has tried
+        already.
         """
         if self.is_supernodal:
             try:
@@ -416,7 +460,8 @@ class Factoriser:
             ):  # not asked for beforehand: other threads take from it too
                 pardiso = self._pardiso()
             factor = SupernodalFactor(pardiso, self._pool)
-            return factor if pardiso.factorise(values[self._upper[2]]) else None
+            upper_values = values[self._upper.lower_positions]
+            return factor if pardiso.factorise(upper_values) else None
         if not self.is_banded:
             lu = self._superlu(values, pivot_below=0.0)
             return (
@@ -434,7 +479,7 @@ class Factoriser:
 
     def _pardiso(self) -> Pardiso:
         """Return a new PARDISO solver for the pattern."""
-        return Pardiso(*self._upper[:2])
+        return Pardiso(self._upper.row_starts, self._upper.columns)
 
     @cached_property
     def _supernodal_size(self) -> int:
@@ -447,16 +492,18 @@ class Factoriser:
         return self._pool[-1].factor_size
 
     @cached_property
-    def _upper(self) -> tuple[Index, Index, Index]:
-        """Starts of the rows of the upper triangle, their columns, and the positions of
-        their values in the lower triangle.
-        """
+    def _upper(self) -> _UpperTriangle:
+        """Upper triangle of the matrix on the free dofs, row by row."""
         here = self._full_rows <= self._full_columns
         rows = self._full_rows[here]
         columns = self._full_columns[here]
         order = np.lexsort((columns, rows))
         starts = np.searchsorted(rows[order], np.arange(self._size + 1))
-        return starts, columns[order], self._full_source[here][order]
+        return _UpperTriangle(
+            starts,
+            columns[order],
+            lower_positions=self._full_source[here][order],
+        )
 
     def allocate(self, sides: int) -> FactorMemory | None:
         """Return memory for a factor within the skyline, or None if other methods are used.
@@ -472,8 +519,10 @@ class Factoriser:
         self, values: Array, skew: Array, buffer: FactorMemory | None
     ) -> Factor | None:
         """Return the factor within the skyline of a matrix with lower triangles `values` and
-        `skew`, or None if there is no skyline or the matrix needs row exchanges. The factor is
-        written to `buffer` if that is given.
+        `skew`, or None if there is no skyline, or the matrix is not positive definite or needs row
+        exchanges.
+
+        The factor is written to `buffer`, or to new memory for None.
         """
         skyline = self.skyline
         if skyline is None:
@@ -481,7 +530,7 @@ class Factoriser:
         count = 2 if skew.size else 1
         buffer = buffer or skyline.allocate(count)
         pivots, growth = skyline.factorise(buffer, values, skew)
-        # What is not finite in the matrix is not in its pivots.
+        # An entry of the matrix that is not finite makes a pivot infinite or NaN.
         if not (
             pivots.min() > 0 and pivots.max() < np.inf and growth.max() < GROWTH
         ):
@@ -501,7 +550,7 @@ class Factoriser:
         threads: int,
         buffers: Sequence[FactorMemory | None] = (),
     ) -> list[Factor]:
-        """Factorise several matrices in parallel.
+        """Return the factors of several matrices, in their order, computed in parallel.
 
         Parameters
         ----------
@@ -512,7 +561,7 @@ class Factoriser:
         threads : int
             Number of threads.
         buffers : sequence of FactorMemory or None
-            Memory for each factor; empty to allocate.
+            Memory for each factor; empty to allocate. It may be longer than `count`.
 
         Raises
         ------
@@ -531,27 +580,29 @@ class Factoriser:
         return [factors[k] for k in range(count)]
 
     def _sparse_matrix(self, entries: Array) -> sp.csc_array:
-        """Return the sparse matrix (k, k) of entries in the order of both triangles."""
+        """Return the sparse matrix (k, k) of entries in the order of both triangles: the lower one,
+        then the strict upper one.
+        """
         places = self._full_rows, self._full_columns
         return sp.csc_array((entries, places), shape=(self._size, self._size))
 
     def _superlu(
         self, values: Array, pivot_below: float, skew: Array = NONE
     ) -> SuperLU:
-        """Factorise by SuperLU.
+        """Return the factorisation by SuperLU.
 
         Parameters
         ----------
-        values : array
+        values : (m,) array
             Lower triangle of the symmetric part.
         pivot_below : float
             Threshold for row exchanges, from 0 (none) to 1 (partial pivoting).
-        skew : array
+        skew : (m,) or (0,) array
             Lower triangle of the skew part; empty for none.
 
         Raises
         ------
-        LinAlgError
+        numpy.linalg.LinAlgError
             If the matrix is singular.
         """
         entries = values[self._full_source]
@@ -569,7 +620,7 @@ class Factoriser:
 
 
 def _has_positive_pivots(lu: SuperLU) -> bool:
-    """Whether SuperLU took the pivots in their order, and all are positive."""
+    """Return whether SuperLU took the pivots in their order, and all are positive."""
     return bool((lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all())
 
 
@@ -577,7 +628,9 @@ def _has_positive_pivots(lu: SuperLU) -> bool:
 def _cached_analysis(
     pattern: SymmetricPattern, free: bytes, choice: Choice
 ) -> Factoriser:
-    """Return the analysis of a pattern; `free` are the bytes of an array of int64."""
+    """Return the analysis of a pattern, of which the last eight are cached; `free` are the bytes of
+    an array of int64.
+    """
     return Factoriser(
         pattern, np.frombuffer(free, dtype=np.int64), choice=choice
     )

@@ -20,8 +20,8 @@ from threadpoolctl import ThreadpoolController
 
 
 def _routine(name: str, arguments: int) -> Any:
-    """Return a LAPACK routine of SciPy's Cython interface as a ctypes function with pointer
-    arguments.
+    """Return a LAPACK routine of SciPy's Cython interface as a ctypes function of `arguments`
+    pointers.
     """
     module = import_module("scipy.linalg.cython_lapack")
     capsule = LowLevelCallable.from_cython(module, name).function
@@ -39,14 +39,14 @@ _DPBTRF = _routine("dpbtrf", 6)
 
 @cache
 def _controller() -> ThreadpoolController:
-    """Return the controller of BLAS threads; cached because its creation is slow."""
+    """Return the controller of BLAS threads, cached because its creation is slow."""
     return ThreadpoolController()
 
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Context manager that limits BLAS to one thread: on narrow bands several gain nothing
-    and wait for each other.
+    """Limit BLAS to one thread within the block, or within a function that this decorates: on
+    narrow bands several gain nothing and wait for each other.
     """
     with _controller().limit(limits=1, user_api="blas"):
         yield
@@ -58,7 +58,8 @@ def cholesky_in_place(band: NDArray[np.float64]) -> bool:
     Parameters
     ----------
     band : (half-bandwidth + 1, n) Fortran-ordered array
-        Lower band, diagonal first; overwritten by the factor.
+        Lower band, diagonal first; overwritten by the factor, or by meaningless values if the
+        matrix is not positive definite.
     """
     rows, columns = band.shape
     lower = ctypes.c_char(b"L")

@@ -28,7 +28,7 @@ class EntryBlock(NamedTuple):
 
     @property
     def count(self) -> int:
-        """Number of entries."""
+        """Number of entries: the size of the broadcast arrays."""
         return int(
             np.prod(
                 np.broadcast_shapes(*map(np.shape, (*self.rows, *self.columns)))
@@ -36,7 +36,7 @@ class EntryBlock(NamedTuple):
         )
 
     def indices(self) -> tuple[Index, Index]:
-        """Return row and column index of each entry, flat."""
+        """Return row and column index of each entry, flat, in C order of the broadcast arrays."""
         rows, columns = np.broadcast_arrays(sum(self.rows), sum(self.columns))
         return rows.ravel(), columns.ravel()
 
@@ -73,13 +73,14 @@ class SparseAssembly:
         shape: tuple[int, int],
         groups: Iterable[tuple[Index, Index]],
     ) -> SparseAssembly:
-        """Add groups of entries to a structure; entries may exist already, or belong to several
-        groups.
+        """Add groups of entries to a structure; entries may exist already, belong to several
+        groups, or occur repeatedly in one.
 
         Parameters
         ----------
         structure : (array, array)
-            Column pointers and ascending row indices of the first columns.
+            Column pointers and ascending row indices of the first columns; the other columns are
+            empty.
         shape : (int, int)
             Rows and columns of the complete matrix.
         groups : iterable of (array, array)
@@ -106,11 +107,11 @@ class SparseAssembly:
         return cls(
             np.concatenate([[0], np.cumsum(counts)]),
             all_indices,
-            None
+            initial_positions=None
             if is_initial[: len(indices)].all()
             else np.flatnonzero(is_initial),
-            tuple(own[each] for each in group_indices),
-            tuple(
+            group_positions=tuple(own[each] for each in group_indices),
+            has_duplicates=tuple(
                 bool(np.bincount(each, minlength=1).max() > 1)
                 for each in group_indices
             ),
@@ -118,12 +119,12 @@ class SparseAssembly:
 
     @property
     def structure(self) -> tuple[Index, Index]:
-        """Column pointers and row indices."""
+        """Column pointers and row indices of the complete matrix."""
         return self.indptr, self.indices
 
     def positions_of(self, positions: Index) -> Index:
-        """Return the positions of values of the initial structure, given by their positions
-        there.
+        """Return the positions among all values of values of the initial structure, given by their
+        positions there.
         """
         return (
             positions
@@ -132,14 +133,16 @@ class SparseAssembly:
         )
 
     def allocate(self, out: Array | None, count: int) -> tuple[Array, Array]:
-        """Return arrays for all values, and for the `count` values of the initial structure.
+        """Return arrays for all values, and for the `count` values of the initial structure;
+        `assemble` completes them.
 
-        The second array is a view of the first where possible. Neither is initialised.
+        The second array is a view of the first where the initial values come first in their order.
+        Neither is initialised.
 
         Parameters
         ----------
         out : array or None
-            Used for all values if given.
+            Used for all values if given, and returned.
         count : int
             Number of values of the initial structure.
         """
@@ -189,13 +192,13 @@ def _locate(
         Column pointers and row indices.
     height : int
         Number of rows of the complete matrix.
-    codes : array
+    codes : (c,) array
         Column · height + row of the entries, ascending.
 
     Returns
     -------
-    (array, array of bool)
-        Number of entries of the structure before each, and whether it is absent.
+    ((c,) array, (c,) array of bool)
+        Number of entries of the structure before each, and whether it is absent from the structure.
     """
     indptr, indices = structure
     if not len(codes) or codes[0] >= (len(indptr) - 1) * height:

@@ -23,7 +23,7 @@ from ...errors import InputError
 
 # Type of a real symmetric positive definite matrix in PARDISO.
 POSITIVE_DEFINITE = 2
-# Phases, and the error that tells that a pivot is not positive.
+# Phase of PARDISO: symbolic analysis.
 ANALYSE = 11
 # Numerical factorisation.
 FACTORISE = 22
@@ -35,7 +35,7 @@ RELEASE = -1
 NOT_POSITIVE = -4
 # Error of missing memory.
 NO_MEMORY = -2
-# Places in `iparm`.
+# Place in the options `iparm` of the number of entries of the factor.
 COUNTED = 17
 # Place of the flag for indices that count from zero.
 FROM_ZERO = 34
@@ -73,7 +73,8 @@ def load_mkl() -> Any:
 
 
 class Pardiso:
-    """Memory of one factor in PARDISO; each factorisation replaces the one before.
+    """Memory of one factor in PARDISO; each factorisation replaces the one before. It is released
+    when the object is deleted.
 
     Attributes
     ----------
@@ -112,14 +113,23 @@ class Pardiso:
         self.factor_size = int(self._options[COUNTED])
 
     def factorise(self, values: Array) -> bool:
-        """Factorise the values of the upper triangle and return whether the matrix is
+        """Factorise the values of the upper triangle, row by row, and return whether the matrix is
         positive definite.
+
+        Raises
+        ------
+        MemoryError
+            If there is no memory for the factor.
+        numpy.linalg.LinAlgError
+            If PARDISO fails for another reason.
         """
         self._values = np.ascontiguousarray(values, dtype=float)
         return self._call(FACTORISE) != NOT_POSITIVE
 
     def solve(self, right: Array) -> Array:
-        """Solve for right-hand sides (n,) or (n, m)."""
+        """Return the solution for right-hand sides (n,) or (n, m) by the last factorisation, which
+        must have succeeded.
+        """
         columns = np.array(right, dtype=float, order="F")
         result = np.empty_like(columns)
         if columns.size:
@@ -132,7 +142,14 @@ class Pardiso:
         right: Array | None = None,
         result: Array | None = None,
     ) -> int:
-        """Call one phase of PARDISO and return its error code.
+        """Call one phase of PARDISO and return its error code, 0 or `NOT_POSITIVE`.
+
+        Parameters
+        ----------
+        phase : int
+            The phase, such as `FACTORISE`.
+        right, result : (n,) or (n, m) arrays, optional
+            Right-hand sides, and their solutions, which are overwritten; for `SOLVE` alone.
 
         Raises
         ------
@@ -181,7 +198,9 @@ class Pardiso:
 
 
 def _pointer(array: NDArray[Any] | None) -> ctypes.c_void_p | None:
-    """Return a pointer to the data of an array, or None."""
+    """Return a pointer to the data of an array, which must be kept alive by the caller; None for
+    None.
+    """
     return None if array is None else ctypes.c_void_p(array.ctypes.data)
 
 
@@ -204,7 +223,7 @@ class SupernodalFactor:
     positive_definite: bool = True
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Solve for right-hand sides (k,) or (k, m); the matrix is symmetric, so
+        """Return the solution for right-hand sides (n,) or (n, m); the matrix is symmetric, so
         `transposed` has no effect.
         """
         return self.pardiso.solve(right)

@@ -31,23 +31,25 @@ from ..depth.surface_correspondences import (
 BETTER = 0.01
 # The clock leaves its sample when its shift differs by more than this [samples].
 SAMPLES_OFF = 1.0
-# A place that has left the surface across the same edge so often stays in its plane.
-AGAIN = 2
-# Edges nearer than this are the same, relative to the mean edge length.
-SAME = 1e-6
+# Number of times in succession that a place may leave the surface across the same edge; after that
+# it stays in its plane.
+LARGEST_CROSSING_COUNT = 2
+# Distance below which edges are the same, relative to the mean edge length.
+SAME_EDGE_DISTANCE = 1e-6
 
 
 class ShapeFunctions(NamedTuple):
-    """Weights of the nodes in the place of each marker, and their derivatives by its φ.
+    """Weights of the npe nodes of an element in the place of each marker, and their derivatives by
+    the k coordinates of the place, which are in prior standard deviations.
 
     Attributes
     ----------
     weights : (M, npe) array
         Shape functions, npe being the nodes per element.
     gradients : (M, npe, k) array
-        First derivatives.
+        First derivatives; zero for exact places.
     hessians : (M, npe, k, k) array
-        Second derivatives.
+        Second derivatives; zero for exact places.
     """
 
     weights: Array
@@ -119,15 +121,15 @@ class MarkerAssociation:
         chart = cls(
             body,
             sigma_m,
-            points,
-            markers.on_surface,
-            placement.nodes,
-            placement.weights,
-            np.zeros(len(points), dtype=np.int64),
-            points,
-            np.zeros((len(points), 3, k)),
-            np.full((len(points), 2, 3), np.nan),
-            np.zeros(len(points), dtype=np.int64),
+            prior_places_m=points,
+            on_surface=markers.on_surface,
+            nodes=placement.nodes,
+            weights=placement.weights,
+            cells=np.zeros(len(points), dtype=np.int64),
+            centre_places_m=points,
+            axes=np.zeros((len(points), 3, k)),
+            crossed_edges=np.full((len(points), 2, 3), np.nan),
+            crossing_counts=np.zeros(len(points), dtype=np.int64),
             correspondences=initial_correspondences(experiment),
         )
         return chart.centred_at(points)
@@ -136,7 +138,9 @@ class MarkerAssociation:
     def from_exact_places(
         cls, body: Body, placement: Placement, points_m: Array
     ) -> MarkerAssociation:
-        """Return the association for places (M, 3) [m] that are not estimated."""
+        """Return the association for places (M, 3) [m] that are not estimated, with the nodes and
+        weights of `placement`, and k = 3 coordinates without effect.
+        """
         count = len(points_m)
         none = np.zeros(count, dtype=np.int64)
         return cls(
@@ -154,8 +158,8 @@ class MarkerAssociation:
         )
 
     def matches(self, experiment: Experiment) -> bool:
-        """Whether the association belongs to the experiment's body, and has the same priors and
-        cameras.
+        """Return whether the association belongs to the experiment's body (the same object), and
+        has the same priors and cameras.
         """
         return (
             self.body is experiment.body
@@ -187,7 +191,7 @@ class MarkerAssociation:
 
     def places_m(self, phi: Array) -> Array:
         """Return the places (M, 3) on the undeformed body [m] for coordinates `phi` (M, k) in prior
-        standard deviations along `axes`.
+        standard deviations along `axes`, linear about the centre; exact places do not move.
         """
         moved = np.einsum(
             "mik,mk->mi", self.axes, phi - self.centre_coordinates
@@ -197,6 +201,9 @@ class MarkerAssociation:
     def shape_functions(self, phi: Array) -> tuple[Index, ShapeFunctions]:
         """Return the nodes (M, npe) of each marker's element, and their shape functions at its
         place with derivatives by the k coordinates of the place.
+
+        The element is that of the association, also if the place is outside; exact places have
+        their stated nodes and weights.
 
         Parameters
         ----------
@@ -227,7 +234,7 @@ class MarkerAssociation:
                 gradients,
                 gradients,
             )
-        return nodes, ShapeFunctions(weights, slopes, curvatures)
+        return nodes, ShapeFunctions(weights, slopes, hessians=curvatures)
 
     @cached_property
     def _shape(self) -> LocatedBody:
@@ -238,8 +245,10 @@ class MarkerAssociation:
 
     def centred_at(self, points_m: Array) -> MarkerAssociation:
         """Return the association with its centre at places (M, 3) [m] of the estimated markers:
-        their elements, and the axes along which the places may move. With `on_surface` the centres
-        are the nearest points of the surface.
+        their elements, and the axes along which the places may move.
+
+        With `on_surface` the centres are the nearest points of the surface. Exact places are
+        centred at the points too, but keep their nodes and weights.
         """
         points = points_m.copy()
         cells = self.cells.copy()
@@ -259,10 +268,13 @@ class MarkerAssociation:
     ) -> tuple[MarkerAssociation, Array]:
         """Return an association for estimates that have left this one, and φ in it.
 
+        If a place has left its element, all centres are moved to the estimates. The clock is moved
+        if its shift differs by more than `SAMPLES_OFF`.
+
         Parameters
         ----------
         phi : (M, k) array
-            Coordinates of the places.
+            Coordinates of the places, in prior standard deviations along `axes`.
         shift_samples : float
             Shift of the clock over the sample interval.
 
@@ -292,11 +304,12 @@ class MarkerAssociation:
         return chart, chart.centre_coordinates
 
     def _without_alternation(self, points_m: Array) -> MarkerAssociation:
-        """Return the association about places (M, 3) [m] such that none alternates between two
+        """Return the association centred at places (M, 3) [m] such that none alternates between two
         faces for ever.
 
-        Where a marker stands off an edge, the plane of each face may lead back to the other. Such a
-        place stays in one of the planes, even outside the surface.
+        Where a marker stands off an edge, the plane of each face may lead back to the other. A
+        place that has crossed the same edge `LARGEST_CROSSING_COUNT` times stays in its present
+        plane, even outside the surface.
         """
         centred = self.centred_at(points_m)
         if not self.on_surface:
@@ -306,17 +319,18 @@ class MarkerAssociation:
         cells = centred.cells.copy()
         crossed = self.crossed_edges.copy()
         again = self.crossing_counts.copy()
-        same_m = SAME * self._shape.mean_edge_m
+        same_m = SAME_EDGE_DISTANCE * self._shape.mean_edge_m
         for m in self.estimated:
             beyond = points_m[m] - points[m]
-            if again[m] < AGAIN and np.linalg.norm(beyond) > same_m:
+            is_free = again[m] < LARGEST_CROSSING_COUNT
+            if is_free and np.linalg.norm(beyond) > same_m:
                 edge = np.cross(np.cross(*self.axes[m].T), beyond)
                 off_m = np.linalg.norm(
                     np.cross(points[m] - crossed[m, 0], crossed[m, 1])
                 )
                 again[m] = again[m] + 1 if off_m < same_m else 0
                 crossed[m] = points[m], edge / np.linalg.norm(edge)
-            if again[m] == AGAIN:
+            if again[m] == LARGEST_CROSSING_COUNT:
                 points[m] = points_m[m]
                 axes[m] = self.axes[m]
                 cells[m], _ = self._shape.nearest_cell(points_m[m])
@@ -330,13 +344,14 @@ class MarkerAssociation:
         )
 
     def _is_outside(self, point: Array, cell: int) -> bool:
-        """Whether another element contains a point (3,) of the undeformed body better than the
-        element with index `cell`, by more than `BETTER`; false for NaN.
+        """Return whether another element contains a point (3,) of the undeformed body better than
+        the element with index `cell`, by more than `BETTER` in the smallest barycentric coordinate;
+        false for NaN.
         """
         if not np.isfinite(point).all():
             return False
         if self._shape.barycentric(point, np.array([cell])).min() >= 0:
-            return False  # none holds it better
+            return False  # no other element contains it better
         best, _ = self._shape.nearest_cell(point)
         depth = self._shape.barycentric(
             np.stack([point, point]), np.array([cell, best])
@@ -344,10 +359,10 @@ class MarkerAssociation:
         return bool(depth[1] > depth[0] + BETTER)
 
     def places_of_points(self, nodes_m: Array, points_m: Array) -> Array:
-        """Return the places (M, 3) on the undeformed body of points (M, 3) measured in another
+        """Return the places (M, 3) on the undeformed body of points measured in another
         configuration.
 
-        A point outside the body is projected onto its surface.
+        A point outside the body gets the place of the nearest point of its surface.
 
         Parameters
         ----------
@@ -371,7 +386,9 @@ class MarkerAssociation:
 
 
 def _second_derivatives(element, local: Array) -> Array:
-    """Return ∂²N/∂L² (m, npe, 4, 4) of shape functions whose gradients are linear in L."""
+    """Return ∂²N/∂L² (m, npe, 4, 4) by barycentric coordinates L (m, 4) of the shape functions of
+    an element type, whose gradients must be linear in L.
+    """
     at = element.shape_gradients(local)
     steps = [element.shape_gradients(local + unit) - at for unit in np.eye(4)]
     return np.stack(steps, axis=3)

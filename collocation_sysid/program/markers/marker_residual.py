@@ -44,10 +44,10 @@ class MarkerResidual(MeasurementResidual):
     markers : Markers
         Measured tracks.
     is_initially_at_rest : bool
-        Whether the body rests in its first state before the first time; then a shifted marker is
-        predicted there, otherwise such samples are not compared.
+        Whether the body rests in its first state before the first time; then a marker of an earlier
+        time is predicted there, otherwise such samples are not compared.
     preceding_times : int
-        Number of the channel's times before the first sample.
+        Number of the observable's times before the first sample.
     """
 
     observable: PointPositions
@@ -117,7 +117,9 @@ class MarkerResidual(MeasurementResidual):
 
     @property
     def sample_rows(self) -> Index:
-        """Grid time (T,) of each sample."""
+        """Grid times of the observable: without `preceding_times`, the grid time (T,) of each
+        sample.
+        """
         return self.observable.rows
 
     @property
@@ -134,7 +136,7 @@ class MarkerResidual(MeasurementResidual):
 
     @property
     def _sample_indices(self) -> Index:
-        """Index (T,) of each sample among the channel's times."""
+        """Index (T,) of each sample among the observable's times."""
         return self.preceding_times + np.arange(len(self.t_s))
 
     @cached_property
@@ -148,8 +150,8 @@ class MarkerResidual(MeasurementResidual):
 
     @cached_property
     def _first_neighbour(self) -> Index:
-        """Index (T,) of the first sample that each one is interpolated from; negative
-        before the start.
+        """Index (T,) of the first of the observable's times from which each sample is interpolated;
+        negative before the start, where the body rests in its first state.
         """
         first = (
             self._sample_indices
@@ -168,8 +170,8 @@ class MarkerResidual(MeasurementResidual):
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all samples: indices of the neighbouring places, and the data of the
-        expression.
+        """Stencil of all samples; its data are the position of the sample among its neighbours, in
+        samples, and the sample's time [s].
         """
         count = len(self.markers.names)
         place = np.array(
@@ -191,8 +193,8 @@ class MarkerResidual(MeasurementResidual):
         )
 
     def shifted(self, by_s: float) -> MarkerResidual:
-        """Return the model of samples taken `by_s` seconds later, at the same stencil; self if the
-        expression does not depend on time.
+        """Return the model of samples taken `by_s` seconds later, with the same stencil and
+        measurements; self if the expression does not depend on time.
         """
         if not self._full_expression.residual.depends_on_datum(1):
             return self
@@ -225,19 +227,23 @@ class MarkerResidual(MeasurementResidual):
         reading = values[:, 0]
         if len(self.nuisance.clock_indices):
             late = (
-                self.nuisance.marker_delay_s(phi, own, t_s)
+                self.nuisance.marker_delay_s(phi, own, t_s=t_s)
                 / self.nuisance.interval_s
             )
             places = [ca.SX(k) for k in range(self._neighbour_count)]
             reading = values @ ca.vertcat(
                 *lagrange_weights(place + late, places)
             )
-        return self.nuisance.marker_measurement(reading, phi, own, t_s)
+        return self.nuisance.marker_measurement(
+            reading, phi, places=own, t_s=t_s
+        )
 
     # Of positions -----------------------------------------------------------------------------
 
     def predict_samples(self, positions_m: Array, phi: Array) -> Array:
-        """Return predictions (T, M, 3) [m] from the body's positions (T, n, 3) at the samples."""
+        """Return predictions (T, M, 3) [m] at φ (k,) from the body's positions (T, n, 3) [m] at the
+        samples.
+        """
         plain = replace(
             self,
             observable=replace(
@@ -249,14 +255,15 @@ class MarkerResidual(MeasurementResidual):
         )
 
     def predict_positions(self, x: Array, phi: Array) -> Array:
-        """Return predictions (t, M, 3) [m] from the first grid positions x (rows, 3n), for
-        samples that they suffice for.
+        """Return predictions (t, M, 3) [m] at φ (k,) from the first grid positions x (rows, 3n)
+        [m], for the t samples that they suffice for.
         """
         return self.predict(self.observable.evaluate_positions(x, phi), phi)
 
     def squared_distances_m2(self, x: Array, phi: Array) -> Array:
-        """Return the squared distances [m²] of predictions from all samples that are present (P,),
-        at positions x (rows, 3n) and φ; samples after the last row are omitted.
+        """Return the squared distances [m²] of predictions at positions x (rows, 3n) and φ (k,)
+        from the P samples that are compared, flat, time by time; samples after the last row are
+        omitted.
         """
         predicted = self.predict_positions(x, phi)
         tracks = self.markers.positions_m[: len(predicted)]

@@ -20,7 +20,7 @@ from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from .natural_modes import natural_modes
 
-# Natural modes of the prediction.
+# Largest number of natural modes of the prediction.
 MODES = 20
 # Sag of the softest body, relative to its size.
 SOFTEST_SAG = 0.5
@@ -72,9 +72,10 @@ class DeclaredMotion:
 
     @classmethod
     def from_experiment(cls, experiment: Experiment) -> DeclaredMotion | None:
-        """Return the statements of an experiment for its first samples.
+        """Return the statements of an experiment for its first `MOST_SAMPLES` samples.
 
-        None if the experiment is static, or no single rigid motion carries the body at all times.
+        None if the experiment is static, or no single rigid motion carries the body at all times,
+        see `carrying_grasp`.
         """
         grasp = carrying_grasp(experiment)
         if grasp is None or experiment.is_static:
@@ -85,16 +86,25 @@ class DeclaredMotion:
         name = f"'{experiment.name}'"
         gravity_m_s2 = experiment.gravity_m_s2
         return cls(
-            t_s, rotations, translations, tracks, gravity_m_s2, name=name
+            t_s,
+            rotations,
+            translations_m=translations,
+            tracks_m=tracks,
+            gravity_m_s2=gravity_m_s2,
+            name=name,
         )
 
     def to_world(self, points_m: Array) -> Array:
-        """Return points (..., T, M, 3) of the grasp's frame in the world [m]."""
+        """Return points (..., T, M, 3) [m] of the grasp's frame in the world, with the pose of each
+        time [m].
+        """
         turned = np.einsum("tij,...tmj->...tmi", self.rotations, points_m)
         return turned + self.translations_m[:, None]
 
     def to_grasp_frame(self, points_m: Array) -> Array:
-        """Return points (T, M, 3) of the world in the grasp's frame [m]."""
+        """Return points (T, M, 3) [m] of the world in the grasp's frame, with the pose of each time
+        [m].
+        """
         return np.einsum(
             "tji,tmj->tmi",
             self.rotations,
@@ -104,8 +114,8 @@ class DeclaredMotion:
     def with_prior_motion(
         self, rotation: Array, translation_m: Array
     ) -> DeclaredMotion:
-        """Return the statements with a rigid motion C (rotation (3, 3), translation (3,) [m]) of
-        the body before the poses U: x → U(Cx).
+        """Return the statements with a rigid motion C (`rotation` (3, 3), `translation_m` (3,) [m])
+        of the body before the poses U: x → U(Cx).
         """
         shifted = self.translations_m + self.rotations @ translation_m
         return replace(
@@ -114,9 +124,10 @@ class DeclaredMotion:
 
 
 def carrying_grasp(experiment: Experiment) -> Grasp | None:
-    """Return the grasp that carries the body at all times, or None if there is none.
+    """Return the grasp that carries the body at all samples, or None if there is none.
 
-    It must prescribe all axes at all samples, and all other grasps must move with it.
+    It must prescribe all axes. All grasps that hold at some sample must hold at all of them and
+    have the same poses; of several, the first that prescribes all axes is returned.
     """
     holding = [
         grasp
@@ -139,7 +150,7 @@ def carrying_grasp(experiment: Experiment) -> Grasp | None:
 
 @dataclass(frozen=True, eq=False)
 class ModalResponse:
-    """Natural modes of a body in its grasp, evaluated at its markers.
+    """Natural modes of a body in its grasp, evaluated at its M markers.
 
     Attributes
     ----------
@@ -148,7 +159,7 @@ class ModalResponse:
     relative_frequencies : (K,) array
         Angular frequencies relative to the lowest.
     shapes : (K, M, 3) array
-        Displacements of the markers.
+        Displacements of the markers, for modes with φᵀ M φ = 1 kg.
     translation_loads : (K, 3) array
         Modal loads φᵀM of a uniform acceleration.
     rotation_loads : (K, 3, 3) array
@@ -171,7 +182,15 @@ class ModalResponse:
     def from_experiment(
         cls, experiment: Experiment, constants: Mapping[str, float]
     ) -> ModalResponse:
-        """Compute the modes of an experiment; only ratios of the constants matter."""
+        """Compute the modes of an experiment in the grasp and under the loads of its first time.
+
+        Parameters
+        ----------
+        experiment : Experiment
+            The experiment.
+        constants : mapping of str to float
+            Constants of the body by name; only their ratios matter.
+        """
         body = experiment.body
         markers = experiment.markers
         forces = Forces.from_experiment(
@@ -185,18 +204,20 @@ class ModalResponse:
         return cls(
             markers.predict_positions(body.nodes_m),
             omega / omega[:1],
-            markers.predict_positions(modes.shapes),
-            weighted.sum(axis=1),
-            np.einsum("kni,nj->kij", weighted, body.nodes_m),
-            float(np.linalg.norm(np.ptp(body.nodes_m, axis=0))),
-            experiment.start == "equilibrium",
+            shapes=markers.predict_positions(modes.shapes),
+            translation_loads=weighted.sum(axis=1),
+            rotation_loads=np.einsum("kni,nj->kij", weighted, body.nodes_m),
+            size_m=float(np.linalg.norm(np.ptp(body.nodes_m, axis=0))),
+            is_initially_at_rest=experiment.start == "equilibrium",
         )
 
     def predict(self, declared: DeclaredMotion) -> Array:
         """Return predictions (S, T, M, 3) [m] of the markers for S combinations of stiffness and
-        damping, the last for a rigid body; NaN beyond the range of a delayed track.
+        damping, the last for a rigid body.
 
-        Displacements are limited to the size of the body.
+        The damping ratios of `DAMPING_RATIOS` are tried one after the other, each with
+        `STIFFNESSES` stiffnesses in ascending order. Displacements are limited to the size of the
+        body. Predictions are NaN beyond the range of a delayed track.
         """
         scale = declared.mesh_scale
         loads = self._modal_loads(declared)
@@ -215,7 +236,7 @@ class ModalResponse:
         q = np.concatenate([*states, np.zeros((1, *loads.shape))])
         swayed = np.tensordot(q, self.shapes, axes=1)
         limit = scale * self.size_m
-        # Small strains are assumed: what sways farther than the body is long, stays there.
+        # Small strains are assumed: larger displacements than the size of the body are meaningless.
         relative_size = np.linalg.norm(swayed, axis=3, keepdims=True) / limit
         predictions = declared.to_world(
             scale * self.places_m + swayed / np.maximum(relative_size, 1.0)
@@ -227,8 +248,8 @@ class ModalResponse:
         )
 
     def _frequencies(self, scale: float) -> Array:
-        """Return the angular frequencies (S, K) [rad/s] of the assumed stiffnesses for a
-        mesh scale.
+        """Return the angular frequencies (`STIFFNESSES`, K) [rad/s] of the assumed stiffnesses,
+        ascending, for a mesh scale.
         """
         softest = np.sqrt(
             STANDARD_GRAVITY_M_S2 / (SOFTEST_SAG * scale * self.size_m)
@@ -259,8 +280,8 @@ class ModalResponse:
 
 
 def delayed_tracks(predictions: Array, t_s: Array, lag_s: float) -> Array:
-    """Return predictions (S, T, M, 3) delayed by `lag_s` (linear interpolation); NaN beyond
-    their range.
+    """Return predictions (S, T, M, 3) at uniform times `t_s` (T,) [s] delayed by `lag_s` [s], by
+    linear interpolation; NaN beyond their range.
     """
     at = np.arange(len(t_s)) - lag_s / (t_s[1] - t_s[0])
     low = np.clip(np.floor(at).astype(int), 0, len(t_s) - 2)
@@ -273,8 +294,8 @@ def delayed_tracks(predictions: Array, t_s: Array, lag_s: float) -> Array:
 
 
 def _second_differences(x: Array, step_s: float) -> Array:
-    """Return second differences of (T, ...) over the step; the motion is at rest before the
-    first sample.
+    """Return second differences of (T, ...) over the step [1/s²]; the motion is symmetric in time
+    about the first sample, so that its velocity there is zero, and the last value is repeated.
     """
     padded = np.concatenate([x[1:2], x, x[-1:]])
     second = (padded[2:] - 2 * padded[1:-1] + padded[:-2]) / step_s**2

@@ -55,15 +55,15 @@ class Modes:
 
     @property
     def angular_frequencies_rad_s(self) -> Array:
-        """Angular frequencies ω (k,)."""
+        """Undamped angular frequencies ω (k,) [rad/s]."""
         return 2 * np.pi * self.frequencies_hz
 
 
 def natural_modes(
     forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
 ) -> Modes:
-    """Return the lowest modes of a body about a state; those without restoring force are left out
-    and counted in `omitted_count`.
+    """Return the lowest modes of a body about a state; those without restoring force (ω² not
+    positive beyond rounding) are left out and counted in `omitted_count`.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def natural_modes(
             stiffness,
             mass,
             factor=factor,
-            translation_m=-SHIFT * largest,
+            shift_1_s2=-SHIFT * largest,
             requested=requested,
         )
     oscillating = squares > RIGID * largest
@@ -125,7 +125,15 @@ def _dense_modes(
 
 
 class _ShiftedInverse(LinearOperator):
-    """Operator (K − shift · M)⁻¹ of a factorised matrix."""
+    """Operator (K − shift · M)⁻¹ of a factorised matrix.
+
+    Parameters
+    ----------
+    factor : Factor
+        Factor of K − shift · M.
+    size : int
+        Number of rows n.
+    """
 
     def __init__(self, factor: Factor, size: int) -> None:
         super().__init__(np.dtype(float), (size, size))
@@ -139,7 +147,7 @@ def _lanczos_modes(
     stiffness: sp.csc_array,
     mass: Array,
     factor: Factor,
-    translation_m: float,
+    shift_1_s2: float,
     requested: int,
 ) -> tuple[Array, Array]:
     """Return the `requested` eigenvalues [1/s²] and eigenvectors (n, k) of K φ = λ M φ nearest to a
@@ -148,19 +156,21 @@ def _lanczos_modes(
     Parameters
     ----------
     stiffness : sparse (n, n)
+        Stiffness K [N/m].
     mass : (n,) array
-        Diagonal of M.
+        Diagonal of M [kg].
     factor : Factor
         Factor of K − shift · M.
-    translation_m : float
+    shift_1_s2 : float
         The shift, just below zero [1/s²].
     requested : int
+        Number of eigenvalues, less than n.
     """
     squares, vectors = eigsh(
         stiffness,
         requested,
         M=sp.diags_array(mass, format="csc"),
-        sigma=translation_m,
+        sigma=shift_1_s2,
         OPinv=_ShiftedInverse(factor, len(mass)),
         v0=np.random.default_rng(0).normal(size=len(mass)),
     )

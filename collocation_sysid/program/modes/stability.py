@@ -65,14 +65,18 @@ class Instability:
 def find_instabilities(
     collocation: Collocation, z: Array
 ) -> tuple[Instability, ...]:
-    """Return the instabilities of the motions at z, at most one for each experiment."""
+    """Return the instabilities of the motions at z, at most one for each fitted experiment, in
+    their order; experiments whose examined states are stable have none.
+
+    Up to `STATES` samples of each experiment are examined.
+    """
     unstable = (_instability(part) for part in collocation.iterates(z))
     return tuple(each for each in unstable if each is not None)
 
 
 def _instability(iterate: ExperimentIterate) -> Instability | None:
-    """Return the instability of one experiment's motion, or None if all examined states are
-    stable.
+    """Return the instability of one experiment's motion, or None if all examined states (up to
+    `STATES` samples) are stable.
     """
     experiment = iterate.segment.experiment
     last = len(experiment.t_s) - 1
@@ -147,8 +151,19 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
 def _is_definite(
     lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array
 ) -> bool:
-    """Whether a matrix on the free dofs, given by its lower triangle, is positive semidefinite up
-    to rounding relative to `mass` (free,); true for zero.
+    """Return whether a matrix on the free dofs is positive semidefinite up to rounding; true for a
+    matrix with a zero diagonal.
+
+    Parameters
+    ----------
+    lower : (m,) array
+        Lower triangle of the complete matrix.
+    pattern : SymmetricPattern
+        Its pattern.
+    free_dofs : (k,) array
+        Sorted dofs that are not prescribed.
+    mass : (k,) array
+        Their masses [kg], the unit of rounding errors.
     """
     own = pattern.diagonal[free_dofs]
     largest = float((lower[own] / mass).max())
@@ -165,7 +180,7 @@ def _is_definite(
 
 def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
     """Return the largest Re(s) [1/s] of the exponents s of s² + D s + K, for mass-normalised
-    matrices (n, n).
+    matrices (n, n); for large matrices at least 0.
     """
     size = len(stiffness.diagonal())
     if size <= DENSE:
@@ -183,8 +198,8 @@ def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
 
 
 def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
-    """Return directions (n, k) with the smallest eigenvalues of a matrix; if the iteration stops
-    early, those that have converged and the start vector.
+    """Return vectors (n, `DIRECTIONS`) with the smallest eigenvalues of a symmetric matrix; if the
+    iteration stops early, those that have converged and the start vector.
     """
     start = np.random.default_rng(0).normal(size=len(matrix.diagonal()))
     options = {
@@ -200,7 +215,7 @@ def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
 
 
 def _exponents(stiffness: Array, damping: Array) -> NDArray[np.complex128]:
-    """Return all s of s² + D s + K for dense matrices."""
+    """Return all 2n complex s with det(s² + D s + K) = 0, for dense matrices (n, n)."""
     size = len(stiffness)
     chain = np.block(
         [[np.zeros((size, size)), np.eye(size)], [-stiffness, -damping]]

@@ -1,8 +1,8 @@
 """Reaction forces of instrumented grasps, one time step after the other.
 
 The reaction is the residual of the equations of motion at the grasped dofs (see
-`program.wrench.reaction_forces`). It is available one time step late: the midpoint rule evaluates forces
-between two steps, and the acceleration of a tool needs the next pose.
+`program.wrench.reaction_forces`). It is available one time step late: the midpoint rule evaluates
+forces between two steps, and the acceleration of a tool needs the next pose.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class StreamedWrench(GraspWrench):
     rotations : (n + 2, 3, 3)
         Rotations of the poses, with one more time step on either side.
     shifts : (n + 2, 3)
-        Translations of the poses.
+        Translations of the poses [m].
     step_s : float
-        Time step.
+        Time step [s].
     """
 
     rotations: Array
@@ -59,7 +59,8 @@ class StreamedWrench(GraspWrench):
         Parameters
         ----------
         channel : GraspWrench
-            Wrench in the still recording, whose other properties are copied.
+            Wrench in the still recording, whose other properties are copied; generated functions
+            are shared.
         rotations : (n + 2, 3, 3)
             Rotations of the grasp at these steps, and at the ones before and after.
         shifts : (n + 2, 3)
@@ -83,7 +84,7 @@ class StreamedWrench(GraspWrench):
 
     def poses_at(self, rows: Index) -> tuple[Array, Array]:
         """Return rotations (k, 3, 3) and translations (k, 3) [m] at k of the n time steps, given by
-        index (k,).
+        index (k,) from 0.
         """
         return self.rotations[1 + rows], self.shifts[1 + rows]
 
@@ -132,13 +133,15 @@ class GraspReactions:
         return cls(
             GraspForces.zeros(rows, dofs, columns),
             moved,
-            rotations,
-            rotations[..., 0].copy(),
+            rotations=rotations,
+            shifts=rotations[..., 0].copy(),
         )
 
     @property
     def arrays(self) -> tuple[Array, ...]:
-        """All arrays whose first axis is the row."""
+        """All arrays whose first axis is the row, not copied: forces and their changes, columns,
+        rotations and translations.
+        """
         return (
             self.forces.force,
             self.forces.changes,
@@ -148,7 +151,10 @@ class GraspReactions:
         )
 
     def copy(self) -> GraspReactions:
-        """Return a copy that can be modified."""
+        """Return a copy that can be modified.
+
+        All arrays are copied.
+        """
         force, slopes, *others = (each.copy() for each in self.arrays)
         return GraspReactions(GraspForces(force, slopes), *others)
 
@@ -193,7 +199,8 @@ class GraspReactions:
         step : (m,)
             Change of the parameters of the columns.
         grown : (1 + m,)
-            Factors of the columns, whose parameters change their scale.
+            Factors by which the columns are multiplied afterwards, because the unit of their
+            parameters changes.
         """
         force = self.forces.force + self.forces.changes[..., 1:] @ step
         grasp_forces = GraspForces(force, self.forces.changes * grown)
@@ -257,14 +264,14 @@ class GraspReactions:
         by = mass_kg[:, None] * np.tensordot(
             of_x, position_slopes, 1
         ) - np.tensordot(of_force, slopes, 1)
-        by += setting.inertia_derivatives(0, acceleration, dofs)
+        by += setting.inertia_derivatives(0, acceleration, dofs=dofs)
         pose_rows = slice(at[0] - 1, at[-1] + 2)
         channels = [
             StreamedWrench.from_poses(
                 channel,
                 self.rotations[pose_rows, grasp],
-                self.shifts[pose_rows, grasp],
-                dynamics.step_s,
+                shifts=self.shifts[pose_rows, grasp],
+                step_s=dynamics.step_s,
             )
             for channel, grasp in sensors
         ]

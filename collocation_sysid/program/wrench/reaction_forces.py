@@ -36,7 +36,8 @@ def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:
     Returns
     -------
     ((N,) array of bool, int)
-        Mask of the rows, and the number of grid times by which the reaction force precedes its row.
+        Mask of the rows, and the number of grid times by which the reaction force precedes its row;
+        0 if there is no such row.
     """
     t = dynamics.tables
     lags = np.arange(dynamics.largest_lag + 1.0)
@@ -75,7 +76,7 @@ class GraspForces:
         return cls(np.zeros((rows, dofs)), np.zeros((rows, dofs, columns)))
 
     def copy_first_rows(self, known: GraspForces) -> None:
-        """Copy the first rows from `known`, in place."""
+        """Copy the rows of `known`, which may be fewer, into the first rows, in place."""
         done = len(known.force)
         self.force[:done] = known.force
         self.changes[:done] = known.changes
@@ -87,9 +88,24 @@ def forces_on_dofs(
     dofs: Index,
     histories: Sequence[AnyHistory] = (),
 ) -> Array:
-    """Return the forces F (N, g) [N] on dofs (g,) at the evaluations of x (N, 3n) [m], including
-    those on prescribed dofs; zero before the first equation of motion. Internal variables are
-    computed from x where `histories` is empty.
+    """Return the forces F (N, g) [N] on selected dofs at the evaluations, including those on
+    prescribed dofs.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Equations of motion of the N rows of x.
+    x : (N, 3n) array
+        Positions [m].
+    dofs : (g,) array
+        Selected dofs.
+    histories : sequence of histories
+        History variables at x; computed from x if it is empty.
+
+    Returns
+    -------
+    (N, g) array
+        Forces; zero in rows before the first equation of motion.
     """
     force = np.zeros((len(x), len(dofs)))
     force[dynamics.first_row :] = dynamics.force(x, histories)[:, dofs]
@@ -121,7 +137,7 @@ def reaction_changes(
     force_changes: Array,
     position_changes: Array,
 ) -> Array:
-    """Return the changes dR (N, g, columns) of reaction forces.
+    """Return the changes dR (N, g, columns) of reaction forces at constant masses.
 
     Parameters
     ----------
@@ -130,9 +146,9 @@ def reaction_changes(
     mass_kg : (N, g) array
         Masses of the dofs [kg].
     force_changes : (N, g, columns) array
-        Changes dF of the forces.
+        Changes dF of the forces [N].
     position_changes : (N, g, columns) array
-        Changes of the positions of the dofs.
+        Changes of the positions of the dofs [m].
     """
     second = (
         dynamics.combine(dynamics.tables.s, position_changes)

@@ -45,7 +45,8 @@ from ..observables import (
 )
 from .reaction_forces import centred_rows
 
-# Numbers of Q, the grasp's turn and its rate, its shift from the sensor's point, and its rate.
+# Sizes of the data of the tool: the sensor's axes Q, the grasp's rotation and its second time
+# derivative, its translation from the sensor's origin, and the second derivative of that.
 TOOL_DATA = (9, 9, 9, 3, 3)
 
 
@@ -56,11 +57,11 @@ class ReactionGrid:
     Attributes
     ----------
     t_s : (N,) array
-        Evenly spaced times [s].
+        Evenly spaced times [s], unless `is_static`.
     has_reaction : (N,) array of bool
         Rows that determine a reaction force.
     delay_steps : int
-        Row t determines the reaction force at time t − late.
+        Row t determines the reaction force at grid time t − `delay_steps`.
     reach : int
         Row t depends on the grasp from time t − reach on.
     is_static : bool
@@ -76,7 +77,9 @@ class ReactionGrid:
 
     @classmethod
     def from_dynamics(cls, dynamics: Dynamics) -> ReactionGrid:
-        """Build the grid of discrete equations of motion."""
+        """Build the grid of discrete equations of motion, whose rows determine reaction forces as
+        `centred_rows` states.
+        """
         return cls(
             dynamics.t_s,
             *centred_rows(dynamics),
@@ -86,17 +89,19 @@ class ReactionGrid:
 
     @classmethod
     def from_times(cls, t_s: Array) -> ReactionGrid:
-        """Build the grid of reaction forces that are known at given times (N,) themselves."""
-        return cls(t_s, np.ones(len(t_s), dtype=bool), 0, 0)
+        """Build the grid of reaction forces that are known at given times (N,) [s] themselves,
+        without delay.
+        """
+        return cls(t_s, np.ones(len(t_s), dtype=bool), delay_steps=0, reach=0)
 
     @property
     def step_s(self) -> float:
-        """Mean time between rows [s]."""
+        """Mean time between rows [s]; 0 for a single row."""
         return float(self.t_s[-1] - self.t_s[0]) / max(1, len(self.t_s) - 1)
 
     def reaction_times(self, grasp: Grasp) -> Index:
-        """Return the indices of the grid times at which the reaction forces of a grasp are known:
-        it must hold at all times on which they depend.
+        """Return the indices of the grid times at which the reaction forces of a grasp are known,
+        ascending: the grasp must hold at all times on which they depend.
         """
         is_holding = grasp.is_active(self.t_s)
         rows = self.has_reaction & is_holding
@@ -158,12 +163,12 @@ class GraspWrench:
 
     @cached_property
     def known_rows(self) -> Index:
-        """Indices (n,) of the grid times whose wrench is known, consecutive."""
+        """Indices (n,) of the grid times whose wrench is known, ascending."""
         return self.reaction_grid.reaction_times(self.grasp)
 
     @property
     def count(self) -> int:
-        """Number n of times."""
+        """Number n of grid times whose wrench is known."""
         return len(self.known_rows)
 
     @cached_property
@@ -173,17 +178,19 @@ class GraspWrench:
 
     @property
     def rows(self) -> Index:
-        """All grid times, because accelerations are differences of positions."""
+        """Indices of all grid times, because accelerations are differences of positions."""
         return np.arange(len(self.reaction_grid.t_s))
 
     def operator(self, phi: Array) -> sp.csr_array:
-        """Return the matrix (g, 3n) that selects the sensed dofs of a row."""
+        """Return the matrix (g, 3n) that selects the sensed dofs of a row; φ is not used."""
         count = len(self.sensed_dofs)
         entries = np.ones(count), (np.arange(count), self.sensed_dofs)
         return sp.csr_array(entries, shape=(count, self.dof_count))
 
     def known_count(self, rows: int) -> int:
-        """Return how many of the times are known if the first `rows` grid rows are."""
+        """Return how many of the n times are known if the first
+        `rows` grid rows of the motion are.
+        """
         return int(
             np.count_nonzero(
                 self.known_rows + self.reaction_grid.delay_steps < rows
@@ -191,7 +198,9 @@ class GraspWrench:
         )
 
     def parameter_indices(self, row: NuisanceRow) -> Index:
-        """Return the indices in φ of this sensor's nuisance parameters of one kind."""
+        """Return the indices in φ of this sensor's nuisance parameters of one kind; empty if it has
+        none.
+        """
         return self.nuisance.indices_of_rows(row, component=self.sensor_index)
 
     @classmethod
@@ -251,7 +260,9 @@ class GraspWrench:
 
     @cached_property
     def frames(self) -> tuple[Array, Array]:
-        """Axes Q (n, 3, 3) and origins o (n, 3) [m] of the sensor."""
+        """Axes Q (n, 3, 3), one per column, and origins o (n, 3) [m] of the sensor in the world, at
+        the known times; constant unless `frame` is "grasp".
+        """
         rotations, shifts = self.poses_at(self.known_rows)
         if self.frame == "grasp":
             return rotations, shifts + rotations @ self.point_m
@@ -259,12 +270,14 @@ class GraspWrench:
         return axes, np.tile(self.point_m, (self.count, 1))
 
     def poses_at(self, rows: Index) -> tuple[Array, Array]:
-        """Return rotations (k, 3, 3) and translations (k, 3) [m] of the grasp at grid rows (k,)."""
+        """Return rotations (k, 3, 3) and translations (k, 3) [m] of the grasp at grid rows with
+        indices (k,).
+        """
         return self.grasp.poses.at(self.reaction_grid.t_s[rows])
 
     @cached_property
     def moment_data(self) -> Array:
-        """Data (15, n, h) of `MOMENT` for h nodes."""
+        """Data (15, n, h) of `MOMENT` for the h nodes of the grasp."""
         axes, points = self.frames
         nodes = len(self.is_prescribed) // 3
         of_time = np.concatenate([axes.reshape(-1, 9), points], axis=1).T
@@ -277,8 +290,9 @@ class GraspWrench:
         )
 
     def moment_inputs(self, reactions: ReactionForces) -> tuple[Array, Array]:
-        """Return inputs (6, n, h) and data of `MOMENT`, at the times that the reaction
-        forces cover.
+        """Return inputs (6, n, h), positions [m] and reaction forces [N], and data (15, n, h) of
+        `MOMENT` for the h nodes of the grasp, at the first n known times that the reaction forces
+        cover.
         """
         k = self.known_rows[: self.known_count(len(reactions.reaction))]
         both = (
@@ -295,22 +309,24 @@ class GraspWrench:
     def reaction_jacobians(
         self, reactions: ReactionForces
     ) -> tuple[Array, Array]:
-        """Return A and B (n, 6, d) of the change dW = A dR + B dx of the wrench without tool, with
-        the d dofs of the grasp.
+        """Return A and B (n, 6, d) of the change dW = A dR + B dx of the wrench without tool and
+        without low-pass, by the reaction forces and positions of the d dofs of the grasp.
         """
         by_u = MOMENT.evaluate_with_jacobian(*self.moment_inputs(reactions))[1]
         by_u = np.transpose(by_u, (2, 0, 3, 1))
         return _by_dof(by_u[..., 3:]), _by_dof(by_u[..., :3])
 
     def evaluate_without_tool(self, reactions: ReactionForces) -> Array:
-        """Return the wrench W (n, 6) without that of the tool [N, N m]."""
+        """Return the wrench W (n, 6) without that of the tool and without low-pass [N, N m]."""
         return MOMENT.evaluate(*self.moment_inputs(reactions)).sum(axis=2).T
 
     # The tool ---------------------------------------------------------------------------------
 
     @cached_property
     def tool_parameters(self) -> Index:
-        """Indices in φ of mass and centre of the tool and of gravity; empty without a tool."""
+        """Indices in φ of mass and centre of the tool and of gravity, as far as they are estimated;
+        empty if the tool's mass is not.
+        """
         if not len(mass := self.parameter_indices(TOOL_MASS)):
             return mass
         centre = self.parameter_indices(TOOL_CENTRE)
@@ -328,8 +344,8 @@ class GraspWrench:
         )
 
     def _tool_wrench(self, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Expression of the wrench (6,) of the tool in the sensor's axes [N, N m], from its
-        parameters φ and the data of `tool_inputs`.
+        """Return the expression of the wrench (6,) of the tool in the sensor's axes [N, N m], from
+        its parameters φ and the data of `tool_inputs`.
         """
         axes, turn, turn_rate, shift, shift_rate = ca.vertsplit(
             data, np.cumsum([0, *TOOL_DATA])
@@ -366,8 +382,11 @@ class GraspWrench:
         return phi[self.tool_parameters], data.T
 
     def pose_accelerations(self, count: int) -> tuple[Array, Array]:
-        """Return second time derivatives (n, 3, 3) and (n, 3) of the grasp's rotations and
-        translations, by differences; zero for static experiments.
+        """Return second time derivatives of the grasp's rotations (count, 3, 3) [1/s²] and
+        translations (count, 3) [m/s²] at the first `count` known times.
+
+        They are central differences over a grid step, at the ends of the poses those of the next
+        possible time; zero for static experiments and for fewer than three poses.
         """
         step_s = self.reaction_grid.step_s
         poses = self.grasp.poses
@@ -388,8 +407,8 @@ class GraspWrench:
     def evaluate_unfiltered(
         self, reactions: ReactionForces, phi: Array
     ) -> Array:
-        """Return the wrench W (n, 6) [N, N m] of reaction forces at φ including the tool, before
-        the low-pass.
+        """Return the wrench W (n, 6) [N, N m] of reaction forces at φ including the tool if its
+        mass is estimated, before the low-pass.
         """
         value = self.evaluate_without_tool(reactions)
         if len(self.tool_parameters):
@@ -408,19 +427,22 @@ class GraspWrench:
     def filter_wrench(
         self, value: Array, phi: Array
     ) -> RecursionTrajectory | None:
-        """Return the low-pass filtered W (n, 6) as a recursion with derivatives; None without a
-        low-pass or without times.
+        """Return the low-pass filtered W (n, 6) at φ (k,) as a recursion with derivatives; None
+        without a low-pass or without times.
         """
         if not len(self.low_pass_parameters) or not len(value):
             return None
         data = self.low_pass_data[:, : len(value), None]
         return RecursionTrajectory.from_signal(
-            LOW_PASS, phi[self.low_pass_parameters], data, value[None]
+            LOW_PASS,
+            phi[self.low_pass_parameters],
+            data=data,
+            signal=value[None],
         )
 
     @cached_property
     def low_pass_data(self) -> Array:
-        """Data (2, n) of `LOW_PASS`."""
+        """Data (2, n) of `LOW_PASS`; there must be a low-pass."""
         per_step = (
             self.nuisance.scales[self.low_pass_parameters]
             / self.reaction_grid.step_s
@@ -432,8 +454,8 @@ class GraspWrench:
     # As channels are --------------------------------------------------------------------------
 
     def evaluate(self, motion: ObservedMotion, phi: Array) -> Array:
-        """Return the measured wrench Y = L W (n, 2, 3) [N, N m] of a motion at φ: force and torque,
-        with the low-pass L if there is one.
+        """Return the measured wrench Y = L W (n, 2, 3), force [N] and torque [N m], of a motion at
+        φ, at the n times whose reaction forces the motion covers.
         """
         value = self.evaluate_unfiltered(motion.reactions, phi)
         evolution = self.filter_wrench(value, phi)
@@ -442,13 +464,13 @@ class GraspWrench:
     def linearise(
         self, motion: ObservedMotion, phi: Array, columns: Index, size: int
     ) -> tuple[Array, ObservableDerivatives]:
-        """Return Y (n, 2, 3) and its derivatives by all parameters.
+        """Return Y (n, 2, 3) [N, N m] and its derivatives by all parameters.
 
         Parameters
         ----------
         motion : ObservedMotion
             Motion whose reaction forces have changes `reaction_by` and `position_by` with c
-            columns.
+            columns; they must not be None.
         phi : (k,) array
             Nuisance parameters; they are the last of all parameters.
         columns : (c,) array
@@ -494,8 +516,17 @@ class GraspWrench:
     def vjp(
         self, motion: ObservedMotion, phi: Array, by_values: Array
     ) -> VectorJacobianProduct:
-        """Vector–Jacobian product at a motion and φ: the derivatives of a scalar by positions,
-        reaction forces and φ, from those by Y (n, 2, 3).
+        """Vector–Jacobian product: derivatives of a scalar by positions, reaction forces and φ from
+        those by Y.
+
+        Parameters
+        ----------
+        motion : ObservedMotion
+            Motion over all grid times.
+        phi : (k,) array
+            Nuisance parameters.
+        by_values : (n, 2, 3) array
+            Derivatives of the scalar by Y.
         """
         forced = motion.reactions
         by_phi = np.zeros(len(phi))
@@ -521,7 +552,7 @@ class GraspWrench:
         by_x[np.ix_(k, self.sensed_dofs[self.node_dofs])] = np.einsum(
             "ka,kag->kg", by_w, of_place
         )
-        return VectorJacobianProduct(by_x, by_reaction, by_phi)
+        return VectorJacobianProduct(by_x, by_reaction, by_phi=by_phi)
 
     def frame_changes(
         self,
@@ -532,7 +563,7 @@ class GraspWrench:
         rotations: Array,
     ) -> Array | float:
         """Return the changes (n, 2, 3, c) of Y due to pose errors that move the frame of the
-        sensor.
+        sensor; the reaction forces and the wrench of the tool are constant.
 
         Parameters
         ----------
@@ -580,16 +611,19 @@ def sensed_dofs(experiment: Experiment) -> Index:
 
 
 def _moment(u: ca.SX, data: ca.SX) -> ca.SX:
-    """Expression of force and torque (6,) of one node."""
+    """Return the expression of force and torque (6,) of one node, from u = (x_g, R_g) and the data
+    of `MOMENT`; components that the grasp does not prescribe have no force.
+    """
     place, reaction = ca.vertsplit(u, 3)
-    axes, point, reaction_force = ca.vertsplit(data, [0, 9, 12, 15])
+    axes, point, is_prescribed = ca.vertsplit(data, [0, 9, 12, 15])
     axes = ca.reshape(axes, 3, 3)
-    force = reaction_force * reaction
+    force = is_prescribed * reaction
     return ca.vertcat(axes @ force, axes @ ca.cross(place - point, force))
 
 
 def _in_moved_frame(offset: ca.SX, data: ca.SX) -> ca.SX:
-    """Expression of a wrench (6,) in a frame that is rotated and translated by an offset.
+    """Return the expression of a wrench (6,) in a frame that is rotated and translated by an
+    offset.
 
     Parameters
     ----------
@@ -625,14 +659,15 @@ def _by_dof(by_node: Array) -> Array:
 def _low_pass_step(
     before: ca.SX, now: ca.SX, last: ca.SX, lag: ca.SX, data: ca.SX
 ) -> ca.SX:
-    """One step of Y' = (W − Y) / T, with W linear between grid times and constant before the first.
+    """Return Y after one step of Y' = (W − Y) / T, with W linear between grid times and Y = W at
+    the first.
 
     Parameters
     ----------
-    before : (6,) SX
-        Previous Y.
-    now, last : (6,) SX
-        Present and previous W.
+    before : SX
+        Previous Y, one component or several.
+    now, last : SX
+        Present and previous W, of the same size.
     lag : SX
         T in units of its prior standard deviation.
     data : (2,) SX
@@ -647,12 +682,12 @@ def _low_pass_step(
     )
 
 
-# Force and torque (6,) of one node, by x_g and R_g; data are Q, o and what is held.
+# Force and torque (6,) of one node, by x_g and R_g; data are Q, o and one for each prescribed dof.
 MOMENT = GeneratedFunction(_moment, 6, data_size=15)
-# W (6,) by a turn and a shift of the frame; data are Q, W and the point in the frame.
+# W (6,) by a rotation and a translation of the frame; data are Q, W and the point in the frame.
 IN_MOVED_FRAME = GeneratedFunction(_in_moved_frame, 6, data_size=18)
-# Of T by the φ of `low_pass_parameters`; data are whether it is the start, and T / Δt of a φ of
-# one.
+# Y by W and the φ of `low_pass_parameters`; data are one at the start, otherwise zero, and the T / Δt
+# of a φ of one.
 LOW_PASS = Recursion(
     _low_pass_step, 1, signal_size=1, constant_count=1, data_size=2
 )

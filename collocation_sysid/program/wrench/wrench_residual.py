@@ -63,6 +63,8 @@ class WrenchResidual(MeasurementResidual):
     ) -> WrenchResidual:
         """Build the measurement model of a sensor.
 
+        Samples are compared only where the observable covers them for any shift of the clock.
+
         Parameters
         ----------
         observable : GraspWrench
@@ -98,12 +100,14 @@ class WrenchResidual(MeasurementResidual):
 
     @property
     def is_compared_by_component(self) -> NDArray[np.bool_]:
-        """Mask (S, 6) of the numbers that are compared."""
+        """Mask (S, 6) of the components (force, torque) that are compared."""
         return self.is_compared.reshape(-1, 6)
 
     @property
     def first_needed_s(self) -> float:
-        """Time [s] of the first sample with the largest possible shift of the clock."""
+        """Time [s] up to which the motion must be known for the first sample that is compared, with
+        the largest possible shift of the clock.
+        """
         return super().first_needed_s + self.observable.clock_limit_s
 
     def is_covered(self, known: int) -> NDArray[np.bool_]:
@@ -113,14 +117,17 @@ class WrenchResidual(MeasurementResidual):
         return _is_covered(self.observable, self.t_s, known=known)
 
     def _neighbour_count(self, known: int) -> int:
-        """Return the number of grid times that a sample is interpolated from."""
+        """Return the number of grid times from which a sample is interpolated, if `known` are
+        known: at most four, and two for equilibria.
+        """
         return min(
             2 if self.observable.reaction_grid.is_static else NEIGHBOURS, known
         )
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
-        """Return the stencil of all samples: the grid times around each, among the first `known`,
-        shifted by the clock of φ, and their distances from it.
+        """Return the stencil of all samples: the grid times around each, among the first `known`
+        ones, at the clock shift of φ, and their distances from the sample without that shift [s].
+        Samples that are not covered are extrapolated.
         """
         clock = self.observable.parameter_indices(SENSOR_TIME)
         used = self._neighbour_count(known)
@@ -131,7 +138,9 @@ class WrenchResidual(MeasurementResidual):
         return RowStencil(_vector_indices(times), data.T[..., None])
 
     def all_stencils(self) -> Index:
-        """Return the indices (…, 1, v) of neighbouring times, for any shift of the clock."""
+        """Return the indices (…, 1, v) of all sequences of neighbouring times, one for each first
+        time and not for each sample.
+        """
         used = self._neighbour_count(self.observable.count)
         return _vector_indices(
             np.arange(self.observable.count - used + 1)[:, None]
@@ -139,7 +148,8 @@ class WrenchResidual(MeasurementResidual):
         )
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the prediction (6,).
+        """Return the prediction (6,) [N, N m], interpolated in time, with the tare added to the
+        components that are measured.
 
         Parameters
         ----------
@@ -168,8 +178,8 @@ class WrenchResidual(MeasurementResidual):
     def predict_reactions(
         self, known_reactions: ReactionForces, phi: Array
     ) -> Array:
-        """Return the prediction (S, 6) from reaction forces [N, N m]; NaN for samples
-        outside the known times.
+        """Return the prediction (S, 6) [N, N m] at φ (k,) from reaction forces at the observable's
+        times; NaN for samples outside these times.
         """
 
         def reactions() -> ReactionForces:
@@ -185,13 +195,17 @@ class WrenchResidual(MeasurementResidual):
         )
 
     def on_grid(self, grid: ReactionGrid) -> WrenchResidual:
-        """Return the model with reaction forces at the times of another grid."""
+        """Return the model with reaction forces at the times of another grid, with a quadratic loss
+        and names without suffix.
+        """
         return WrenchResidual.from_sensor(
             replace(self.observable, reaction_grid=grid), self.wrench
         )
 
     def with_wrench(self, wrench: Wrench) -> WrenchResidual:
-        """Return the model of other samples, in their own frame."""
+        """Return the model of other samples, in their own frame and about their own point, with a
+        quadratic loss and names without suffix.
+        """
         observable = replace(
             self.observable, frame=wrench.frame, point_m=wrench.point_m
         )
@@ -201,8 +215,8 @@ class WrenchResidual(MeasurementResidual):
 def _is_covered(
     observable: GraspWrench, t_s: Array, known: int
 ) -> NDArray[np.bool_]:
-    """Return the mask (S,) of the samples at times (S,) that lie within the first `known` grid
-    times for any admissible shift of the clock; all false if none are known.
+    """Return the mask (S,) of the samples at times `t_s` (S,) [s] that lie within the first `known`
+    times of the observable for any admissible shift of the clock; all false if none are known.
     """
     if not known:
         return np.zeros(len(t_s), dtype=bool)
@@ -225,7 +239,8 @@ def wrench_residuals(
     nuisance: NuisanceMap,
     huber: float | None = None,
 ) -> tuple[WrenchResidual, ...]:
-    """Build the measurement models of all grasps of an experiment that have a force–torque sensor.
+    """Build the measurement models of all grasps of an experiment that have a force–torque sensor,
+    in the order of the grasps.
 
     Parameters
     ----------
@@ -256,7 +271,9 @@ def wrench_residuals(
 
 
 def without_grasp_sensors(experiment: Experiment) -> Experiment:
-    """Return the experiment without force–torque sensors and custom sensors of grasps."""
+    """Return the experiment without force–torque sensors and without custom sensors of grasps;
+    custom sensors of points are kept.
+    """
     grasps = [replace(grasp, wrench=None) for grasp in experiment.grasps]
     readings = [gauge for gauge in experiment.readings if gauge.grasp is None]
     return replace(experiment, grasps=grasps, readings=readings)

@@ -20,7 +20,11 @@ from ...errors import SimulationError
 from ...fem.laws.constants import is_modulus
 from ...fem.laws.moduli import engineering_constants
 from ...model.nuisance_map import NuisanceMap
-from ...program.depth.camera_alignment import iterate_alignment, thinned
+from ...program.depth.camera_alignment import (
+    AlignedPose,
+    iterate_alignment,
+    thinned,
+)
 from ...program.depth.depth_camera_model import DepthCameraModel
 from ...program.depth.visible_surface import VisibleSurface
 from ...program.forward.initial_equilibrium import equilibrium
@@ -347,15 +351,16 @@ class _ImageComparison:
         places_m, normals = self.surfaces[index]
         gate_m = self.camera.depth.gate_m
         size_m = self.camera.size_m
-        _, rotation, shift_m = iterate_alignment(
+        aligned = iterate_alignment(
             self.camera,
             tree,
-            places_m,
-            normals,
-            np.geomspace(INITIAL_GATE * size_m, gate_m, iterations),
-            Rotation.identity(),
-            np.zeros(3),
+            places=places_m,
+            normals=normals,
+            gates=np.geomspace(INITIAL_GATE * size_m, gate_m, iterations),
+            start=AlignedPose(Rotation.identity(), np.zeros(3)),
         )
+        rotation = aligned.rotation
+        shift_m = aligned.translation_m
         pivot_m = self.camera.pivot_m
         aligned_m = rotation.inv().apply(places_m - pivot_m - shift_m) + pivot_m
         turned = rotation.inv().apply(normals)
