@@ -7,6 +7,7 @@ the same inputs, data are (d, …) and values (m, …), for any shape … of ins
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -188,15 +189,19 @@ class GeneratedFunction:
             Data and, for second derivatives, weights; the axes after the first are the instances.
         """
         shape = others[0].shape[1:]
-        count = int(np.prod(shape))
+        count = math.prod(shape)
         if u.ndim == 1:
             u = np.broadcast_to(
                 u.reshape(-1, *(1 for _ in shape)), (len(u), *shape)
             )
-        sizes = [function.size_out(k) for k in range(function.n_out())]
+        name = function.name()
+        if name not in self._output_sizes:
+            self._output_sizes[name] = [
+                function.size_out(k) for k in range(function.n_out())
+            ]
+        sizes = self._output_sizes[name]
         if not count:
             return [np.zeros((*size, *shape)) for size in sizes]
-        name = function.name()
         with COMPILING:
             if name not in self._evaluators:
                 self._evaluators[name] = make_instance_evaluator(
@@ -210,6 +215,11 @@ class GeneratedFunction:
             each.reshape(*size[::-1], *shape).swapaxes(0, 1)
             for each, size in pairs
         ]
+
+    @cached_property
+    def _output_sizes(self) -> dict[str, list[tuple[int, int]]]:
+        """Numbers of rows and columns of the outputs by name of the function, filled on demand."""
+        return {}
 
     @cached_property
     def _evaluators(self) -> dict[str, Instances]:

@@ -88,6 +88,8 @@ def compile_instance_evaluator(function: ca.Function) -> Instances:
         )
     )
 
+    entry_counts = [function.nnz_out(k) for k in range(function.n_out())]
+
     def evaluate(inputs: list[Array]) -> list[Array]:
         """Return the outputs (size, instances) at inputs (size, instances)."""
         count = inputs[0].shape[1]
@@ -98,8 +100,7 @@ def compile_instance_evaluator(function: ca.Function) -> Instances:
             inputs = [each[:, instance_indices] for each in inputs]
         arguments = [np.ascontiguousarray(each, float) for each in inputs]
         outputs = [
-            np.empty((function.nnz_out(k), padded_count))
-            for k in range(function.n_out())
+            np.empty((entries, padded_count)) for entries in entry_counts
         ]
         run(padded_count, *map(address, [*arguments, *outputs]))
         return [each[:, :count] for each in outputs]

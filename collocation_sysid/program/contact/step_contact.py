@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ import numpy as np
 from ...common.array_types import Array, Index
 from ...fem.contact_surface import VECTORS_PER_POINT
 from ...fem.pattern import SymmetricPattern, dofs_of
-from ...model.contact import Contact, ContactLaw
+from ...model.contact import POINT_BATCH, Contact, ContactLaw
 
 # Distance within which points are candidates, in edges of the surface.
 MARGIN = 0.25
@@ -55,6 +55,11 @@ class ContactCandidates:
     entries: Index
     symmetric_factors: Array
     skew_factors: Array
+
+    @cached_property
+    def _last_data(self) -> dict[tuple[float, bytes], Array]:
+        """Data of the law at the last evaluation, by the length of the step and the frame."""
+        return {}
 
     @staticmethod
     @lru_cache(maxsize=64)
@@ -116,10 +121,23 @@ class ContactCandidates:
         ]
         ends = [(x[frame[1:]] - x[frame[0]]).ravel() for x in moving]
         same = np.concatenate([*ends, theta[self.law.constant_columns]])
-        data = np.broadcast_to(same[:, None], (len(same), len(self.nodes)))
-        return np.concatenate(own), np.concatenate(
-            [data, contact.data_of(self.point_indices)]
-        )
+        return own[0] if len(own) == 1 else np.concatenate(
+            own
+        ), self._data_with(contact, same)
+
+    def _data_with(self, contact: Contact, same: Array) -> Array:
+        """Return the data (d, i) of the law from those that are the same at all points (s,).
+
+        The last data are stored, because the frame of the obstacle does not move within a step.
+        """
+        key = contact.step_s, same.tobytes()
+        if key not in self._last_data:
+            data = np.broadcast_to(same[:, None], (len(same), len(self.nodes)))
+            self._last_data.clear()
+            self._last_data[key] = np.concatenate(
+                [data, contact.data_of(self.point_indices)]
+            )
+        return self._last_data[key]
 
     def assemble(self, push: Array, size: int) -> Array:
         """Return forces (size,) [N] on the dofs of a body from forces `push` (3, i) [N] on the i
@@ -150,6 +168,40 @@ class LinearisedContact(NamedTuple):
     skew: Array
 
 
+@dataclass(frozen=True, eq=False)
+class TouchingPoints:
+    """Candidates of one obstacle with a contact force, and these forces.
+
+    Attributes
+    ----------
+    candidates : ContactCandidates
+        All candidates of the obstacle.
+    indices : (t,) array
+        Indices of the points among the candidates.
+    force : (3, t) array
+        Forces on the points [N].
+    slopes : (3, 3, i) or (3, 6, i) array
+        Derivatives of the forces on all candidates by their positions and, if the law depends on
+        them, their velocities.
+    rates : (float, float)
+        Derivatives of ξ and of ν by the unknown positions.
+    """
+
+    candidates: ContactCandidates
+    indices: Index
+    force: Array
+    slopes: Array
+    rates: tuple[float, float]
+
+    @cached_property
+    def slope(self) -> Array:
+        """Derivative (3, 3, t) of the force by the unknown position of the point [N/m]."""
+        slope = self.rates[0] * self.slopes[:, :3, self.indices]
+        if self.candidates.law.depends_on_velocity:
+            slope += self.rates[1] * self.slopes[:, 3:, self.indices]
+        return slope
+
+
 class StepContact:
     """Contact in one time step of a body with constants θ (k,).
 
@@ -160,6 +212,8 @@ class StepContact:
     ----------
     acts : bool
         Whether there are contact forces at all.
+    dof_count : int
+        Number 3n of dofs.
 
     Parameters
     ----------
@@ -180,10 +234,11 @@ class StepContact:
         self._contacts = contacts
         self._theta = theta
         self._pattern = pattern
-        self._from = np.full((2, 1), np.nan)
+        self._from = np.full((1, 1), np.nan)
         self._candidates_of_contacts = list[tuple[Contact, ContactCandidates]]()
         edges_m = [each.law_of_contact.surface.edge_m for each in contacts]
         self.acts = bool(contacts)
+        self.dof_count = pattern.size
         self._margin_m = MARGIN * min(edges_m, default=0.0)
         # A pressure that is averaged over a step depends on the states at both ends.
         self._half_s = max((each.step_s for each in contacts), default=0.0) / 2
@@ -243,6 +298,36 @@ class StepContact:
                 )
         return LinearisedContact(force, symmetric, skew=skew)
 
+    def touching_points(
+        self, xi: Array, nu: Array, rates: tuple[float, float]
+    ) -> list[TouchingPoints]:
+        """Return the points that touch at ξ and ν, (1, 3n) each, for each obstacle with candidates.
+
+        Parameters
+        ----------
+        xi, nu : (1, 3n) arrays
+            State [m] and velocity [m/s].
+        rates : (float, float)
+            Derivatives of ξ and of ν by the unknown positions.
+        """
+        touching = []
+        for candidates, u, data in self._candidates(xi[0], nu[0]):
+            law = candidates.law
+            force, slopes = law.point_force_function.evaluate_with_jacobian(
+                u, data
+            )
+            (touch,) = np.nonzero(force.any(axis=0))
+            touching.append(
+                TouchingPoints(
+                    candidates,
+                    touch,
+                    force=force[:, touch],
+                    slopes=slopes,
+                    rates=rates,
+                )
+            )
+        return touching
+
     def _candidates(
         self, xi: Array, nu: Array
     ) -> Iterator[tuple[ContactCandidates, Array, Array]]:
@@ -252,7 +337,10 @@ class StepContact:
         The search for candidates is repeated if the state has changed by more than the margin
         allows.
         """
-        ends = np.array([xi - self._half_s * nu, xi + self._half_s * nu])
+        ends = xi[None]
+        if self._half_s:
+            half_step = self._half_s * nu
+            ends = np.array([xi - half_step, xi + half_step])
         if not np.abs(ends - self._from).max() <= CHANGE * self._margin_m:
             self._from = ends
             self._candidates_of_contacts = []
@@ -260,9 +348,11 @@ class StepContact:
                 gaps = each.law_of_contact.gaps(each.points.vectors(ends)).min(
                     axis=0
                 )
-                (chosen,) = np.nonzero(
-                    gaps < each.law_of_contact.widths_m + self._margin_m
-                )
+                is_near = gaps < each.law_of_contact.widths_m + self._margin_m
+                # Others fill the last vector of the compiled law.
+                (others,) = np.nonzero(~is_near)
+                is_near[others[: -is_near.sum() % POINT_BATCH]] = True
+                (chosen,) = np.nonzero(is_near)
                 if len(chosen):
                     candidates = ContactCandidates.from_indices(
                         each.law_of_contact,

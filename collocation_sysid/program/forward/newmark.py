@@ -29,6 +29,7 @@ from ...model.internal_variables import (
 )
 from ...model.weight import Weight
 from ...recording.experiment import Experiment
+from ..contact.condensed_contact import ContactEquations
 from ..contact.step_contact import StepContact
 from ..linear_algebra.lapack import one_blas_thread
 from ..observables import ReactionForces
@@ -263,15 +264,12 @@ class _StepEquations:
         before = self._state.x
         return (before + x)[None] / 2, (x - before)[None] / self._step_s
 
-    def residual(self, x: Array) -> Array:
-        """Return the force balance F + 2 C − M a (3n,) [N] at the end positions x (3n,) [m]."""
+    def residual_without_contact(self, x: Array) -> Array:
+        """Return the force balance F − M a (3n,) [N] at the end positions x (3n,) [m]."""
         v, a = self.kinematics(x)
-        balance = self._forces.total(x, v)[0] - self.mass_kg * a
-        if not self.contact.acts:
-            return balance
-        return balance + 2 * self.contact.force(*self.middle_state(x))
+        return self._forces.total(x, v)[0] - self.mass_kg * a
 
-    def linearise(self, x: Array) -> NewtonLinearisation:
+    def linearise_without_contact(self, x: Array) -> NewtonLinearisation:
         """Return the force balance (3n,) [N] at x (3n,) [m], and its derivative by x."""
         v, a = self.kinematics(x)
         slope = self._slope
@@ -281,15 +279,22 @@ class _StepEquations:
         skew = -at.by_position_skew[0]
         if at.by_velocity_skew.size:
             skew = skew - slope * at.by_velocity_skew[0]
-        balance = at.force[0] - self.mass_kg * a
-        if self.contact.acts:
-            contact = self.contact.linearise(
-                *self.middle_state(x), (0.5, 1 / self._step_s)
-            )
-            balance = balance + 2 * contact.force
-            matrix -= 2 * contact.symmetric
-            skew = skew - 2 * contact.skew
-        return NewtonLinearisation(balance, matrix, skew=skew)
+        return NewtonLinearisation(
+            at.force[0] - self.mass_kg * a, matrix, skew=skew
+        )
+
+    def with_contact(self) -> ContactEquations:
+        """Return the force balance F + 2 C − M a, with the contact forces C in the middle of the
+        step.
+        """
+        return ContactEquations(
+            self.residual_without_contact,
+            self.linearise_without_contact,
+            contact=self.contact,
+            states=self.middle_state,
+            rates=(0.5, 1 / self._step_s),
+            weight=2.0,
+        )
 
 
 class _Stepper:
@@ -494,7 +499,7 @@ class _Stepper:
         guess = equations.extrapolation()
         if not solver.has_no_inverted_element(guess):
             guess = equations.with_prescribed_positions(state.x)
-        x = solver.solve(guess, equations.residual, equations.linearise)
+        x = solver.solve_in_contact(guess, equations.with_contact())
         v, a = equations.kinematics(x)
         contact_n = None
         if equations.contact.acts:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,21 @@ from numpy.typing import NDArray
 from ...common.array_types import Array
 from ...errors import SimulationError
 from ...recording.experiment import Experiment
+from ..contact.condensed_contact import (
+    Compliance,
+    CondensationError,
+    CondensedSteps,
+    ContactEquations,
+)
 from ..linear_algebra.factorisation import Factor, Factoriser
 from ..stopwatch import Stopwatch
+from .newton_linearisation import NewtonLinearisation
 from .retraction import Retraction, add_increment
 
 T = TypeVar("T")
 
+# Skew part of a matrix that is approximated by its symmetric part.
+NO_SKEW_PART = np.zeros(0)
 # Share of the tolerance below which a step that was computed with the factor of the previous
 # iterate is the last one.
 OLD_FACTOR_SHARE = 0.01
@@ -28,24 +37,6 @@ FAST = 0.1
 LARGEST_CHORD_STEP_COUNT = 8
 # Chord steps end when the expected remaining error is this share of the tolerance.
 LEAST_RESIDUAL_SHARE = 1e-5
-
-
-class NewtonLinearisation(NamedTuple):
-    """Residual r and its derivative at a state x.
-
-    Attributes
-    ----------
-    residual : (3n,) array
-        Residual [N].
-    symmetric : (m,) array
-        Lower triangle of the symmetric part of −∂r/∂x [N/m].
-    skew : (m,) or (0,) array
-        Lower triangle of the skew part of −∂r/∂x; empty for a symmetric derivative.
-    """
-
-    residual: Array
-    symmetric: Array
-    skew: Array
 
 
 # Residual (3n,) of a state (3n,).
@@ -123,6 +114,12 @@ class NewtonSolver:
     ----------
     free, is_prescribed : arrays
         Indices of free and of prescribed dofs.
+    size_m : float
+        Length of the diagonal of the box that contains the body.
+    last_factor : Factor or None
+        Factor of the last solution of complete equations, with which the next one begins.
+    compliance : Compliance or None
+        Inverse of the matrix of the body without contact, of the last step with contact.
 
     Parameters
     ----------
@@ -154,8 +151,9 @@ class NewtonSolver:
         self.is_prescribed = np.flatnonzero(holding)
         self.pattern = experiment.sparsity
         self.factoriser = Factoriser.cached(self.pattern, self.free)
-        self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
-        self._last_factor: Factor | None = None
+        self.size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
+        self.last_factor: Factor | None = None
+        self.compliance: Compliance | None = None
 
     def solve(
         self,
@@ -208,16 +206,16 @@ class NewtonSolver:
         if not keep_definite:
             # If they do not converge, the search begins at x: their last state may be far off.
             improved, done = self._simplified_newton(
-                x, residual, linearise=linearise
+                x, _CompleteIteration(self, residual, linearise=linearise)
             )
             if done:
                 return improved
-        at = self._timed(linearise, x)
-        factor = self._factorise(at, x, keep_definite)
-        iterate = _Iterate(x, factor, step=self._step(factor, at.residual))
+        at = self.timed(linearise, x)
+        factor = self.factorise(at, x, keep_definite)
+        iterate = _Iterate(x, factor, step=self.step(factor, at.residual))
         for _ in range(self.options.max_iterations):
             if self._is_last(iterate.step):
-                self._last_factor = iterate.factor
+                self.last_factor = iterate.factor
                 iterate.x[self.free] += iterate.step
                 return iterate.x
             iterate = self._backtrack(
@@ -231,8 +229,39 @@ class NewtonSolver:
             f"Newton's method took more than {self.options.max_iterations} iterations",
         )
 
+    def solve_in_contact(self, x: Array, equations: ContactEquations) -> Array:
+        """Solve one time step, with contact or without, for the free dofs.
+
+        Contact is condensed to the dofs that touch, with the factor of the body without contact of
+        earlier steps. Where that does not converge, `solve` treats the complete equations.
+
+        Parameters
+        ----------
+        x : (3n,) array
+            First guess [m]; not modified. Prescribed dofs keep their values.
+        equations : ContactEquations
+            Equations of the step.
+
+        Returns
+        -------
+        (3n,) array
+            Solution [m].
+
+        Raises
+        ------
+        NewtonFailure
+            If no method converges.
+        """
+        if equations.contact.acts and self.has_no_inverted_element(x):
+            improved, done = self._simplified_newton(
+                x, _CondensedIteration(self, equations)
+            )
+            if done:
+                return improved
+        return self.solve(x, equations.residual, equations.linearise)
+
     def _simplified_newton(
-        self, x: Array, residual: Residual, linearise: Linearise
+        self, x: Array, iteration: ChordIteration
     ) -> tuple[Array, bool]:
         """Iterate with few factorisations (simplified Newton method); the last factor is stored,
         and x is not modified.
@@ -247,25 +276,22 @@ class NewtonSolver:
         """
         is_own = False
         for _ in range(self.options.max_iterations):
-            if self._last_factor is not None:
-                improved, done = self._chord_steps(
-                    x, residual, factor=self._last_factor
-                )
-                if done:
-                    return improved, True
-                if improved is x and is_own:
-                    break
-                x = improved
-            at = self._timed(linearise, x)
             try:
-                self._last_factor = self._factorise(at, x, keep_definite=False)
+                if iteration.has_factor:
+                    improved, done = self._chord_steps(x, iteration)
+                    if done:
+                        return improved, True
+                    if improved is x and is_own:
+                        break
+                    x = improved
+                iteration.factorise_at(x)
                 is_own = True
-            except NewtonFailure:
+            except (NewtonFailure, CondensationError):
                 break
         return x, False
 
     def _chord_steps(
-        self, x: Array, residual: Residual, factor: Factor
+        self, x: Array, iteration: ChordIteration
     ) -> tuple[Array, bool]:
         """Iterate with a given factor while steps shrink fast; x is not modified.
 
@@ -279,7 +305,7 @@ class NewtonSolver:
         before = None
         done = False
         for _ in range(LARGEST_CHORD_STEP_COUNT):
-            step = self._step(factor, self._timed(residual, improved))
+            step = iteration.step_from(improved)
             length = float(np.linalg.norm(step))
             rate = length / before if before else 1.0
             if not rate <= 1.0:
@@ -313,10 +339,10 @@ class NewtonSolver:
         state[self.is_prescribed] = goal
         if not self._is_last(way):
             self._require_upright(x)
-            at = self._timed(linearise, x)
+            at = self.timed(linearise, x)
             coupling = self.pattern.products(at.symmetric[None], way[None])[0]
-            factor = self._factorise(at, x, keep_definite=False)
-            state[self.free] += self._step(factor, at.residual - coupling)
+            factor = self.factorise(at, x, keep_definite=False)
+            state[self.free] += self.step(factor, at.residual - coupling)
         return state
 
     def _backtrack(
@@ -357,21 +383,21 @@ class NewtonSolver:
             trial = update(x, increment)
             if self.has_no_inverted_element(trial):
                 # A whole step is mostly taken: it is evaluated with its derivatives at once.
-                at = self._timed(linearise, trial) if share == 1 else None
+                at = self.timed(linearise, trial) if share == 1 else None
                 value = (
-                    self._timed(residual, trial) if at is None else at.residual
+                    self.timed(residual, trial) if at is None else at.residual
                 )
-                next_step = self._step(factor, value)
+                next_step = self.step(factor, value)
                 if np.linalg.norm(next_step) <= (1 - share / 4) * length:
                     is_last = self._is_last(next_step, OLD_FACTOR_SHARE)
                     if is_last and not keep_definite:
                         return _Iterate(trial, factor, step=next_step)
                     if at is None:
-                        at = self._timed(linearise, trial)
+                        at = self.timed(linearise, trial)
                     try:
-                        own = self._factorise(at, trial, keep_definite)
+                        own = self.factorise(at, trial, keep_definite)
                         return _Iterate(
-                            trial, own, step=self._step(own, at.residual)
+                            trial, own, step=self.step(own, at.residual)
                         )
                     except NewtonFailure:
                         pass
@@ -393,10 +419,10 @@ class NewtonSolver:
         """Whether the largest entry of a step (free or 3n,) [m] is at most `share` times the
         tolerance.
         """
-        tolerance = share * self.options.tolerance * self._size_m
+        tolerance = share * self.options.tolerance * self.size_m
         return bool(np.abs(step).max(initial=0.0) <= tolerance)
 
-    def _factorise(
+    def factorise(
         self, at: NewtonLinearisation, x: Array, keep_definite: bool
     ) -> Factor:
         """Return the factor of −∂residual/∂x on the free dofs.
@@ -426,12 +452,12 @@ class NewtonSolver:
             raise NewtonFailure(x, "the stiffness is not positive definite")
         return factor
 
-    def _step(self, factor: Factor, residual: Array) -> Array:
+    def step(self, factor: Factor, residual: Array) -> Array:
         """Return the Newton step (free,) [m] of the free dofs for a residual (3n,)."""
         with self.stopwatch.solving():
             return factor.solve(residual[self.free])
 
-    def _timed(self, function: Callable[[Array], T], x: Array) -> T:
+    def timed(self, function: Callable[[Array], T], x: Array) -> T:
         """Return `function(x)`; its time is added to the evaluations of the stopwatch."""
         with self.stopwatch.evaluating():
             return function(x)
@@ -454,6 +480,103 @@ class NewtonSolver:
         at x (3n,) [m].
         """
         return int(self.body.volume_ratios(x)[0].min(axis=1).argmin())
+
+
+class ChordIteration(Protocol):
+    """Steps with a factor that is kept for several of them."""
+
+    @property
+    def has_factor(self) -> bool:
+        """Whether there is a factor of an earlier state."""
+        ...
+
+    def factorise_at(self, x: Array) -> None:
+        """Replace the factor by that at x (3n,) [m]; raises NewtonFailure if it is singular."""
+        ...
+
+    def step_from(self, x: Array) -> Array:
+        """Return the step (free,) [m] from x (3n,) [m] with the present factor."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class _CompleteIteration:
+    """Steps with the factor of the complete matrix.
+
+    Attributes
+    ----------
+    solver : NewtonSolver
+        Stores the factor.
+    residual, linearise : callable
+        Functions of the state, see `NewtonSolver.solve`.
+    """
+
+    solver: NewtonSolver
+    residual: Residual
+    linearise: Linearise
+
+    @property
+    def has_factor(self) -> bool:
+        return self.solver.last_factor is not None
+
+    def factorise_at(self, x: Array) -> None:
+        solver = self.solver
+        at = solver.timed(self.linearise, x)
+        solver.last_factor = solver.factorise(at, x, keep_definite=False)
+
+    def step_from(self, x: Array) -> Array:
+        solver = self.solver
+        assert solver.last_factor is not None
+        return solver.step(solver.last_factor, solver.timed(self.residual, x))
+
+
+class _CondensedIteration:
+    """Steps with the factor of the body without contact, and contact condensed.
+
+    Parameters
+    ----------
+    solver : NewtonSolver
+        Stores the factor and its compliance.
+    equations : ContactEquations
+        Equations of the step.
+    """
+
+    def __init__(
+        self, solver: NewtonSolver, equations: ContactEquations
+    ) -> None:
+        self._solver = solver
+        self._equations = equations
+        self._use_compliance()
+
+    @property
+    def has_factor(self) -> bool:
+        return self._steps is not None
+
+    def factorise_at(self, x: Array) -> None:
+        solver = self._solver
+        at = solver.timed(self._equations.linearise_without_contact, x)
+        symmetric = at._replace(skew=NO_SKEW_PART)
+        factor = solver.factorise(symmetric, x, keep_definite=False)
+        solver.compliance = Compliance(factor, len(solver.free))
+        self._use_compliance()
+
+    def step_from(self, x: Array) -> Array:
+        assert self._steps is not None
+        return self._solver.timed(self._steps.step_from, x)
+
+    def _use_compliance(self) -> None:
+        """Prepare steps with the compliance of the solver, if there is one."""
+        compliance = self._solver.compliance
+        self._steps = (
+            None
+            if compliance is None
+            else CondensedSteps(
+                self._equations,
+                compliance,
+                free=self._solver.free,
+                size_m=self._solver.size_m,
+            )
+        )
 
 
 def follow_path(

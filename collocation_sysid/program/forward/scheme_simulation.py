@@ -19,6 +19,7 @@ from ...model.internal_variables import (
     insert_previous_states,
 )
 from ...recording.experiment import Experiment
+from ..contact.condensed_contact import ContactEquations
 from ..contact.step_contact import StepContact
 from ..linear_algebra.lapack import one_blas_thread
 from ..stopwatch import Stopwatch
@@ -319,6 +320,18 @@ class RowEquations:
             scaled.rest = self.forces_before.interpolate(self.forces, share)
         return scaled
 
+    @property
+    def equations(self) -> ContactEquations:
+        """Equations of the row with contact apart."""
+        return ContactEquations(
+            self._residual_without_contact,
+            self._linearise_without_contact,
+            contact=self.contact,
+            states=self.states,
+            rates=(self.row.p[0], self.row.q[0]),
+            weight=self.row.w[0],
+        )
+
     def force(self, x: Array) -> Array:
         """Return the force F_t (3n,) [N] at the evaluation state that follows from x_t = `x` (3n,)
         [m], with contact.
@@ -333,36 +346,27 @@ class RowEquations:
             self.nu + self.row.q[0] * x
         )[None]
 
-    def residual_from(self, force: Array, x: Array) -> Array:
+    def _residual_from(self, force: Array, x: Array) -> Array:
         """Return c_t (3n,) [N] from the force F_t (3n,) [N] and x_t (3n,) [m]."""
         row = self.row
         return row.w[0] * force + self.known - row.s[0] * row.mass_kg * x
 
-    def residual(self, x: Array) -> Array:
-        """Return the constraints c_t (3n,) [N] at positions x_t (3n,) [m]."""
-        return self.residual_from(self.force(x), x)
+    def _residual_without_contact(self, x: Array) -> Array:
+        """Return the constraints c_t (3n,) [N] at positions x_t (3n,) [m], without contact."""
+        return self._residual_from(self.rest.total(*self.states(x))[0], x)
 
-    def linearise(self, x: Array) -> NewtonLinearisation:
-        """Return c_t (3n,) [N] at x_t = `x` (3n,) [m], and its derivative by x_t."""
-        states = self.states(x)
+    def _linearise_without_contact(self, x: Array) -> NewtonLinearisation:
+        """Return c_t (3n,) [N] without contact at x_t = `x` (3n,) [m], and its derivative by
+        x_t.
+        """
         row = self.row
-        at = self.rest.linearise(*states)
+        at = self.rest.linearise(*self.states(x))
         matrix = row.block(
             at.by_position[0], at.by_velocity[0], pattern=self.rest.pattern
         )
         skew = row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
-        if not self.contact.acts:
-            return NewtonLinearisation(
-                self.residual_from(at.force[0], x), matrix, skew=skew
-            )
-        contact = self.contact.linearise(*states, (row.p[0], row.q[0]))
-        matrix -= row.w[0] * contact.symmetric
-        if contact.skew.size:
-            skew -= row.w[0] * contact.skew
         return NewtonLinearisation(
-            self.residual_from(at.force[0] + contact.force, x),
-            matrix,
-            skew=skew,
+            self._residual_from(at.force[0], x), matrix, skew=skew
         )
 
 
@@ -407,12 +411,17 @@ def solve_row(
             if share == 1
             else origin + share * (prescribed_m - origin)
         )
+        equations = step.equations
         if row.dynamics.is_static:
             return solver.solve(
-                start, step.residual, step.linearise, True, goal
+                start,
+                equations.residual,
+                linearise=equations.linearise,
+                keep_definite=True,
+                prescribed_m=goal,
             )
         start[solver.is_prescribed] = goal
-        return solver.solve(start, step.residual, step.linearise)
+        return solver.solve_in_contact(start, equations)
 
     return follow_path(
         solve, previous, halvings=solver.options.max_halvings, guess=guess

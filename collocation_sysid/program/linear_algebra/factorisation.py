@@ -26,7 +26,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from ...common.array_types import Array, Index
 from ...fem.kernels import make_skyline, run_in_slices
 from ...fem.pattern import SymmetricPattern
-from .lapack import cholesky_in_place
+from .lapack import cholesky_in_place, solve_band_in_blocks
 from .supernodal import Pardiso, SupernodalFactor, load_mkl
 
 if TYPE_CHECKING:
@@ -45,6 +45,8 @@ MUCH_WORK = 2e9
 # Half bandwidth up to which the skyline is faster than LAPACK (measured: 17 GFlop/s at 200,
 # LAPACK's Cholesky 21 at 300).
 NARROW = 250
+# Number of right-hand sides from which a band is solved in blocks.
+MANY_COLUMNS = 4
 # Largest growth of a diagonal entry without row exchanges; definite matrices have none.
 GROWTH = 10.0
 # Relative size of the last correction by the skew part, far below the accuracy of a Newton or
@@ -102,7 +104,10 @@ class _BandFactor:
         has no effect on a symmetric matrix.
         """
         permuted = right[self.order]
-        solved, _ = _pbtrs(self.band, permuted, lower=1)
+        if right.ndim > 1 and right.shape[1] >= MANY_COLUMNS:
+            solved = solve_band_in_blocks(self.band, permuted)
+        else:
+            solved, _ = _pbtrs(self.band, permuted, lower=1)
         result = np.empty_like(right)
         result[self.order] = solved.reshape(right.shape)
         return result

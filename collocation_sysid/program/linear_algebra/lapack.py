@@ -14,8 +14,10 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from scipy import LowLevelCallable
+from scipy.linalg import get_blas_funcs
 from threadpoolctl import ThreadpoolController
 
 
@@ -76,3 +78,82 @@ def cholesky_in_place(band: NDArray[np.float64]) -> bool:
         ctypes.addressof(failed_at),
     )
     return failed_at.value == 0
+
+
+# Rows of the blocks in which a band is solved: larger ones need more operations, smaller ones more
+# calls.
+BLOCK_ROWS = 64
+
+(_trsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
+
+
+def solve_band_in_blocks(
+    band: NDArray[np.float64], right: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the solution of L Lᵀ x = b for many right-hand sides b.
+
+    LAPACK's pbtrs reads the complete factor for every column; products of blocks read it once.
+
+    Parameters
+    ----------
+    band : (half-bandwidth + 1, n) Fortran-ordered array
+        Lower band of the factor L, diagonal first.
+    right : (n, m) array
+        Right-hand sides; not modified.
+    """
+    height, size = band.shape
+    reach = height - 1
+    step = min(BLOCK_ROWS, max(reach, 1))
+    stride = band.itemsize
+    # L as a matrix: next rows are adjacent in memory, the next column is `reach` entries further.
+    # Only entries within the band may be used.
+    factor = as_strided(
+        band, (size, size), (stride, reach * stride), writeable=False
+    )
+    solution = np.array(right, order="C")
+    starts = range(0, size, step)
+    for start in starts:
+        stop = min(start + step, size)
+        solution[start:stop] = _trsm(
+            1.0, factor[start:stop, start:stop], solution[start:stop], lower=1
+        )
+        for rows, block in _blocks_below(factor, start, stop=stop, reach=reach):
+            solution[rows] -= block @ solution[start:stop]
+    for start in reversed(starts):
+        stop = min(start + step, size)
+        for rows, block in _blocks_below(factor, start, stop=stop, reach=reach):
+            solution[start:stop] -= block.T @ solution[rows]
+        solution[start:stop] = _trsm(
+            1.0,
+            factor[start:stop, start:stop],
+            solution[start:stop],
+            lower=1,
+            trans_a=1,
+        )
+    return solution
+
+
+def _blocks_below(
+    factor: NDArray[np.float64], start: int, stop: int, reach: int
+) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+    """Yield the rows and entries of the blocks of a band below its diagonal block.
+
+    Parameters
+    ----------
+    factor : (n, n) array
+        Lower triangle, of which only the band is defined.
+    start, stop : int
+        Rows and columns of the diagonal block.
+    reach : int
+        Half-bandwidth.
+    """
+    size = len(factor)
+    full = slice(stop, min(start + reach + 1, size))
+    if full.start < full.stop:
+        yield full, factor[full, start:stop]
+    # Rows that only the later columns reach.
+    rest = slice(max(full.stop, stop), min(stop + reach, size))
+    if rest.start < rest.stop:
+        columns = slice(start, stop)
+        offset = start + reach - rest.start
+        yield rest, np.triu(factor[rest, columns], -offset)

@@ -1,0 +1,503 @@
+"""Time steps of a body in contact, with the contact condensed to the dofs that touch.
+
+The stiffness of contact changes with every point that begins or ceases to touch, whereas the matrix
+A of the body without contact hardly changes from one step to the next. Here only A is factorised.
+With the residual c of the body and the contact forces f, the step d from the state x satisfies
+
+    d = A⁻¹ (c(x) + f(x + d)),
+
+in which f depends on the few dofs that touch. Columns of A⁻¹ at these dofs, their compliance, are
+computed once for each factor of A. The equation is solved for the step of these dofs by Newton's
+method with small dense matrices, so that it contains any change of the contact, and the iteration
+over x converges as fast as that of a body without contact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import get_lapack_funcs
+
+from ...common.array_types import Array, Index
+from ...model.contact import ContactLaw
+from ..forward.newton_linearisation import NewtonLinearisation
+from ..linear_algebra.factorisation import Factor
+from .step_contact import StepContact, TouchingPoints
+
+# Largest number of dofs that touch: dense matrices of this size take as long as the factor of a
+# body of some thousand nodes.
+MAX_TOUCHING_DOFS = 900
+# Largest number of Newton iterations for the dofs that touch; usually 1 to 5.
+MAX_CONTACT_ITERATIONS = 20
+# Largest remaining error of the step of these dofs, as a share of the longest step: the iteration
+# over the state of the body reduces the error by a similar factor.
+CONTACT_ACCURACY = 0.05
+# Remaining error that is due to rounding, as a share of the size of the body.
+ROUND_OFF = 1e-13
+# Largest number of entries of all columns that are stored, 240 MB.
+MAX_COLUMN_ENTRIES = 30_000_000
+# Number of columns for which memory is allocated at a time.
+COLUMN_BATCH = 64
+
+_getrf, _getrs = get_lapack_funcs(("getrf", "getrs"), dtype=np.float64)
+
+
+class CondensationError(Exception):
+    """The contact of a step cannot be condensed: too many dofs touch, or the iteration for them
+    does not converge.
+    """
+
+
+@dataclass(frozen=True)
+class ContactEquations:
+    """Equations of motion of one time step, contact apart.
+
+    Attributes
+    ----------
+    residual_without_contact : callable
+        Residual (3n,) [N] at positions (3n,) [m], without contact.
+    linearise_without_contact : callable
+        The same residual and its derivative by the positions.
+    contact : StepContact
+        Contact in the step.
+    states : callable
+        State ξ [m] and velocity ν [m/s], (1, 3n) each, of positions (3n,).
+    rates : (float, float)
+        Derivatives of ξ and of ν by the positions.
+    weight : float
+        Factor of the contact forces in the residual.
+    """
+
+    residual_without_contact: Callable[[Array], Array]
+    linearise_without_contact: Callable[[Array], NewtonLinearisation]
+    contact: StepContact
+    states: Callable[[Array], tuple[Array, Array]]
+    rates: tuple[float, float]
+    weight: float
+
+    def residual(self, x: Array) -> Array:
+        """Return the residual (3n,) [N] at positions x (3n,) [m], with contact."""
+        residual = self.residual_without_contact(x)
+        if not self.contact.acts:
+            return residual
+        return residual + self.weight * self.contact.force(*self.states(x))
+
+    def linearise(self, x: Array) -> NewtonLinearisation:
+        """Return the residual (3n,) [N] with contact at positions x (3n,) [m], and its derivative
+        by x.
+        """
+        at = self.linearise_without_contact(x)
+        if not self.contact.acts:
+            return at
+        contact = self.contact.linearise(*self.states(x), self.rates)
+        skew = at.skew
+        if contact.skew.size:
+            skew = skew - self.weight * contact.skew
+        return NewtonLinearisation(
+            at.residual + self.weight * contact.force,
+            at.symmetric - self.weight * contact.symmetric,
+            skew=skew,
+        )
+
+    def touching_points(self, x: Array) -> list[TouchingPoints]:
+        """Return the points that touch at positions x (3n,) [m]."""
+        return self.contact.touching_points(*self.states(x), self.rates)
+
+
+class Compliance:
+    """Columns of the inverse of a factorised matrix on the free dofs, computed on demand.
+
+    Parameters
+    ----------
+    factor : Factor
+        Factor of the matrix of the body without contact.
+    size : int
+        Number k of free dofs.
+    """
+
+    def __init__(self, factor: Factor, size: int) -> None:
+        self.factor = factor
+        self._column_of_dof = np.full(size, -1)
+        self._count = 0
+        self._columns = np.zeros((0, size))
+
+    def columns_at(self, dofs: Index) -> Array:
+        """Return the rows (s, k) of the transposed inverse at free dofs, given as indices (s,).
+
+        Columns that are not known yet are computed and stored, in place of all others if these
+        would need more than `MAX_COLUMN_ENTRIES`.
+
+        Raises
+        ------
+        CondensationError
+            If the columns at these dofs need more.
+        """
+        size = len(self._column_of_dof)
+        if len(dofs) * size > MAX_COLUMN_ENTRIES:
+            raise CondensationError
+        missing = dofs[self._column_of_dof[dofs] < 0]
+        if (self._count + len(missing)) * size > MAX_COLUMN_ENTRIES:
+            self._column_of_dof[:] = -1
+            self._count = 0
+            missing = dofs
+        if len(missing):
+            self._append(missing)
+        chosen = self._column_of_dof[dofs]
+        if len(chosen) == self._count and (np.diff(chosen) == 1).all():
+            return self._columns[: self._count]
+        return self._columns[chosen]
+
+    def _append(self, dofs: Index) -> None:
+        """Compute and store the columns of free dofs (s,) that are not known yet."""
+        size = len(self._column_of_dof)
+        unit_forces = np.zeros((size, len(dofs)))
+        unit_forces[dofs, np.arange(len(dofs))] = 1.0
+        count = self._count + len(dofs)
+        if count > len(self._columns):
+            allocated = -(-count // COLUMN_BATCH) * COLUMN_BATCH
+            columns = np.empty((allocated, size))
+            columns[: self._count] = self._columns[: self._count]
+            self._columns = columns
+        self._columns[self._count : count] = self.factor.solve(unit_forces).T
+        self._column_of_dof[dofs] = np.arange(self._count, count)
+        self._count = count
+
+
+@dataclass(frozen=True, eq=False)
+class TouchingDofs:
+    """Free dofs of the nodes whose faces touch, and the assembly of forces on them.
+
+    Attributes
+    ----------
+    dofs : (s,) array
+        Sorted indices among the free dofs.
+    places : sequence of (t, 3v) arrays
+        For each obstacle the index in `dofs` of the dofs of each touching point; s for dofs that
+        are prescribed.
+    """
+
+    dofs: Index
+    places: Sequence[Index]
+
+    @classmethod
+    def from_points(
+        cls, points: Sequence[TouchingPoints], number: Index
+    ) -> TouchingDofs:
+        """Return the dofs of touching points.
+
+        Parameters
+        ----------
+        points : sequence of TouchingPoints
+            Points of each obstacle.
+        number : (3n,) array
+            Index of each dof among the free ones; −1 for prescribed dofs.
+        """
+        numbers = [
+            number[each.candidates.dofs[each.indices]] for each in points
+        ]
+        touches = np.zeros(len(number) + 1, dtype=bool)
+        for each in numbers:
+            touches[each] = True
+        touches[-1] = False
+        (dofs,) = touches.nonzero()
+        place_of_dof = np.full(len(touches), len(dofs))
+        place_of_dof[dofs] = np.arange(len(dofs))
+        return cls(dofs, [place_of_dof[each] for each in numbers])
+
+    def assemble_force(self, points: Sequence[TouchingPoints]) -> Array:
+        """Return the forces (s,) [N] on the dofs."""
+        count = len(self.dofs) + 1
+        total = np.zeros(count)
+        for each, places in zip(points, self.places, strict=True):
+            weights = each.candidates.weights[each.indices]
+            on_nodes = weights[:, :, None] * each.force.T[:, None]
+            total += np.bincount(
+                places.ravel(), weights=on_nodes.ravel(), minlength=count
+            )
+        return total[:-1]
+
+    def assemble_stiffness(self, points: Sequence[TouchingPoints]) -> Array:
+        """Return the negative derivative (s, s) of the forces on the dofs by their positions
+        [N/m].
+        """
+        count = len(self.dofs) + 1
+        total = np.zeros(count * count)
+        for each, places in zip(points, self.places, strict=True):
+            weights = each.candidates.weights[each.indices]
+            blocks = np.einsum("pa,ijp,pb->paibj", weights, each.slope, weights)
+            total -= np.bincount(
+                (places[:, :, None] * count + places[:, None]).ravel(),
+                weights=blocks.ravel(),
+                minlength=count * count,
+            )
+        return total.reshape(count, count)[:-1, :-1]
+
+
+@dataclass(frozen=True, eq=False)
+class ContactForces:
+    """Contact forces of a state on the free dofs that touch.
+
+    Attributes
+    ----------
+    x : (3n,) array
+        Positions [m].
+    points : sequence of TouchingPoints
+        Touching points of each obstacle.
+    touching : TouchingDofs
+        Free dofs that touch.
+    force : (s,) array
+        Forces on these dofs, multiplied by the weight of contact in the equations [N].
+    """
+
+    x: Array
+    points: Sequence[TouchingPoints]
+    touching: TouchingDofs
+    force: Array
+
+    @property
+    def dofs(self) -> Index:
+        """Sorted indices (s,) among the free dofs."""
+        return self.touching.dofs
+
+
+@dataclass(frozen=True, eq=False)
+class CondensedStiffness:
+    """Contact stiffness K and compliance C of the body at free dofs, with the factor of 1 + C K.
+
+    Attributes
+    ----------
+    dofs : (s,) array
+        Sorted indices of the dofs among the free ones.
+    columns : (s, k) array
+        Columns of the inverse of the matrix of the body at these dofs.
+    compliance : (s, s) array
+        C, the entries of these columns at the dofs [m/N].
+    stiffness : (s, s) array
+        K, the negative derivative of the contact forces [N/m].
+    factor : tuple
+        LU factorisation of 1 + C K.
+    """
+
+    dofs: Index
+    columns: Array
+    compliance: Array
+    stiffness: Array
+    factor: tuple[Array, Index]
+
+    @classmethod
+    def at_dofs(
+        cls, dofs: Index, compliance: Compliance, stiffness: Array
+    ) -> CondensedStiffness:
+        """Return the matrices at sorted free dofs (s,) with a contact stiffness (s, s).
+
+        Raises
+        ------
+        CondensationError
+            If the matrix is singular.
+        """
+        columns = compliance.columns_at(dofs)
+        flexibility = columns[:, dofs].T
+        matrix = flexibility @ stiffness
+        matrix.flat[:: len(dofs) + 1] += 1.0
+        lu, pivots, info = _getrf(matrix)
+        if info:
+            raise CondensationError
+        return cls(
+            dofs,
+            columns,
+            compliance=flexibility,
+            stiffness=stiffness,
+            factor=(lu, pivots),
+        )
+
+    def solve(self, right: Array) -> Array:
+        """Return (1 + C K)⁻¹ b for b = `right` (s,)."""
+        return _getrs(*self.factor, right)[0]
+
+
+class CondensedSteps:
+    """Steps of the free dofs towards the solution of a time step with contact.
+
+    Parameters
+    ----------
+    equations : ContactEquations
+        Equations of the time step.
+    compliance : Compliance
+        Inverse of the matrix of the body without contact.
+    free : (k,) array
+        Indices of the free dofs.
+    size_m : float
+        Size of the body, of which errors by rounding are a share.
+    """
+
+    def __init__(
+        self,
+        equations: ContactEquations,
+        compliance: Compliance,
+        free: Index,
+        size_m: float,
+    ) -> None:
+        self._equations = equations
+        self._size_m = size_m
+        self._compliance = compliance
+        self._free = free
+        self._number = np.full(equations.contact.dof_count, -1)
+        self._number[free] = np.arange(len(free))
+        self._last: ContactForces | None = None
+        self._condensed: CondensedStiffness | None = None
+        self._known_dofs: dict[
+            tuple[tuple[ContactLaw, bytes], ...], TouchingDofs
+        ] = {}
+
+    def step_from(self, x: Array) -> Array:
+        """Return the step (k,) [m] from positions x (3n,) [m].
+
+        Raises
+        ------
+        CondensationError
+            If too many dofs touch, or if the iteration for them does not converge.
+        """
+        start = self._last
+        if start is None or not np.array_equal(start.x, x):
+            # A copy, because the caller may change x in place.
+            start = self._forces_at(x.copy())
+        residual = self._equations.residual_without_contact(x)[self._free]
+        residual[start.dofs] += start.force
+        without_change = self._compliance.factor.solve(residual)
+        now = start
+        step = np.zeros_like(without_change)
+        if not len(start.dofs):
+            # Before any point touches, the step is that of the body.
+            step = without_change
+            now = self._forces_at(self._advanced(x, step))
+            if not len(now.dofs):
+                self._last = now
+                return step
+        condensed = self._condensed
+        if (
+            condensed is None
+            or now is not start
+            or not np.array_equal(condensed.dofs, start.dofs)
+        ):
+            condensed = self._condensed_at(start, now)
+        for _ in range(MAX_CONTACT_ITERATIONS):
+            dofs = condensed.dofs
+            change = _spread(now, dofs) - _spread(start, dofs)
+            known = change + condensed.stiffness @ step[dofs]
+            step_of_dofs = condensed.solve(
+                without_change[dofs] + condensed.compliance @ known
+            )
+            forces = known - condensed.stiffness @ step_of_dofs
+            step = without_change + forces @ condensed.columns
+            now = self._forces_at(self._advanced(x, step))
+            if self._is_converged(
+                step, start, now=now, forces=forces, condensed=condensed
+            ):
+                self._condensed = condensed
+                self._last = now
+                return step
+            condensed = self._condensed_at(start, now)
+        raise CondensationError
+
+    def _is_converged(
+        self,
+        step: Array,
+        start: ContactForces,
+        now: ContactForces,
+        forces: Array,
+        condensed: CondensedStiffness,
+    ) -> bool:
+        """Whether the contact forces at the end of a step are those of the step.
+
+        Parameters
+        ----------
+        step : (k,) array
+            Step [m].
+        start, now : ContactForces
+            Contact forces before and after the step.
+        forces : (s,) array
+            Change of the forces that the step contains [N].
+        condensed : CondensedStiffness
+            Matrices with which the step was computed.
+        """
+        dofs = condensed.dofs
+        if now.touching is not start.touching and not (
+            np.isin(now.dofs, dofs).all()
+        ):
+            return False
+        change = _spread(now, dofs) - _spread(start, dofs)
+        error_m = condensed.compliance @ (change - forces)
+        limit_m = max(
+            CONTACT_ACCURACY * float(np.abs(step).max()),
+            ROUND_OFF * self._size_m,
+        )
+        return bool(np.abs(error_m).max() <= limit_m)
+
+    def _condensed_at(
+        self, start: ContactForces, now: ContactForces
+    ) -> CondensedStiffness:
+        """Return the condensed matrices at present forces and at the dofs that touch at the start
+        of the step or now.
+
+        Raises
+        ------
+        CondensationError
+            If too many dofs touch, or the matrix is singular.
+        """
+        dofs = (
+            start.dofs
+            if now.touching is start.touching
+            else np.union1d(start.dofs, now.dofs)
+        )
+        if len(dofs) > MAX_TOUCHING_DOFS:
+            raise CondensationError
+        present = self._equations.weight * now.touching.assemble_stiffness(
+            now.points
+        )
+        stiffness = present
+        if len(dofs) > len(now.dofs):
+            stiffness = np.zeros((len(dofs), len(dofs)))
+            places = np.searchsorted(dofs, now.dofs)
+            stiffness[np.ix_(places, places)] = present
+        return CondensedStiffness.at_dofs(
+            dofs, self._compliance, stiffness=stiffness
+        )
+
+    def _advanced(self, x: Array, step: Array) -> Array:
+        """Return positions x (3n,) after a step (k,) of the free dofs."""
+        advanced = x.copy()
+        advanced[self._free] += step
+        return advanced
+
+    def _forces_at(self, x: Array) -> ContactForces:
+        """Return the contact forces on free dofs at positions x (3n,), which are not copied."""
+        points = self._equations.touching_points(x)
+        key = tuple(
+            (
+                each.candidates.law,
+                each.candidates.point_indices[each.indices].tobytes(),
+            )
+            for each in points
+        )
+        if key not in self._known_dofs:
+            self._known_dofs[key] = TouchingDofs.from_points(
+                points, self._number
+            )
+        touching = self._known_dofs[key]
+        return ContactForces(
+            x,
+            points,
+            touching=touching,
+            force=self._equations.weight * touching.assemble_force(points),
+        )
+
+
+def _spread(forces: ContactForces, dofs: Index) -> Array:
+    """Return forces at sorted dofs (s,), which contain those of the forces."""
+    if len(dofs) == len(forces.dofs):
+        return forces.force
+    at_dofs = np.zeros(len(dofs))
+    at_dofs[np.searchsorted(dofs, forces.dofs)] = forces.force
+    return at_dofs

@@ -1,0 +1,199 @@
+"""Time steps in which contact is condensed to the dofs that touch, and what they cost."""
+
+from __future__ import annotations
+
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from benchmark_contact import TRUTH, pressed
+from kit.problems import EDGE_M, IDEAL, box, vertex_markers
+
+from collocation_sysid.model.contact import contact_terms
+from collocation_sysid.model.dynamics import Dynamics
+from collocation_sysid.program.contact import condensed_contact
+from collocation_sysid.program.forward import newton_solver
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
+from collocation_sysid.program.linear_algebra.factorisation import Factoriser
+from collocation_sysid.program.linear_algebra.lapack import solve_band_in_blocks
+from collocation_sysid.recording import (
+    Cuboid,
+    Experiment,
+    Grasp,
+    Obstacle,
+    Plane,
+    PoseSequence,
+)
+
+STEPS = 12
+SCHEME = "bdf2"
+
+
+def simulated(experiment: Experiment) -> np.ndarray:
+    """Positions (N, 3n) of all rows."""
+    dynamics = Dynamics.from_experiment(experiment, SCHEME).with_theta(
+        experiment.body.theta_from_values(TRUTH)
+    )
+    return simulate_scheme(experiment, dynamics)
+
+
+def residual_n(experiment: Experiment, x: np.ndarray) -> np.ndarray:
+    """Largest residual of each row after the first, on free dofs."""
+    dynamics = Dynamics.from_experiment(experiment, SCHEME).with_theta(
+        experiment.body.theta_from_values(TRUTH)
+    )
+    free = np.isnan(dynamics.prescribed_m).reshape(len(x), -1)
+    return np.abs(np.where(free, dynamics.residual(x), 0.0))[1:].max(axis=1)
+
+
+def without_condensation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every step fall back to the complete equations."""
+    monkeypatch.setattr(condensed_contact, "MAX_TOUCHING_DOFS", -1)
+
+
+def counted_factorisations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A list that grows by one entry with each factorisation."""
+    calls: list[int] = []
+    factorise = Factoriser.factorise
+
+    def counting(self, *arguments, **options):
+        calls.append(1)
+        return factorise(self, *arguments, **options)
+
+    monkeypatch.setattr(Factoriser, "factorise", counting)
+    return calls
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_steps_in_contact_take_hardly_more_factorisations_than_without(
+    friction, monkeypatch
+):
+    """After the equilibrium at the start and two steps at most one in three steps."""
+    calls = counted_factorisations(monkeypatch)
+    simulated(pressed(3, 2, friction))
+    at_start = len(calls)
+    calls.clear()
+    simulated(pressed(3, 2 + STEPS, friction))
+    assert len(calls) - at_start <= STEPS // 3
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_condensed_steps_have_the_solution_of_the_complete_equations(
+    friction, monkeypatch
+):
+    experiment = pressed(3, STEPS, friction)
+    x = simulated(experiment)
+    assert residual_n(experiment, x).max() < 1e-9
+    without_condensation(monkeypatch)
+    complete = simulated(experiment)
+    np.testing.assert_allclose(x, complete, atol=1e-12)
+    # The plate moved the body: there is contact.
+    alone = simulated(pressed(3, STEPS, None))
+    assert np.abs(x[:, : alone.shape[1]] - alone).max() > 1e-4
+
+
+def test_steps_that_cannot_be_condensed_are_solved_completely(monkeypatch):
+    """Here the dofs that touch are too many, or never converge."""
+    experiment = pressed(3, 4, 0.3)
+    x = simulated(experiment)
+    for name, value in (
+        ("MAX_TOUCHING_DOFS", 3),
+        ("MAX_CONTACT_ITERATIONS", 0),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(condensed_contact, name, value)
+            np.testing.assert_allclose(simulated(experiment), x, atol=1e-12)
+
+
+def between_two_obstacles() -> Experiment:
+    """A cube below a plate that comes down and rubs, and beside a smooth bar that comes later."""
+    body = box()
+    t_s = 0.01 * np.arange(STEPS)
+    foot = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
+    top = np.flatnonzero(body.nodes_m[:, 2] > EDGE_M - 1e-9)
+    down = np.array([0.0, 0.0, -1.0])
+    later_s = np.clip(t_s - 0.03, 0.0, None)
+    bar = np.array([(-1.0, -1.0, 0.06), (-0.002, 1.0, 0.09)])
+    plate = Obstacle(
+        name="plate",
+        poses=moved(t_s, np.outer(0.05 * t_s, down)),
+        shape=Plane(down, np.array([0.0, 0.0, EDGE_M])),
+        friction=0.3,
+    )
+    side = Obstacle(
+        name="bar",
+        poses=moved(t_s, np.outer(0.1 * later_s, [1.0, 0.0, 0.0])),
+        shape=Cuboid(bar, 0.01),
+    )
+    return Experiment(
+        body,
+        t_s,
+        [Grasp(foot, PoseSequence.fixed()), plate, side],
+        vertex_markers(body, top, t_s),
+        nuisance=IDEAL,
+    )
+
+
+def moved(t_s: np.ndarray, way_m: np.ndarray) -> PoseSequence:
+    """Poses along a way (T, 3), without rotation."""
+    return PoseSequence(
+        t_s, way_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
+    )
+
+
+def test_two_obstacles_touch_at_once(monkeypatch):
+    experiment = between_two_obstacles()
+    x = simulated(experiment)
+    assert residual_n(experiment, x).max() < 1e-9
+    for term in contact_terms(experiment):
+        y = term.points.vectors(x[-1:])
+        assert term.law_of_contact.gaps(y).min() < 0.0
+    without_condensation(monkeypatch)
+    np.testing.assert_allclose(x, simulated(experiment), atol=1e-11)
+
+
+def test_stored_columns_of_the_compliance_are_limited(monkeypatch):
+    """Those of other dofs are computed anew; more than the limit at once are refused."""
+    size = 6
+    factor = Mock()
+    factor.solve = lambda right: 2.0 * right
+    compliance = condensed_contact.Compliance(factor, size)
+    monkeypatch.setattr(condensed_contact, "MAX_COLUMN_ENTRIES", 3 * size)
+    for dofs in ([0, 1], [1, 2], [3, 4, 5], [0, 5], [0, 4, 5]):
+        np.testing.assert_array_equal(
+            compliance.columns_at(np.array(dofs)), 2.0 * np.eye(size)[dofs]
+        )
+    with pytest.raises(condensed_contact.CondensationError):
+        compliance.columns_at(np.array([0, 1, 2, 3]))
+
+
+@pytest.mark.parametrize(
+    ("size", "half_bandwidth"),
+    [(5, 0), (9, 8), (200, 30), (200, 64), (200, 130)],
+)
+def test_a_band_is_solved_in_blocks_as_a_full_matrix(size, half_bandwidth):
+    rng = np.random.default_rng(size + half_bandwidth)
+    band = np.asfortranarray(rng.normal(size=(half_bandwidth + 1, size)))
+    band[0] = 2.0 + half_bandwidth + rng.random(size)
+    lower = np.zeros((size, size))
+    for k in range(half_bandwidth + 1):
+        lower[np.arange(k, size), np.arange(size - k)] = band[k, : size - k]
+        # What is stored beyond the end of the matrix does not matter.
+        band[k, size - k :] = np.nan
+    right = rng.normal(size=(size, 7))
+    before = right.copy()
+    np.testing.assert_allclose(
+        solve_band_in_blocks(band, right),
+        np.linalg.solve(lower @ lower.T, right),
+        rtol=1e-9,
+        atol=1e-12,
+    )
+    np.testing.assert_array_equal(right, before)
+
+
+def test_a_simulation_without_contact_does_not_condense(monkeypatch):
+    def refuse(*arguments, **options):
+        raise AssertionError
+
+    monkeypatch.setattr(newton_solver, "CondensedSteps", refuse)
+    simulated(pressed(2, 3, None))
