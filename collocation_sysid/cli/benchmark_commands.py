@@ -122,7 +122,12 @@ def _list_bodies(options: BenchmarkCommand) -> None:
 
 
 def _write_bodies(options: BenchmarkCommand, folder: Path) -> None:
-    """Write the benchmark folder, and print its path and the bodies that were left out."""
+    """Write the benchmark folder, and print its path.
+
+    Bodies that were left out because their data are not on this computer are named on stderr. With
+    the option --json, path and names of the bodies written and left out are printed as JSON
+    instead.
+    """
     from rich.progress import Progress
 
     from ..extras.benchmark import BODIES, write_benchmark
@@ -199,7 +204,11 @@ def score_tables(scores: Sequence[Score]) -> list[Table]:
 
 
 def score_warnings(scores: Sequence[Score]) -> list[str]:
-    """Return a warning for each prediction that is worse than the undeformed body."""
+    """Return a warning for each prediction that is worse than the undeformed body.
+
+    `scores` must contain the score of the undeformed body for every body and recording of a
+    prediction; a missing one is a KeyError.
+    """
     from ..extras.benchmark.scores import PREDICTION, UNDEFORMED
 
     trivial = {

@@ -200,10 +200,15 @@ class SimulateCommand(ProblemOptions, OutputOptions):
     "simulate problem.toml --out data --set parameters.mu_pa.guess=300",
 )
 def simulate(options: SimulateCommand) -> None:
-    """Simulate at the guesses and write markers and poses as CSV.
+    """Simulate at the guesses and write the measurements and poses as CSV.
 
     The positions of the markers are their reference_m, or follow from their file. The parameters
-    are the guesses or fixed values; set other values with --set.
+    are the guesses or fixed values; set other values with --set. Tables of force sensors, custom
+    sensors, test benches and specimens are written, too. The names of the files are printed.
+
+    Files of an earlier simulation are replaced. Other files in the folder are an error unless it is
+    the folder of the problem, whose data files are never replaced. If the body loses its stability,
+    instability.png shows how.
     """
     from ..result.solve_progress import SolveProgress
 

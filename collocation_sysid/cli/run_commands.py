@@ -231,7 +231,11 @@ class PlotCommand(RunFolderOptions):
 
 @command(commands, "plot runs/swing")
 def plot(options: PlotCommand) -> None:
-    """Draw the pictures of a run again, from its files."""
+    """Draw the pictures of a run again, from its files.
+
+    They replace the pictures in the run folder, or are written into the folder of --out; their
+    names are printed. The picture of the Jacobian is not drawn again.
+    """
     from ..result.pictures.album import redraw_pictures
     from ..result.solve_progress import SolveProgress
 
@@ -286,7 +290,7 @@ class AnimateCommand(RunFolderOptions):
     Attributes
     ----------
     to : FILE
-        Output file: .gif, or .mp4, which needs ffmpeg.
+        Output file: .gif, or .mp4, which needs ffmpeg; EXPERIMENT.gif in the run folder by default.
     fps : float
         Frames per second.
     slow : float

@@ -204,7 +204,12 @@ class NewCommand:
     "check silicone/problem.toml",
 )
 def new(options: NewCommand) -> None:
-    """Write a commented problem file as a starting point."""
+    """Write a commented problem file as a starting point.
+
+    The folder, new or existing, gets problem.toml and, with either --kind or --dataset, its data.
+    If a file of the same name exists, nothing is written, and the exit code is 2. The names of the
+    files are printed.
+    """
     from ..datasets.dataset_files import copy_dataset
     from ..problem.new_problem import create_problem
 

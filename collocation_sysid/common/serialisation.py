@@ -110,7 +110,8 @@ def read(kind: Any, content: Any) -> Any:
         Output of `json.load`; None is NaN where a float is expected. Entries that the dataclass
         does not have are ignored; `optional` fields may be missing. Integers are accepted as
         floats, but neither truth values as numbers nor floats as integers; an infinite number is
-        refused.
+        refused. Entries of arrays are only converted to floats: truth values and infinite ones
+        pass.
 
     Raises
     ------

@@ -124,7 +124,13 @@ def foreign_files(folder: Path) -> Iterator[Path]:
     or were changed since; all files if it has no list.
 
     Links are not followed. A list in a subfolder, such as that of an export in a run folder, is
-    valid for the files of that subfolder. Lists and drafts (`IGNORED_NAME`) are not yielded.
+    valid for the files of that subfolder. Lists and ignored names (`IGNORED_NAME`, such as
+    drafts) are not yielded, but a link in place of a list is.
+
+    Raises
+    ------
+    OSError
+        If the folder does not exist or cannot be read.
     """
     lists: dict[Path, dict[str, str]] = {}
     for file in _files(folder):

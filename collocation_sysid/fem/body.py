@@ -939,7 +939,9 @@ class Body(Discretisation):
 
     @cached_property
     def _memory_columns(self) -> list[tuple[int, slice]]:
-        """Index in θ of each part's first branch constant, and the slice of all of them."""
+        """For each part with memory, in their order: the index in θ of its first branch constant,
+        and the slice of θ with all its branch constants, two for each branch.
+        """
         firsts = [
             s + p.law_constant_count
             for p, s in zip(self.parts, self.starts, strict=False)

@@ -515,8 +515,9 @@ class InverseEquilibrium:
         return self._newton_step(factor, self._weight_n(constants))
 
     def point_data_at(self, positions_m: Array) -> list[Array]:
-        """Return for each part the data of its points if the stress-free positions X (n, 3) [m] are
-        given and do not depend on θ: all derivatives are zero.
+        """Return for each part the data (1, E · q · `layout.count`) of its points if the
+        stress-free positions X (n, 3) [m] are given and do not depend on θ: all derivatives are
+        zero. New arrays, with the columns of `point_data_columns`.
         """
         others = self.layout.input_count + len(self.layout.input_pairs)
         return self._fields_at_points(
@@ -524,12 +525,14 @@ class InverseEquilibrium:
         )
 
     def _fields_at_points(self, fields: Sequence[Array]) -> list[Array]:
-        """Return G and its derivatives at the points of each part.
+        """Return the data of the points of each part, (1, E · q · `layout.count`) each: G and its
+        derivatives, and their volume logarithms if the layout averages the dilatation.
 
         Parameters
         ----------
         fields : sequence of (n, 3)
-            X, then its derivatives.
+            X [m], then its derivatives by the inputs, and the second ones in the order of
+            `layout.input_pairs`.
         """
         layout = self.layout
         data = []

@@ -182,6 +182,11 @@ class DaskExecutor:
     def notes(self) -> list[str]:
         """Return a note for the user if workers were lost during the solve, as a list; else
         empty.
+
+        Raises
+        ------
+        SearchEnded
+            If the scheduler is lost.
         """
         with self._end_search_if_disconnected():
             failed_workers = self._first - self.client.nthreads().keys()

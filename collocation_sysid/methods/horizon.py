@@ -156,7 +156,7 @@ class Horizon:
         Raises
         ------
         SimulationError
-            If a time step is singular or not finite.
+            If a time step is singular or not finite, or a node has no mass.
         """
         known = (
             known_iterate.trajectories if known_iterate else self._repeat(None)
@@ -183,7 +183,7 @@ class Horizon:
         Raises
         ------
         SimulationError
-            If a time step is singular or not finite.
+            If a time step is singular or not finite, or a node has no mass.
         """
         return self._run(
             p,

@@ -299,11 +299,24 @@ def _run(
 def _run_on_thread(
     search: Callable[[], None], monitor: IterationMonitor
 ) -> None:
-    """Run a search on a thread, so that the main thread can handle signals during long
-    factorisations.
+    """Run a search on a thread and wait for its end, so that the main thread, from which this must
+    be called, can handle signals during long factorisations.
 
     After a request to stop, the search is abandoned if it does not end within `GRACE_S`: the thread
     goes on, and `monitor.errors` receives an entry.
+
+    Parameters
+    ----------
+    search : callable
+        The search, which stores its result itself. Its exceptions do not reach the caller, and
+        `monitor.errors` does not receive them.
+    monitor : IterationMonitor
+        Monitor that is asked to stop by Ctrl-C.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        At a second Ctrl-C; the search is abandoned then too.
     """
     thread = threading.Thread(
         target=copy_context().run, args=(search,), daemon=True

@@ -337,17 +337,24 @@ class ReducedSearch:
     def _minimise(self, horizon: Horizon, is_last: bool) -> Status:
         """Take Gauss–Newton steps on one horizon until convergence, and return the status.
 
-        Accepted steps change the parameters, trajectories and trust region of this object; they
-        need trajectories of the horizon. The status is that of convergence, of the iteration limit,
-        or `STALLED` if steps become tiny without a decrease.
+        It starts at `p` and `trajectories`, which must exist and have the rows of the horizon, and
+        resets the trust region. The start and every accepted step become the best point so far:
+        associations are renewed there, in the horizon too, and an entry is added to the history.
+        Every trial counts as a sweep. The status is that of convergence, of the iteration limit, or
+        `STALLED` if steps become tiny without a decrease.
 
         Parameters
         ----------
         horizon : Horizon
             Problem on the first rows.
         is_last : bool
-            Whether it is the complete problem, so that the tolerance applies instead of
-            `rung_decrease`.
+            Whether it is the complete problem. Otherwise the status is also that of convergence if
+            the predicted relative decrease of the loss is less than `rung_decrease`.
+
+        Raises
+        ------
+        SimulationError
+            If the sweep at the start fails; failed trials are only rejected.
         """
         assert self.trajectories is not None
         tolerance = self.options.tolerance

@@ -494,7 +494,7 @@ class _TrialSimulation:
     ) -> tuple[float, SimulationError | None]:
         """Return the misfit of the guess and None, or NaN and the failure of its simulation. With
         `is_complete` the complete recordings are simulated; the misfit is always that of their
-        first part.
+        first part, in standard deviations, and NaN without a failure if it is not finite.
         """
         p = self.collocation.guess_p
         positions, failure = self._simulate(
@@ -507,8 +507,8 @@ class _TrialSimulation:
     def evaluate_at(
         self, young_pa: float, guess: list[Array] | None
     ) -> tuple[float, list[Array] | None]:
-        """Return misfit and trajectories at a Young's modulus; NaN and None if the simulation
-        fails, whose error is then stored in `failure`.
+        """Return misfit (NaN if it is not finite) and trajectories at a Young's modulus; NaN and
+        None if the simulation fails, whose error is then stored in `failure`.
 
         Parameters
         ----------
@@ -546,7 +546,16 @@ class _TrialSimulation:
         return np.concatenate([q, np.zeros(self.collocation.nphi)])
 
     def _evaluate(self, p: Array, positions: Sequence[Array]) -> float:
-        """Return the misfit of trajectories at p; NaN if it is not finite."""
+        """Return the misfit of the first part of the recordings at parameters p (np,), see
+        `_misfit`; NaN if it is not finite.
+
+        Parameters
+        ----------
+        p : (np,) array
+            Parameters (q, φ).
+        positions : sequence of (N, 3n) array
+            Trajectory of each experiment [m], of which the first `rows` are used.
+        """
         first = [x[:rows] for x, rows in zip(positions, self.rows, strict=True)]
         misfit = _misfit(self.collocation, p, positions=first)
         return misfit if np.isfinite(misfit) else np.nan

@@ -172,7 +172,7 @@ def sweep(
     Parameters
     ----------
     solver : Sweep
-        Solver of the experiment's linearised equations of motion.
+        Solver of the experiment's linearised equations of motion; its stopwatch is read and reset.
     transcription : Transcription
         Transcription of the experiment.
     huber : float or None
@@ -219,14 +219,15 @@ def sweep_after_step(
 ) -> SweepResult:
     """Return the result of one sweep after a step of the parameters to p.
 
-    The positions are those of `previous` extrapolated along the sensitivities. Static experiments
-    are first solved for the equilibrium if one is near: a linear extrapolation stretches slender
-    bodies that rotate much, so that its loss would be meaningless.
+    The positions are those of `previous` after its feasibility step, extrapolated along the
+    sensitivities. Static experiments are first solved for the equilibrium if one is near, and keep
+    the extrapolated positions otherwise: a linear extrapolation stretches slender bodies that
+    rotate much, so that its loss would be meaningless.
 
     Parameters
     ----------
     solver : Sweep
-        Solver of the experiment's linearised equations of motion.
+        Solver of the experiment's linearised equations of motion; its stopwatch is read and reset.
     transcription : Transcription
         Transcription of the experiment.
     huber : float or None
@@ -241,7 +242,7 @@ def sweep_after_step(
     Raises
     ------
     SimulationError
-        If a time step is singular or not finite.
+        If a time step is singular or not finite, or a node has no mass.
     """
     part = _iterate(
         transcription, p, x=extrapolate(transcription, previous, step=step)
@@ -276,7 +277,7 @@ def reassociate(
     Parameters
     ----------
     solver : Sweep
-        Solver, for its stopwatch.
+        Solver, for its stopwatch, which is read and reset.
     transcription : Transcription
         Transcription with new marker or camera associations.
     huber : float or None

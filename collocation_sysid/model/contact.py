@@ -591,12 +591,12 @@ class Contact(Pointwise):
         )
 
     def rigid_limit_n(self, states: States) -> Array:
-        """Return the change (T, 3n) of the forces if contact were rigid, to first order [N].
+        """Return the change (T, 3n) [N] of the forces if contact were rigid, to first order.
 
         With κ/ε and ε δ in place of κ and δ, the pressure depends on g/ε alone. For ε → 0 it is
         therefore the present pressure at a gap larger by g, at all points with a pressure: they
         move to the surface of the obstacle, from inside it or in front of it. The pressure must not
-        be averaged over a step.
+        be averaged over a step. This is not checked; the result would be wrong.
 
         Parameters
         ----------

@@ -395,12 +395,14 @@ class ForceForwardColumns(_DerivativeIterator):
     def advance(
         self, of_state: Callable[[], Array], of_rate: Callable[[], Array]
     ) -> None:
-        """Pass the next evaluation and update the columns, in place.
+        """Pass the next evaluation: replace `columns` by a new array with the columns after it, and
+        increase `next` by one.
 
         Parameters
         ----------
         of_state, of_rate : callable
-            Changes (3n, columns) of ξ and ν there; called only if the variables depend on them.
+            Functions without arguments that return the changes (3n, columns) of ξ and ν there;
+            called only if the variables depend on them.
         """
         _, by = self.derivatives()
         of_inputs = self.by_p(self.next)[self.history.input_columns]
@@ -445,7 +447,8 @@ class ForceAdjoint(_DerivativeIterator):
         return np.einsum("abi,ai->bi", by, self.columns)
 
     def step_back(self, force_weight: Array) -> None:
-        """Pass the evaluation backward and update μ, in place.
+        """Pass the evaluation backward: replace `columns` by a new array with the weights μ before
+        it, and decrease `next` by one.
 
         Parameters
         ----------

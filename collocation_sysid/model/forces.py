@@ -524,7 +524,7 @@ class Forces:
 
     def _with_input_columns(self, by_theta: Array) -> Array:
         """Return derivatives by θ (…, k) with zero columns appended for the inputs of the terms (…,
-        U).
+        U): a copy, or `by_theta` itself if the terms have no inputs.
         """
         further = self._input_offsets[-1] - self._input_offsets[0]
         if not further:

@@ -440,7 +440,7 @@ class NuisanceMap:
     def marker_measurement(
         self, y: ca.SX, phi: ca.SX, places: Index, t_s: ca.SX
     ) -> ca.SX:
-        """Return the measured position (3,) of a marker whose true position is y (3,).
+        """Return the measured position (3,) [m] of a marker whose true position is y (3,) [m].
 
         Effects common to all markers are applied before those of the single marker.
 
@@ -448,11 +448,11 @@ class NuisanceMap:
         ----------
         y : (3,) SX
         phi : SX
-            Parameters at the indices `places`.
+            Parameters at the indices `places`, in prior standard deviations.
         places : array of int
             Indices in φ of the marker, a row of `marker_indices`.
         t_s : SX
-            Time of the sample.
+            Time of the sample [s].
         """
         values = self.values_by_row(phi, places)
         for row in sorted(values, key=lambda row: row.of == "marker"):

@@ -168,8 +168,8 @@ class Parameter:
 
     def _check_fixed(self) -> None:
         """Raise an `InputError` if the fixed value is missing, not finite, or not admissible for
-        the constant: below its lower limit (zero is admissible for a logarithmic scale) or at or
-        above its upper one.
+        the constant: at or above its `below`, or less than its least value. That is `at_least` if
+        the scale of this parameter is linear, else `lower_limit`, which is itself admissible.
         """
         constant = constant_named(self.name)
         least = (

@@ -80,7 +80,8 @@ class Scheme:
 
     @property
     def is_midpoint(self) -> bool:
-        """Whether forces are evaluated half way between the last two states, with their difference.
+        """Whether `regular` and all stencils of `start` evaluate forces half way between the last
+        two states, with the velocity from their difference.
 
         The last two states are then ξ ∓ Δt ν/2, and a force may be averaged over the step.
         """

@@ -628,12 +628,14 @@ class MemoryForwardColumns:
     def advance(
         self, of_state: Callable[[], Array], _: Callable[[], Array]
     ) -> None:
-        """Pass the next evaluation and update the columns, in place.
+        """Pass the next evaluation: overwrite `columns` with the columns after it, and increase
+        `next` by one.
 
         Parameters
         ----------
         of_state : callable
-            Change (3n, columns) of ξ there; the second argument, that of ν, is not used.
+            Function without arguments that returns the change (3n, columns) of ξ there; the second
+            argument, that of ν, is not used.
         """
         k = self.next
         history = self.history
@@ -711,7 +713,8 @@ class MemoryAdjoint:
         return by_x, np.zeros_like(by_x)
 
     def step_back(self, force_weight: Array) -> None:
-        """Pass the evaluation backward and update μ, in place.
+        """Pass the evaluation backward: replace `columns` by a new array with the weights μ before
+        it, and decrease `next` by one.
 
         Parameters
         ----------

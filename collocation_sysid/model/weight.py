@@ -421,8 +421,11 @@ class _JoiningLoads(NamedTuple):
     Attributes
     ----------
     joining_kg : (L, 3n)
+        Mass of each load at every dof [kg]; zero for a force.
     joining_n : (L, T, 3n)
+        Complete force of each load [N]; zero for a mass.
     share : (T, L)
+        Share of each load, as a change from the stated share.
     """
 
     joining_kg: Array
@@ -431,13 +434,14 @@ class _JoiningLoads(NamedTuple):
 
 
 def _zero_loads(rows: Array, count: int = 0) -> _JoiningLoads:
-    """Return arrays of zeros for a number of loads.
+    """Return new arrays of zeros for L loads: masses (L, 3n), forces (L, T, 3n), shares (T, L).
 
     Parameters
     ----------
     rows : (T, 3n)
         Array whose shape is used.
     count : int
+        Number L of loads.
     """
     times, dofs = rows.shape
     return _JoiningLoads(

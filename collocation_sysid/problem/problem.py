@@ -218,9 +218,15 @@ class Problem:
         }
 
     def with_lengths(self, lengths_m: Mapping[str, float]) -> Problem:
-        """Return the problem with other correlation lengths [m] of spatially varying constants, by
-        name of the constant; itself if the mapping is equal to `lengths_m`. This problem is not
-        modified.
+        """Return the problem with other correlation lengths of spatially varying constants.
+
+        This problem is not modified; it is returned itself if the lengths are those it has.
+
+        Parameters
+        ----------
+        lengths_m : mapping of str to float
+            Correlation length [m] of every such constant, by the names of the property `lengths_m`;
+            a missing one is a KeyError, and other names are ignored.
         """
         if dict(lengths_m) == self.lengths_m:
             return self

@@ -163,6 +163,13 @@ class SolverSection(Section):
 def _method_from_table(method: str, table: Any) -> Any:
     """Return the method called `method` with the options of its table, defaults elsewhere.
 
+    Parameters
+    ----------
+    method : str
+        Name of a method in the file, a key of `METHODS`; the caller has checked it.
+    table : object
+        Options by name, as they are in the file.
+
     Raises
     ------
     InputError

@@ -574,8 +574,8 @@ class Collocation:
         )
 
     def bounds(self) -> tuple[Array, Array]:
-        """Return lower and upper bounds of z, (variables,) each;
-        equal where a value is prescribed.
+        """Return lower and upper bounds of z, (variables,) each; equal where a value is prescribed,
+        ∓∞ where there is none.
         """
         lower, upper = self.parameter_bounds
         lows, highs = zip(

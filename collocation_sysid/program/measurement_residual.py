@@ -675,7 +675,7 @@ class MeasurementResidual(ABC):
 
     def loss(self, values: Array, phi: Array) -> float:
         """Return the loss Σ ρ of values (n, e, 3) of the observable at φ (k,), over the samples
-        that these suffice for; 0 without values.
+        that these suffice for; 0 if n = 0.
         """
         if not len(values):
             return 0.0
@@ -684,8 +684,17 @@ class MeasurementResidual(ABC):
         return float(loss.sum())
 
     def loss_gradient(self, values: Array, phi: Array) -> tuple[Array, Array]:
-        """Return the gradient of `loss` by the observable (n, e, 3) and, at constant values of it,
-        by φ (k,); zeros without values.
+        """Return the gradient of `loss` by the observable's values (n, e, 3) and, at constant
+        values, by φ (k,).
+
+        If n = 0, the first is empty and the second zero.
+
+        Parameters
+        ----------
+        values : (n, e, 3) array
+            Values of the observable at its first n times.
+        phi : (k,) array
+            Nuisance parameters.
         """
         by_values = np.zeros_like(values)
         by_phi = np.zeros(len(phi))
@@ -851,7 +860,7 @@ class _LinearisedSamples:
 
 def _gather(by: Array, places: Index) -> Array:
     """Return changes (s, E, 3 v, c) of the stencils' vectors from changes `by` (n, e, 3, c) of the
-    observable, for the stencils' indices `places` (s, E, v).
+    observable, for the stencils' indices `places` (s, E, v) into its n e vectors, see `RowStencil`.
     """
     times, each, _, count = by.shape
     rows = by.reshape(times * each, GROUP, count)[places]

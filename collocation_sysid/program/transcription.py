@@ -1044,8 +1044,9 @@ class Transcription:
         Parameters
         ----------
         factors : callable
-            Coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v from the stencils (p, q) of two positions in one
-            evaluation.
+            ``factors(p, q, p_second, q_second)`` returns the coefficients a and b (N,) of the
+            lower-triangle values A and B in `BlockBand.fill`, from the stencil coefficients (N,) of
+            state (p) and velocity (q) of two positions in one evaluation, see `_state_factors`.
         """
         rows, columns, source = self.pattern.full
         blocks = []
@@ -1084,7 +1085,7 @@ class Transcription:
         distance : int
             Difference of the rows' indices.
         factors : callable
-            Factors of the second derivatives, from the coefficients p and q of both rows.
+            As for `_hessian_blocks`; the first position is that of the later row.
         """
         p = self.dynamics.state_weights
         q = self.dynamics.tables.q / self.dynamics.step_s

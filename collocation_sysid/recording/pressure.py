@@ -108,12 +108,14 @@ class Pressure(Actuator[EnclosedVolume]):
             )
 
     def _measure_on(self, body: Body) -> EnclosedVolume:
-        """Return the volume on the pressure's side of the faces of a body, positive for a cavity.
+        """Return the volume on the pressure's side of the faces of a body, positive for a cavity;
+        the faces may also be an open patch.
 
         Raises
         ------
         InputError
-            If a face is not on the boundary, or the faces enclose the body instead of a cavity.
+            If a selection has no faces, a face given by node numbers is not on the boundary, or
+            closed faces enclose the body instead of a cavity.
         """
         mesh = body.mesh
         if isinstance(self.faces, Selection):
@@ -142,7 +144,13 @@ class Pressure(Actuator[EnclosedVolume]):
         """Return the pressure on the body `finer`, whose mesh is that of `body` with every element
         split in eight; without `body_measure`, which an experiment sets.
 
-        A selection by position or name stays as it is; faces given by indices are split in four.
+        A selection by position or name stays as it is. Faces given as node numbers, (F, 3) or as
+        `Indices`, become the four triangles of each, (4F, 3) node numbers of `finer`.
+
+        Raises
+        ------
+        InputError
+            If such faces do not fit `body`, see `_measure_on`.
         """
         if isinstance(self.faces, Selection) and not isinstance(
             self.faces, Indices

@@ -484,8 +484,18 @@ class FilmFigure:
         mm_per_m: float,
         height_mm: float,
     ) -> None:
-        """Draw the axis directions, the scale bar for `mm_per_m` and the legend below the body into
-        `axes`.
+        """Draw the axis directions, the scale bar and the legend below the body into `axes`.
+
+        Parameters
+        ----------
+        axes : Axes
+            Axes of the complete figure, in mm.
+        camera : ParallelCamera
+            View of the body, whose directions are drawn.
+        mm_per_m : float
+            Scale of the drawing: millimetres in the figure for each metre of the body.
+        height_mm : float
+            Not used.
         """
         draw_directions(axes, camera, origin_mm=(7.0, 4.0))
         draw_scale(axes, mm_per_m, corner_mm=(FILM_WIDTH_MM * 0.17, 4.0))

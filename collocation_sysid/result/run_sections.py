@@ -558,8 +558,8 @@ def _simulation_lines(
 ) -> Iterator[str]:
     """Yield lines on how far a forward simulation is from the measurements.
 
-    For a validation experiment, the errors of a blind prediction and of copied measurements follow
-    for comparison.
+    If it failed, the only line says why. For a validation experiment, the errors of a blind
+    prediction and of copied measurements follow for comparison.
 
     Parameters
     ----------
@@ -600,10 +600,17 @@ def _simulation_lines(
 def _errors_text(
     error: PredictionErrors, units: Mapping[str, str] | None
 ) -> str:
-    """Return the errors of a prediction in words; "" if nothing is compared. Errors that are None
-    or zero are left out.
+    """Return the errors of a prediction in words; "" if nothing is compared.
 
-    `units` are the units of custom sensors by name; None if none states a unit.
+    Errors of markers and forces that are None or zero are left out; those of custom sensors and
+    depth cameras are all written.
+
+    Parameters
+    ----------
+    error : PredictionErrors
+        Errors of markers, forces, custom sensors and depth cameras.
+    units : mapping of str to str, or None
+        Units of custom sensors by name; None if none states a unit.
     """
     texts = []
     if error.rms_m:  # none without markers

@@ -227,7 +227,11 @@ def _write_tables(
     rng: np.random.Generator,
     recipe: Recipe,
 ) -> None:
-    """Write the simulated measurements with noise, and the poses of the grasps.
+    """Write the CSV tables of an experiment: simulated measurements with noise, and poses.
+
+    The measurements are those of markers, force sensors and custom sensors; on a test bench, tables
+    of displacement and load replace those of poses and force sensors. A specimen has one table, of
+    its stresses. Images of depth cameras are not written.
 
     Parameters
     ----------
@@ -237,10 +241,12 @@ def _write_tables(
     trajectory : Trajectory
         The simulated motion.
     files : mapping of str to Path
-        Files by the keys of `_table_names`.
+        Files by the keys of `_table_names`, from which markers and the poses of any grasp may be
+        absent; these are then not written. Existing files are replaced.
     rng : Generator
         Source of the noise; its state advances.
     recipe : Recipe
+        Its noise_m, noise_n, noise_nm and noise_own are the standard deviations of the noise.
     """
     if experiment.specimen is not None or isinstance(section, SpecimenSection):
         stated = section if isinstance(section, SpecimenSection) else None

@@ -57,8 +57,9 @@ class Colouring:
     def by_strain(cls, replay: MotionRecord) -> Colouring:
         """Return the colouring of all trajectories, at least one, by the largest principal strain.
 
-        The scale reaches from 0 to the quantile `STRAIN_QUANTILE` of the strain of the first
-        trajectory.
+        The strain (T, F) is the largest stretch minus one, see `surface_strain`; NaN where a
+        position is not finite. The scale reaches from 0 to the quantile `STRAIN_QUANTILE` of the
+        absolute strain of the first trajectory, the fitted one if there is one.
         """
         values = {
             name: surface_strain(replay, x)

@@ -260,7 +260,8 @@ def _simulate(
     parameters: Mapping[str, float],
     report: Callable[[float], None] | None = None,
 ) -> Trajectory:
-    """Simulate a recording with its nuisance parameters φ (k,) and the values of the parameters.
+    """Simulate a recording with its nuisance parameters φ (k,), in units of their priors, and the
+    values of the parameters.
 
     Integrator and step are those of `problem.rollout`: Newmark's scheme by default, and a finer
     step than in the fit. `parameters` are in SI units by name. `report` is called with the
@@ -361,7 +362,8 @@ def _blind_error(
 def transcription_and_nuisance(
     experiment: Experiment, solution: Solution
 ) -> tuple[Transcription, Array]:
-    """Return an experiment's transcription and its nuisance parameters φ (k,).
+    """Return an experiment's transcription and its nuisance parameters φ (k,) in units of their
+    priors; k is 0 without any.
 
     For a fitted experiment φ is the estimate; for validation φ is fitted to its measurements in
     reduced space, with the material at its estimate. Whether that solve converged is not checked.

@@ -369,10 +369,14 @@ class SolvedProblem:
         return self.solution.nuisance(name)
 
     def to_frame(self) -> Any:
-        """Return the estimates as a pandas DataFrame, one row each.
+        """Return the estimates as a pandas DataFrame, one row each with the name of the parameter
+        or derived modulus as index.
 
         Columns: value, combined_std_error, combined_lower, combined_upper, statistical_std_error,
-        statistical_lower, statistical_upper, verdict, guess, unit. NaN stands for what is unknown.
+        statistical_lower, statistical_upper, verdict, guess, unit. Lower and upper are ends of 95 %
+        intervals. Numbers are in the SI unit of the column unit, empty if there is none; NaN stands
+        for what is unknown, and for the guess of a tied parameter. The verdict (good, check or
+        doubtful) is that of the complete solve, the same in all rows.
 
         Raises
         ------

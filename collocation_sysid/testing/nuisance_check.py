@@ -310,7 +310,8 @@ def _smooth_motion(
     collocation : Collocation
         Program of one recording.
     shift_s : float
-        Time that is added to the grid times [s]; the same motion later if positive.
+        Time that is added to the grid times [s]: if positive, each row is where the motion is so
+        much later.
     """
     (transcription,) = collocation.transcriptions
     nodes_m = transcription.body.nodes_m

@@ -63,6 +63,8 @@ def check_scheme(scheme: str | Scheme) -> None:
     ------
     AssertionError
         For the first property that fails: which one, where, found and expected value.
+    InputError
+        For an unknown name of a scheme.
     """
     made = as_scheme(scheme)
     check = PropertyCheck(f"scheme {made.name!r}")

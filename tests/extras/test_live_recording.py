@@ -26,7 +26,8 @@ def problem_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def lines(problem_file: Path) -> list[dict]:
     """Printed estimates of the frames, and at the end the final ones, with their recording."""
     file = problem_file.parent / "new" / "swing.rrd"
-    words = ("--json", "--rate", "0", "--rerun", file)
+    # No time to pass frames again: results do not depend on the machine.
+    words = ("--json", "--rate", "0", "--budget-ms", "1e-6", "--rerun", file)
     outcome = run_command("replay", problem_file, *words)
     assert outcome.code == 0, outcome.err
     return [json.loads(line) for line in outcome.out.splitlines()]
@@ -84,9 +85,9 @@ def test_the_surface_is_near_the_markers_at_the_estimate(
             for name in experiment.markers.names
         ]
     )
-    # Residuals are of the estimate before the last frame, the surface of that after it: 0.013 mm.
+    # Residuals are of the estimate before the last frame, the surface of that after it: 0.038 mm.
     assert distances_mm[-1][is_drawn] == pytest.approx(
-        last_mm[is_drawn], abs=0.03
+        last_mm[is_drawn], abs=0.06
     )
 
 

@@ -100,9 +100,11 @@ def test_another_parameter_costs_a_right_hand_side_and_no_factorisation(
         factorised = []
         factorise_each = solver.factoriser.factorise_each
 
-        def counted(matrix, count, *rest, kept=factorised, do=factorise_each):
+        def counted(
+            matrix, count, *rest, kept=factorised, do=factorise_each, **more
+        ):
             kept.append(count)
-            return do(matrix, count, *rest)
+            return do(matrix, count, *rest, **more)
 
         object.__setattr__(solver.factoriser, "factorise_each", counted)
         (part,) = collocation.iterates(z)

@@ -75,7 +75,7 @@ def damping_description(name: str) -> str:
 
 
 def body_readme(content: Mapping[str, Any]) -> str:
-    """Return the README of a body; `content` is that of its JSON file."""
+    """Return the README of a body as Markdown; `content` is that of its body.json."""
     parts = [
         f"# {content['body']}\n",
         *_introduction(content),
@@ -88,7 +88,9 @@ def body_readme(content: Mapping[str, Any]) -> str:
 
 
 def _introduction(content: Mapping[str, Any]) -> Iterator[str]:
-    """Yield paragraphs on the specimen, the source and the licence."""
+    """Yield Markdown paragraphs on the specimen, the source and the licence; `content` is that of
+    body.json.
+    """
     kind = (
         "Measured data."
         if content["is_measured"]
@@ -105,7 +107,9 @@ def _introduction(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _material(content: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the section on the material and its constants."""
+    """Yield lines of the Markdown section on the material and its constants; `content` is that of
+    body.json.
+    """
     yield "## Material\n"
     yield f"- Energy density, law `{content['law']}`: {content['energy']}."
     if content["damping"]:
@@ -130,7 +134,7 @@ def _material(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _mesh(content: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the section on the mesh."""
+    """Yield lines of the Markdown section on the mesh; `content` is that of body.json."""
     yield "## Mesh\n"
     yield "`mesh.vtu`, and the same as tables: `nodes.csv` with the undeformed, stress-free nodes, and"
     yield "`tetrahedra.csv` with the nodes of each tetrahedron. Indices count from 0, in the order of"
@@ -146,7 +150,7 @@ def _mesh(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _recording(recording: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the section on a recording."""
+    """Yield lines of the Markdown section on a recording, an entry of "recordings" in body.json."""
     name = recording["file_name"]
     files = recording["files"]
     held_out = (
@@ -173,7 +177,9 @@ def _recording(recording: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _homogeneous_test(files: Mapping[str, str]) -> Iterator[str]:
-    """Yield the description of a material test without a mesh."""
+    """Yield lines of Markdown on a material test without a mesh, from the names of its files by
+    kind.
+    """
     yield (
         f"- `{files['stretches']}` has the stretches along x, y and z of each sample. Where a cell is "
         "blank, the stretch is free and the stress along that axis vanishes. Shear is zero."
@@ -185,7 +191,9 @@ def _homogeneous_test(files: Mapping[str, str]) -> Iterator[str]:
 
 
 def _motion(recording: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the description of the motion or of the equilibria of a body."""
+    """Yield lines of Markdown on the motion or the equilibria of a body in a recording, an entry of
+    "recordings" in body.json.
+    """
     gravity = ", ".join(f"{value:.6g}" for value in recording["gravity_m_s2"])
     yield f"- Gravity: [{gravity}] m/s²."
     if recording["kind"] == "static":

@@ -23,12 +23,22 @@ TIME_TOLERANCE = 1e-3
 
 
 def prediction_name(recording: str) -> str:
-    """Return the name of the prediction file of a recording, without its suffix."""
+    """Return the name of the prediction file of a recording, without its suffix, from the file name
+    of the recording.
+    """
     return f"{recording}_prediction"
 
 
 def find_prediction(folder: Path, recording: str) -> Path | None:
-    """Return the prediction file of a recording; None if there is none.
+    """Return the prediction file of a recording, RECORDING_prediction.csv or .npz in a folder; None
+    if there is none.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the body.
+    recording : str
+        File name of the recording, "file_name" in body.json.
 
     Raises
     ------
@@ -75,7 +85,15 @@ def read_prediction(file: Path, measured: Signal) -> Signal:
 
 
 def _read_table(file: Path, measured: Signal) -> tuple[Array, Array]:
-    """Return the keys (N,) and the values (N, C) of a CSV table."""
+    """Return the keys (N,) and the values (N, C) of a CSV table, with the columns of `measured` in
+    their order; blank lines are skipped.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, a column is missing or present twice, or a needed cell is not a
+        finite number.
+    """
     try:
         with file.open(newline="", encoding="utf-8-sig") as lines:
             rows = [row for row in csv.reader(lines)]
@@ -126,7 +144,14 @@ def _number(
 
 
 def _read_archive(file: Path, measured: Signal) -> tuple[Array, Array]:
-    """Return the keys (N,) and the values (N, C) of an NPZ archive."""
+    """Return the keys (N,) and the values (N, C) of an NPZ archive, markers (N, M, 3) as (N, 3 M).
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, an array is missing or has another shape, or a value is not a
+        finite real number.
+    """
     try:
         arrays = load_arrays(file)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
@@ -171,7 +196,24 @@ def _real_numbers(file: Path, name: str, array: Array) -> Array:
 
 
 def _rows_of_samples(file: Path, keys: Array, measured: Signal) -> Index:
-    """Return the index of the row of each sample (T,); refuse a file without one of them."""
+    """Return the index (T,) of the row nearest to each of the T measured samples.
+
+    Parameters
+    ----------
+    file : Path
+        The file, for messages.
+    keys : (N,) array
+        Key of each row of the file in any order: times [s], or numbers of samples from 1, as in
+        `Signal.keys`.
+    measured : Signal
+        Its keys are the samples.
+
+    Raises
+    ------
+    InputError
+        If the file has no rows, or none whose key is that of a sample within `TIME_TOLERANCE` times
+        the shortest interval of the measured keys (at most 1).
+    """
     needed = measured.keys
     if not keys.size:
         raise InputError(

@@ -1069,7 +1069,12 @@ class LiveEstimator:
         """Return how many rows may be computed again: as many as fit into the rest of the time
         budget of the frame, or, if `rows` per frame is fixed, these minus `done`.
 
-        `elapsed_s` is the time since the frame began [s].
+        Parameters
+        ----------
+        done : int
+            Rows that were computed again in this frame; used only if `rows` is fixed.
+        elapsed_s : float
+            Time since the frame began, and that of work that comes first [s]; used otherwise.
         """
         if self.rows is not None:
             return self.rows - done

@@ -705,8 +705,15 @@ def _without_later_values(gauge: Gauge, end_s: float) -> Gauge:
 def _stress_residuals_pa(
     experiment: Experiment, predicted: Mapping[str, Array]
 ) -> tuple[Array, Array]:
-    """Return times (S,) and differences (S,) of predicted and measured stresses [Pa] of a specimen,
-    in the order of time; NaN where not measured.
+    """Return times (S,) [s] and differences (S,), predicted less measured, of all stresses [Pa] of
+    a specimen together, in the order of time; NaN where not measured.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Test of a specimen, with at least one measured stress.
+    predicted : mapping of str to (S, 1) array
+        Prediction at the samples of each stress [Pa], by the name of the custom sensor.
     """
     stresses = [
         gauge for gauge in experiment.readings if gauge.unit == STRESS_UNIT

@@ -303,7 +303,7 @@ class Indices:
         return _indices_or_error(chosen, mesh, what="an empty list of indices")
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
-        """Return the indices of the selected cells, sorted.
+        """Return the indices of the selected cells, sorted and without duplicates.
 
         Raises
         ------

@@ -267,8 +267,9 @@ def _judge(
 def _hessian_values(
     collocation: Collocation, hessian: Hessian
 ) -> HessianValues:
-    """Return the function that writes the Hessian's values at z to its last argument, in place; the
-    multipliers are used only if `hessian` is "exact".
+    """Return the function (z, weight, multipliers, out) that overwrites `out`, with the values of
+    the Hessian of weight · f + multipliers · g at z; of weight · f in the Gauss–Newton
+    approximation, without multipliers, if `hessian` is "gauss-newton".
     """
 
     def values(z: Array, weight: float, multipliers: Array, out: Array) -> None:

@@ -288,8 +288,8 @@ def _next_direction(
 
 def _initial_step(x: Array, f: float, g: Array) -> float:
     """Return the step size of the first line search at x with the value f and the gradient g ≠ 0,
-    rule I0: `FIRST` times the size of x over that of g; without x, of |f| over ‖g‖²; 1 if both are
-    zero.
+    rule I0: `FIRST` times the largest magnitude in x over that in g; if x is zero, `FIRST` times
+    |f| over the squared Euclidean norm of g; 1 if f is zero too.
     """
     steepest = float(np.abs(g).max())
     if x.any():

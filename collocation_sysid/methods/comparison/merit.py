@@ -75,8 +75,8 @@ class PenaltyProblem:
         self.parameter_indices: Index = np.flatnonzero(of_p & self.is_free)
 
     def constraints_and_jacobian(self, z: Array) -> tuple[Array, sp.csc_array]:
-        """Return g (constraints,) and ∂g/∂z at z (variables,); the matrix is overwritten by the
-        next call, which counts in `evaluations`.
+        """Return the scaled constraints g (constraints,) and ∂g/∂z at z (variables,). The next call
+        overwrites the matrix, and each call counts in `evaluations`.
         """
         self.evaluations += 1
         with self.stopwatch.evaluating():

@@ -225,8 +225,10 @@ class _StepEquations:
         self._known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
 
     def extrapolation(self) -> Array:
-        """Return a guess (3n,) of the positions at the end [m], at constant acceleration including
-        that of the previous contact.
+        """Return a guess (3n,) of the positions at the end of the step [m].
+
+        Free dofs move at the acceleration of the start plus that by the mean contact force of the
+        previous step; prescribed dofs are at their prescribed positions.
         """
         state = self._state
         h = self._step_s

@@ -114,8 +114,19 @@ def natural_modes(
 def _dense_modes(
     stiffness: sp.csc_array, mass: Array, requested: int
 ) -> tuple[Array, Array]:
-    """Return the `requested` lowest eigenvalues [1/s²] and eigenvectors (n, k) of K φ = λ M φ by a
-    dense solver, fewer if n is smaller; `mass` (n,) is the diagonal of M.
+    """Return the `requested` lowest eigenvalues (k,) [1/s²], ascending, and eigenvectors (n, k) of
+    K φ = λ M φ by a dense solver; k = n if n is smaller.
+
+    Eigenvectors have φᵀ M φ = 1.
+
+    Parameters
+    ----------
+    stiffness : sparse (n, n)
+        Symmetric stiffness K [N/m].
+    mass : (n,) array
+        Diagonal of M [kg], positive.
+    requested : int
+        Number of eigenvalues.
     """
     root = np.sqrt(mass)
     scaled = stiffness.toarray() / np.outer(root, root)
@@ -151,7 +162,7 @@ def _lanczos_modes(
     requested: int,
 ) -> tuple[Array, Array]:
     """Return the `requested` eigenvalues [1/s²] and eigenvectors (n, k) of K φ = λ M φ nearest to a
-    shift, by shift-invert Lanczos iterations, ascending.
+    shift, by shift-invert Lanczos iterations, ascending; eigenvectors have φᵀ M φ = 1.
 
     Parameters
     ----------

@@ -464,7 +464,7 @@ class GraspWrench:
     def linearise(
         self, motion: ObservedMotion, phi: Array, columns: Index, size: int
     ) -> tuple[Array, ObservableDerivatives]:
-        """Return Y (n, 2, 3) [N, N m] and its derivatives by all parameters.
+        """Return Y (n, 2, 3) [N, N m], as `evaluate` does, and its derivatives by all parameters.
 
         Parameters
         ----------

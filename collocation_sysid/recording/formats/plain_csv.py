@@ -56,6 +56,9 @@ def _read_wide(table: TextTable, choose: LabelChooser) -> RawTracks:
 def _wide_labels(table: TextTable) -> list[str]:
     """Return the names of the markers in the file, in the order of their first columns.
 
+    The columns are t_s and, for each marker, <name>_x, <name>_y and <name>_z, in any order and
+    without a unit in their names.
+
     Raises
     ------
     InputError
@@ -140,8 +143,8 @@ def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
 
 
 def _long_columns(table: TextTable) -> tuple[list[str], str | None]:
-    """Return the names of the columns of x, y and z, and the unit in these names; None if they name
-    none.
+    """Return the names of the columns of x, y and z, and the unit in these names, such as "mm" of
+    x_mm; None if they name none.
 
     Raises
     ------

@@ -103,8 +103,12 @@ def with_unique_names(
 
 
 def _experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
-    """Yield name and picture of everything that is known of one experiment; of a specimen only its
-    measurements over strain.
+    """Yield name and picture of everything that is known of one experiment.
+
+    A name is the kind of picture before the name of the experiment, such as "tracks_swing", and of
+    a custom sensor or depth camera also that one's name; names may repeat. A specimen has only
+    pictures of its measurements over strain, named "<measurement>_<experiment>". Infinite positions
+    are drawn as NaN: as gaps.
     """
     t_s = replay.t_s
     measured = replay.measured_m

@@ -34,11 +34,20 @@ from ..figure_style import (
 def drawn_models(
     fitted_m: Array | None, simulated_m: Array | None
 ) -> list[tuple[str, Array, dict[str, Any]]]:
-    """Return label, values and line style of each trajectory that is not None, fitted before
-    simulated.
+    """Return label, values and line style of the fitted and then the simulated trajectory.
 
-    The second line is dashed, so that the first remains visible where they agree. The values, such
-    as markers (T, M, 3), are returned as they are.
+    A trajectory that is None is left out. The line of the simulated one is always dashed, so that
+    the fitted one remains visible where they agree.
+
+    Parameters
+    ----------
+    fitted_m, simulated_m : array or None
+        Values of any shape, such as markers (T, M, 3) [m], which are returned as they are.
+
+    Returns
+    -------
+    list of (str, array, dict)
+        Label "fitted" or "simulated", values, and keyword arguments of ``Axes.plot``.
     """
     named = (
         ("fitted", fitted_m, {"color": BLUE, "lw": LINE_PT}),

@@ -496,8 +496,8 @@ def _program_fields(
 def _natural_modes(
     problem: Problem, collocation: Collocation
 ) -> tuple[ModesCheck, ...]:
-    """Return the natural modes at the guess of all fitted experiments that move, with the scheme
-    and step of the collocation.
+    """Return the natural modes at the guess of each fitted experiment that moves, in their order,
+    with the scheme and step of the collocation; static and held out experiments are left out.
     """
     scheme = as_scheme(collocation.scheme)
     guesses = problem.parameters.guesses

@@ -194,8 +194,8 @@ class _MotionComparison:
     def _shapes_in_camera(
         self, described: ImageTimes
     ) -> list[tuple[Array, Array]]:
-        """Return the visible points of the surface and their normals, (P, 3) each, in the camera's
-        stated frame at each image [m].
+        """Return for each image the visible points of the surface [m] and their unit normals,
+        (P, 3) each, in the camera's stated frame.
         """
         rows = np.interp(
             described.times_s, self.at_s, np.arange(len(self.at_s))
@@ -229,7 +229,18 @@ class _MotionComparison:
         shift_m: Array,
     ) -> tuple[Array, Array, float]:
         """Return rotation vector (3,) [rad] and shift (3,) [m] of the points after one more
-        Gauss–Newton step, and the misfit before it [m].
+        Gauss–Newton step, and the misfit before it: the root mean square distance of the surface
+        from the points along its normal [m], at most the gate for each point.
+
+        Parameters
+        ----------
+        images : sequence of int
+            Indices of the compared images.
+        shapes : list of pairs of (P, 3) arrays
+            Visible points of the surface [m] and their normals at each of these images, in the
+            camera's stated frame.
+        turn_rad, shift_m : (3,) arrays
+            Rotation vector [rad] and shift [m] before the step; not modified.
         """
         pivot_m = self.camera.pivot_m
         rows = []

@@ -93,8 +93,11 @@ def _noise_n(experiment: Experiment, obstacle: Obstacle) -> float:
 
 
 def _normal_and_tangential_n(obstacle: Obstacle) -> tuple[Array, Array]:
-    """Return the components (S,) of the measured force along the normal of a plane and across it
-    [N]; empty for other shapes, and without samples of all components.
+    """Return the component of the measured force on the body along the normal of a plane, positive
+    if the plane pushes, and the magnitude across it, (S,) each [N].
+
+    S counts the samples of the wrench with all components of the force; others are left out. Both
+    are empty for other shapes, and without a wrench.
     """
     shape = obstacle.shape
     wrench = obstacle.wrench
@@ -139,8 +142,12 @@ def _pulling(
 
 
 def _load_along_motion_n(experiment: Experiment, obstacle: Obstacle) -> Array:
-    """Return the load (S,) of an obstacle that advances along one axis of the world [N], positive
-    if it pushes; empty if it does not, or the experiment moves.
+    """Return the load (S,) on the body along the axis of the world along which an obstacle moves
+    most [N], positive in the direction of this motion, thus if the obstacle pushes.
+
+    S counts the samples of the wrench with this component; others are left out. Empty if the
+    obstacle has no wrench, does not move or also moves back along the axis, or the experiment is
+    not static.
     """
     wrench = obstacle.wrench
     if wrench is None or not experiment.is_static:
