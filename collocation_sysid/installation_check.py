@@ -452,14 +452,14 @@ def _self_test_unless_missing(dependencies: Sequence[Dependency]) -> SelfTest:
         )
     began_s = time.perf_counter()
     try:
-        message, is_passed = _identify_small_body()
+        message, is_passed = identify_small_body()
     except Exception as error:  # any failure is a finding of this report
         message = f"{type(error).__name__}: {error}"
         is_passed = False
     return SelfTest(is_passed, message, time_s=time.perf_counter() - began_s)
 
 
-def _identify_small_body() -> tuple[str, bool]:
+def identify_small_body() -> tuple[str, bool]:
     """Identify the shear modulus of a small swinging block from exact tracks of its markers.
 
     Returns

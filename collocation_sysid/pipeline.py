@@ -266,7 +266,7 @@ def run(
             )
         answer = _with_problem_notes(answer)
         if answer.uncertainty is not None and fit is not None:
-            profiles = _profiles(answer, fit, say=say)
+            profiles = profile_likelihoods(answer, fit, say=say)
             changes = _changes(answer, say)
             sources = _sources(
                 answer, fit, known=answer.uncertainty, changes=changes
@@ -497,7 +497,9 @@ def _probes(
     return deep_probes(solved_fit)
 
 
-def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
+def profile_likelihoods(
+    answer: Run, fit: LinearisedFit, say: Log
+) -> tuple[Profile, ...]:
     """Return the profile likelihoods that the problem requests, in that order; the run must have
     uncertainties.
 

@@ -1222,7 +1222,7 @@ def table(
                 raise RuntimeError(
                     f"the small problem is not solved: {ended.err}"
                 )
-        with mock.patch.object(run_record, "_write_pictures"):
+        with mock.patch.object(run_record, "write_pictures"):
             cases = Cases(folder, problem, solved, count, seed, limit_s, kept)
             for name in only:
                 began = time.monotonic()

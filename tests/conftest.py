@@ -22,7 +22,7 @@ BodyFactory = Callable[..., Body]
 def _runs_without_pictures() -> Iterator[None]:
     """Pictures take most of the time of a small run; `problem_files.pictures_drawn` has them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_record, "_write_pictures", lambda *_, **__: None)
+        patch.setattr(run_record, "write_pictures", lambda *_, **__: None)
         yield
 
 

@@ -82,7 +82,7 @@ REPLACED_COMMANDS = {
 
 
 @cache
-def _command_sources() -> dict[str, tuple[str, str]]:
+def command_sources() -> dict[str, tuple[str, str]]:
     """Return the module and the first help line of each command by its name, in the order of
     `FAMILIES` and of the files; read from the source without importing.
     """
@@ -118,19 +118,19 @@ class LazyCommands(TyperGroup):
         """Return the names of all commands, in the order of their modules; the
         context is not used.
         """
-        return [*_command_sources()]
+        return [*command_sources()]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return the command called `cmd_name`, or None if there is none; its module is imported.
         The context is not used.
         """
-        if cmd_name not in _command_sources():
+        if cmd_name not in command_sources():
             return None
         with error_console.status(
             "starting"
         ):  # on a terminal only; it takes a second
             family = import_module(
-                _command_sources()[cmd_name][0]
+                command_sources()[cmd_name][0]
             ).commands.registered_commands
         info = next(
             each
@@ -155,11 +155,11 @@ class LazyCommands(TyperGroup):
             ctx.fail(f"No such command {args[0]!r}: {replacement}.")
         if (
             args
-            and args[0] not in _command_sources()
+            and args[0] not in command_sources()
             and not ctx.resilient_parsing
         ):
             ctx.fail(
-                f"No such command {args[0]!r}{hint_at(args[0], _command_sources()) or '.'}"
+                f"No such command {args[0]!r}{hint_at(args[0], command_sources()) or '.'}"
             )
         return super().resolve_command(ctx, args)
 
@@ -167,7 +167,7 @@ class LazyCommands(TyperGroup):
         """Write a line on each command into the help, by the groups of `COMMAND_GROUPS`, to
         `formatter`; the context is not used.
         """
-        sources = _command_sources()
+        sources = command_sources()
         for title, names in COMMAND_GROUPS.items():
             with formatter.section(title):
                 formatter.write_dl([(name, sources[name][1]) for name in names])

@@ -137,7 +137,7 @@ def start_problem(
         collocation = replace(collocation, parameters=usual)
     if not _has_free_modulus(collocation):
         return collocation, None
-    trial = _TrialSimulation(collocation)
+    trial = TrialSimulation(collocation)
     misfit, failure = trial.evaluate_guess(is_complete)
     if failure is None and misfit <= trial.rigid_misfit:
         return collocation, None
@@ -197,12 +197,12 @@ def scan_stiffness(
         If the body cannot be simulated at any stiffness.
     """
     began = time.perf_counter()
-    trial = _TrialSimulation(
+    trial = TrialSimulation(
         replace(
             collocation, parameters=_with_units(collocation.parameters, 1.0)
         )
     )
-    trials = _ScanState(trial)
+    trials = ScanState(trial)
     step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
     with counted_phase(StepUnit.STIFFNESS, STEPS):
         trials.try_sequence([STIFFEST_PA * step**k for k in range(STEPS)])
@@ -228,7 +228,7 @@ def scan_stiffness(
         )
     best = int(np.flatnonzero(young_pa == candidates[0])[0])
     start = typical_parameters(collocation.parameters, candidates[0])
-    others = _other_starts(misfit, best) if not is_complete else ()
+    others = other_starts(misfit, best) if not is_complete else ()
     starts = {
         k: typical_parameters(collocation.parameters, young_pa[k])
         for k in (best, *others)
@@ -246,7 +246,7 @@ def scan_stiffness(
     )
 
 
-def _other_starts(misfit: Array, best: int) -> tuple[int, ...]:
+def other_starts(misfit: Array, best: int) -> tuple[int, ...]:
     """Return the indices of moduli other than the best that may lead to a better solution, in
     ascending order of the misfit.
 
@@ -443,7 +443,7 @@ def _compared_samples(transcription: Transcription) -> int:
     )
 
 
-class _TrialSimulation:
+class TrialSimulation:
     """Simulation of the first part of every recording, and its misfit.
 
     Parameters
@@ -578,7 +578,7 @@ class _TrialSimulation:
         )
 
 
-class _ScanState:
+class ScanState:
     """Moduli that were tried so far, with their misfits.
 
     Attributes
@@ -591,7 +591,7 @@ class _ScanState:
         Whether the scan ended before the softest modulus.
     """
 
-    def __init__(self, trial: _TrialSimulation) -> None:
+    def __init__(self, trial: TrialSimulation) -> None:
         self.trial = trial
         self.misfits: dict[float, float] = {}
         self.last_trajectories: list[Array] | None = None

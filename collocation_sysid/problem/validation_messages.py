@@ -232,7 +232,7 @@ def _schema_field(
             and model is not None
             and part not in _fields_by_key(model)
         ):
-            others = _table_models(field.annotation)
+            others = table_models(field.annotation)
             model = next(
                 (each for each in others if part in _fields_by_key(each)), None
             )
@@ -256,19 +256,17 @@ def _table_model(annotation: Any) -> type[BaseModel] | None:
     """Return the first model of a field that is a table or a list of tables; None for other
     fields.
     """
-    return next(iter(_table_models(annotation)), None)
+    return next(iter(table_models(annotation)), None)
 
 
-def _table_models(annotation: Any) -> list[type[BaseModel]]:
+def table_models(annotation: Any) -> list[type[BaseModel]]:
     """Return the models in an annotation, from the first to the last: of a field that is a table or
     a list of tables; several if tables differ by kind, none for other fields.
     """
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     arguments = getattr(annotation, "__args__", ())
-    return [
-        model for argument in arguments for model in _table_models(argument)
-    ]
+    return [model for argument in arguments for model in table_models(argument)]
 
 
 def shortened(value: Any) -> str:

@@ -76,7 +76,7 @@ def write_run(
             place / "trajectory.npz", allow_pickle=False, **arrays
         )
         if frames:
-            _write_all_frames(solved, place)
+            write_all_frames(solved, place)
     if pictures:
         draw_run(solved, Path(folder))
     return Path(folder)
@@ -111,7 +111,7 @@ def draw_run(
     began_s = time.perf_counter()
     result = build_result(solved)
     file = folder / RESULT_FILE
-    _write_pictures(
+    write_pictures(
         solved, result, folder=folder, say=report or (lambda _: None)
     )
     if not file.is_file() or file.read_text(encoding="utf-8") != _result_text(
@@ -135,7 +135,7 @@ def _result_text(result: Result) -> str:
     return as_json(result) + "\n"
 
 
-def _write_pictures(
+def write_pictures(
     finished: SolvedProblem,
     result: Result,
     folder: Path,
@@ -176,7 +176,7 @@ def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
     return data
 
 
-def _write_all_frames(finished: SolvedProblem, place: Path) -> None:
+def write_all_frames(finished: SolvedProblem, place: Path) -> None:
     """Write the ParaView frames of every fitted experiment into the folder `place`.
 
     With several fitted experiments each has a subfolder of its name.

@@ -173,7 +173,7 @@ def run_report(run: str | Path) -> TitledParts:
             TitledParts(
                 "What to do",
                 (
-                    *_remedy_lines(result.trust.concerns),
+                    *remedy_lines(result.trust.concerns),
                     *_deeper_check_advice(result),
                 ),
             ),
@@ -700,7 +700,7 @@ def _cards(result: Result) -> Cards:
     )
 
 
-def _remedy_lines(concerns: Iterable[Concern]) -> Iterator[Line]:
+def remedy_lines(concerns: Iterable[Concern]) -> Iterator[Line]:
     """Yield a line for each topic of the concerns: meaning, remedy, and documentation."""
     for name, topic in topics_of(concerns).items():
         about = Span(f"{topic.title}.", "strong")

@@ -231,7 +231,7 @@ def _solve_once(
             and warm_start is None
             and solution.method == ReducedSpace.name
         ):
-            solution = _best_of_second_start(solver, solution, watch=watch)
+            solution = best_of_second_start(solver, solution, watch=watch)
     except InputError as error:
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:
@@ -328,7 +328,7 @@ def _solve_from_scan(
     return (scan, solution) if ended else (None, failed)
 
 
-def _best_of_second_start(
+def best_of_second_start(
     solver: Method, first: Solution, watch: Watch | None
 ) -> Solution:
     """Return the better of a solution and of the solution from its `second_start_parameters`, with

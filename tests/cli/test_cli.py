@@ -37,8 +37,8 @@ import collocation_sysid as cs
 from collocation_sysid import cli, pipeline
 from collocation_sysid.cli import (
     COMMAND_GROUPS,
-    _command_sources,
     command_options,
+    command_sources,
     common,
 )
 from collocation_sysid.common.console import PlainConsole
@@ -343,7 +343,7 @@ def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(
         shown.append((sys.stdout.getvalue(), result_in(tiny / "run")))
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(run_record, "_write_pictures", interrupt)
+    monkeypatch.setattr(run_record, "write_pictures", interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     ((out, result),) = shown
     assert "Verdict: check" in out
@@ -366,7 +366,7 @@ def test_the_answer_is_shown_even_if_its_folder_cannot_be_written(
     def fail(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device", "run")
 
-    monkeypatch.setattr(run_record, "_write_all_frames", fail)
+    monkeypatch.setattr(run_record, "write_all_frames", fail)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 2
     assert "Verdict: check" in outcome.out
@@ -380,11 +380,11 @@ def test_an_interrupt_while_the_folder_is_written_loses_nothing(
 ):
     monkeypatch.setattr(
         run_record,
-        "_write_all_frames",
+        "write_all_frames",
         lambda *_, **__: signal.raise_signal(signal.SIGTERM),
     )
     monkeypatch.setattr(
-        run_record, "_write_pictures", lambda *_, **__: time.sleep(60)
+        run_record, "write_pictures", lambda *_, **__: time.sleep(60)
     )
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
@@ -399,7 +399,7 @@ def test_another_result_in_the_folder_is_left_alone_when_the_pictures_are_drawn(
     file = tiny / "run" / "result.json"
     monkeypatch.setattr(
         run_record,
-        "_write_pictures",
+        "write_pictures",
         lambda *_, **__: file.write_text('{"another": 1}'),
     )
     outcome = run_command("solve", "problem.toml", "--out", "run")
@@ -460,7 +460,9 @@ def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):
     assert "no error bars" in result["missing"]
 
 
-@pytest.mark.parametrize("late", ["find_misspecifications", "_profiles"])
+@pytest.mark.parametrize(
+    "late", ["find_misspecifications", "profile_likelihoods"]
+)
 def test_so_do_error_bars_an_interrupt_after_them(tiny, monkeypatch, late):
     def interrupt(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGINT)
@@ -848,7 +850,7 @@ def test_help_imports_nothing_that_solves():
 
 def test_every_command_is_in_exactly_one_group_of_the_help():
     names = [name for group in COMMAND_GROUPS.values() for name in group]
-    assert sorted(names) == sorted(_command_sources())
+    assert sorted(names) == sorted(command_sources())
     words = [title.split()[0] for title in COMMAND_GROUPS]
     assert words == ["Identify", "Inspect", "Extend", "Exchange", "Reference"]
     sections = re.split(

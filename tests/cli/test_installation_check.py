@@ -155,7 +155,7 @@ def test_a_self_test_that_fails_is_a_finding(monkeypatch):
     def fail() -> None:
         raise RuntimeError("no processor")
 
-    monkeypatch.setattr(installation_check, "_identify_small_body", fail)
+    monkeypatch.setattr(installation_check, "identify_small_body", fail)
     outcome = run_command("doctor", "--json")
     assert outcome.code == 2
     data = json.loads(outcome.out)
@@ -165,7 +165,7 @@ def test_a_self_test_that_fails_is_a_finding(monkeypatch):
 
 def test_a_wrong_answer_fails_the_self_test(monkeypatch):
     monkeypatch.setattr(installation_check, "SELF_TEST_TOLERANCE", -1.0)
-    message, is_passed = installation_check._identify_small_body()
+    message, is_passed = installation_check.identify_small_body()
     assert not is_passed
     assert "relative error" in message
     assert not SelfTest(is_passed, message, 0.1).is_passed

@@ -14,7 +14,7 @@ from collocation_sysid.cli.markdown import TerminalPage
 from collocation_sysid.common.console import PlainConsole
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.common.pages import page_files, page_text, page_url
-from collocation_sysid.result.run_sections import _remedy_lines, remedy_command
+from collocation_sysid.result.run_sections import remedy_command, remedy_lines
 from collocation_sysid.statistics.concerns import TOPICS, Concern
 
 ROOT = Path(__file__).parents[2]
@@ -99,7 +99,7 @@ def test_reports_link_to_the_documentation_that_the_project_states(
     monkeypatch.setattr(metadata, "metadata", lambda name: stated)
     links = [
         span.to
-        for cure in _remedy_lines(CONCERNS)
+        for cure in remedy_lines(CONCERNS)
         for span in cure.spans
         if span.to
     ]

@@ -306,7 +306,7 @@ def test_options_that_do_not_fit_are_refused(
 def test_a_body_without_data_names_the_script(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(benchmark_bodies, "_CHECKOUT", tmp_path)
+    monkeypatch.setattr(benchmark_bodies, "CHECKOUT", tmp_path)
     outcome = run_command(
         "benchmark", tmp_path / "new", "--write", "--body", "silicone_beam"
     )

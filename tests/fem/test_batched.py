@@ -477,7 +477,7 @@ def broken_compiler(cache, monkeypatch):
     def fail(*_, **__):
         raise RuntimeError("no registers")
 
-    monkeypatch.setattr(jit, "_compile", fail)
+    monkeypatch.setattr(jit, "compile_module", fail)
 
 
 def test_failing_compiler_yields_to_casadi_with_a_note(
@@ -512,10 +512,10 @@ def test_failing_compiler_is_an_error_where_vector_code_is_forced(
 def compiled(monkeypatch) -> list[str]:
     """Grows with every compilation."""
     done = []
-    compile_module = jit._compile
+    compile_module = jit.compile_module
     monkeypatch.setattr(
         jit,
-        "_compile",
+        "compile_module",
         lambda *args, **more: done.append("") or compile_module(*args, **more),
     )
     return done

@@ -142,7 +142,7 @@ def test_a_mesh_that_is_refused_is_not_kept(tmp_path, monkeypatch):
         np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]),
         np.array([[0, 1, 2, 3]]),
     )
-    monkeypatch.setattr(surface, "_run_ftetwild", lambda *_, **__: flat)
+    monkeypatch.setattr(surface, "run_ftetwild", lambda *_, **__: flat)
     monkeypatch.setattr(surface, "version", lambda name: "0")
     with pytest.raises(InputError, match="degenerate"):
         TetMesh.from_surface(cube_surface(), 0.02, cache=tmp_path)
@@ -158,7 +158,7 @@ def test_a_surface_of_arrays_is_scaled_by_its_unit():
 
 
 def test_a_mesher_that_fails_is_reported_with_its_last_words(monkeypatch):
-    monkeypatch.setattr(surface, "_WORKER", "raise RuntimeError('no inside')")
+    monkeypatch.setattr(surface, "WORKER", "raise RuntimeError('no inside')")
     monkeypatch.setattr(surface, "version", lambda name: "0")
     with pytest.raises(
         InputError, match=r"could not fill the surface .*no inside"

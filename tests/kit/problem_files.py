@@ -64,7 +64,7 @@ reference_m = {REFERENCES}
 
 Edit = Callable[[Path], object]
 write_pictures = (
-    run_record._write_pictures
+    run_record.write_pictures
 )  # before the session's fixture leaves them out
 
 
@@ -196,7 +196,7 @@ def run_command(*arguments: object) -> Outcome:
 def pictures_drawn() -> Iterator[None]:
     """Runs that are written in this block have their pictures."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_record, "_write_pictures", write_pictures)
+        patch.setattr(run_record, "write_pictures", write_pictures)
         yield
 
 

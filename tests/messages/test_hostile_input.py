@@ -528,7 +528,7 @@ import os, signal, sys, threading, time
 from collocation_sysid import cli
 from collocation_sysid.methods import nlpsol
 from collocation_sysid.result import run_record
-run_record._write_pictures = lambda *_, **__: None
+run_record.write_pictures = lambda *_, **__: None
 sys.argv = ["collocation-sysid", "solve", "problem.toml", "--out", "run", "-q"]
 def end():
     for _ in range({times}):

@@ -281,7 +281,7 @@ def test_a_c3d_that_crashes_its_reader_is_refused(
     whole_c3d(tmp_path)
     monkeypatch.setattr(
         c3d,
-        "_WORKER",
+        "WORKER",
         "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
     )
     with pytest.raises(

@@ -34,8 +34,8 @@ from collocation_sysid import (
 from collocation_sysid.fem.meshes.selection import Box
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.stiffness_scan import (
-    _ScanState,
-    _TrialSimulation,
+    ScanState,
+    TrialSimulation,
     scan_stiffness,
     start_problem,
     typical_parameters,
@@ -198,8 +198,8 @@ class Known:
         return self.misfit(young_pa), None
 
 
-def walked(misfit, step: float = 10.0) -> _ScanState:
-    tried = _ScanState(Known(misfit))  # type: ignore[arg-type]
+def walked(misfit, step: float = 10.0) -> ScanState:
+    tried = ScanState(Known(misfit))  # type: ignore[arg-type]
     tried.try_sequence([1e7 / step**k for k in range(6)])
     return tried
 
@@ -273,7 +273,7 @@ def test_markers_and_forces_count_alike():
     both = sensed(wristed_cube(30))
     seen = replace(both, grasps=[replace(g, wrench=None) for g in both.grasps])
     trials = [
-        _TrialSimulation(Problem([each], GUESS).collocation())
+        TrialSimulation(Problem([each], GUESS).collocation())
         for each in (both, seen, unseen(both))
     ]
     together, of_markers, of_forces = (
@@ -363,7 +363,7 @@ def test_a_guess_that_cannot_be_simulated_is_rescued_with_a_note():
 
 def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
     monkeypatch.setattr(
-        "collocation_sysid.methods.stiffness_scan._TrialSimulation.rigid_misfit",
+        "collocation_sysid.methods.stiffness_scan.TrialSimulation.rigid_misfit",
         1e-3,
     )
     collocation, found = start_problem(cube(guessed(mu_pa=1e4)).collocation())
@@ -378,7 +378,7 @@ def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
 
 def test_a_better_guess_than_the_scans_best_stays(monkeypatch):
     monkeypatch.setattr(
-        "collocation_sysid.methods.stiffness_scan._TrialSimulation.rigid_misfit",
+        "collocation_sysid.methods.stiffness_scan.TrialSimulation.rigid_misfit",
         0.0,
     )
     collocation = cube(guessed(**{**TRUTH, "mu_pa": 301.0})).collocation()
@@ -418,7 +418,7 @@ def test_a_method_that_simulates_everything_gets_a_start_that_can_be(
 ):
     best = scanned().young_pa[scanned().best]
     monkeypatch.setattr(
-        "collocation_sysid.methods.stiffness_scan._TrialSimulation.is_simulable",
+        "collocation_sysid.methods.stiffness_scan.TrialSimulation.is_simulable",
         lambda _, young: young > 1.5 * best,
     )
     found = scan_stiffness(cube().collocation(), is_complete=True)

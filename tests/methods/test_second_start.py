@@ -11,7 +11,7 @@ from kit.problems import hung_cube
 import collocation_sysid as cs
 from collocation_sysid.runs.solving import (
     NEARLY_INCOMPRESSIBLE,
-    _best_of_second_start,
+    best_of_second_start,
     second_start_parameters,
 )
 
@@ -47,13 +47,13 @@ def test_a_ratio_that_is_known_gives_no_second_start():
 
 def test_the_better_of_two_answers_counts():
     first = answer("young_pa", "poisson", "gamma_r_s")
-    same = _best_of_second_start(cs.ReducedSpace(), first, None)
+    same = best_of_second_start(cs.ReducedSpace(), first, None)
     assert same is first
     worse = replace(
         first,
         history=(replace(first.history[-1], loss=first.history[-1].loss + 5),),
     )
-    better = _best_of_second_start(cs.ReducedSpace(), worse, None)
+    better = best_of_second_start(cs.ReducedSpace(), worse, None)
     assert "χ² lower by 5" in better.notes[0]
     assert better.parameters["poisson"] == pytest.approx(
         first.parameters["poisson"], rel=1e-3

@@ -13,7 +13,7 @@ from pydantic_core import PydanticUndefined
 from collocation_sysid import Nuisance
 from collocation_sysid.common.declarations import documented
 from collocation_sysid.problem.nuisance_schema import KEYS, NuisanceSection
-from collocation_sysid.problem.validation_messages import _table_models
+from collocation_sysid.problem.validation_messages import table_models
 from collocation_sysid.recording.nuisance import KINDS, NuisanceRow
 from collocation_sysid.statistics.budget.systematic_effects import (
     ASSUMPTIONS,
@@ -68,7 +68,7 @@ def test_the_table_has_a_key_for_each_kind():
 def prior_section(key: str) -> Any:
     """Class of the table of a key of [experiment.nuisance]."""
     return next(
-        iter(_table_models(NuisanceSection.model_fields[key].annotation))
+        iter(table_models(NuisanceSection.model_fields[key].annotation))
     )
 
 

@@ -24,7 +24,7 @@ from scipy.ndimage import binary_erosion
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.stiffness_scan import _other_starts
+from collocation_sysid.methods.stiffness_scan import other_starts
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
@@ -239,9 +239,9 @@ def test_an_outline_off_the_edges_at_many_points_gives_concern():
 
 def test_starts_are_the_best_stiffness_its_neighbours_and_other_minima():
     misfit = np.array([9.0, 3.0, 2.0, 2.5, 2.8, 2.6, 5.0, np.nan])
-    assert _other_starts(misfit, 2) == (3, 5)
-    assert _other_starts(np.array([1.0, 50.0, 60.0]), 0) == ()
-    assert _other_starts(np.array([np.nan, 1.0, 1.5]), 1) == (2,)
+    assert other_starts(misfit, 2) == (3, 5)
+    assert other_starts(np.array([1.0, 50.0, 60.0]), 0) == ()
+    assert other_starts(np.array([np.nan, 1.0, 1.5]), 1) == (2,)
 
 
 @pytest.mark.long

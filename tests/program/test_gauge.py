@@ -36,7 +36,7 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_readings
 from collocation_sysid.recording import Experiment, Gauge, Look, Markers, Wrench
 from collocation_sysid.result.pictures.album import (
-    _experiment_pictures as album_pictures,
+    experiment_pictures as album_pictures,
 )
 from collocation_sysid.result.pictures.over_time import sensor_picture
 from collocation_sysid.result.replay import read_run

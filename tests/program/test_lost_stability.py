@@ -13,7 +13,7 @@ from collocation_sysid.errors import SimulationError
 from collocation_sysid.program.forward.loss_of_stability import (
     BIOT_RATIO,
     StabilityLoss,
-    _on_surface,
+    is_on_surface,
 )
 
 LAW = {"young_pa": 2e4, "poisson": 0.45, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
@@ -99,7 +99,7 @@ def test_critical_stretches_are_biots(stretch, across, critical):
     mode = np.zeros_like(moved_m)
     top = mesh.points_m[:, 2] > 0.0999
     mode[top, 2] = np.sin(40 * mesh.points_m[top, 0])
-    lost = _on_surface(mesh.points_m, moved_m, mode, mesh.surface)
+    lost = is_on_surface(mesh.points_m, moved_m, mode, mesh.surface)
     assert (lost.smaller_stretch, lost.larger_stretch) == pytest.approx(
         (stretch, max(across, stretch))
     )

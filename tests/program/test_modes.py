@@ -16,7 +16,7 @@ from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.program.modes.modal_prediction import (
-    _oscillator_responses,
+    oscillator_responses,
 )
 from collocation_sysid.program.modes.natural_modes import Modes, natural_modes
 
@@ -195,7 +195,7 @@ def test_oscillators_answer_loads_that_are_linear_between_samples(
             now,
             then - now,
         ]
-    found = _oscillator_responses(
+    found = oscillator_responses(
         np.array([[omega]]), ratio, loads[:, None], step_s, from_rest
     )
     np.testing.assert_allclose(found[0, :, 0], expected, rtol=1e-9, atol=1e-15)

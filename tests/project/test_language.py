@@ -137,3 +137,20 @@ def test_no_test_module_imports_another_one():
         if module in names
     ]
     assert imported == []
+
+
+def test_no_test_replaces_a_private_function():
+    """What tests replace is public, so that its docstring states what it may be replaced by."""
+    replaced = [
+        f"{path.name}:{node.lineno}"
+        for path in TESTS.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Attribute)
+        and node.func.attr in ("setattr", "object")
+        and len(node.args) > 1
+        and isinstance(node.args[1], ast.Constant)
+        and str(node.args[1].value).startswith("_")
+        and not str(node.args[1].value).startswith("__")
+    ]
+    assert replaced == []

@@ -9,7 +9,7 @@ from ...datasets.dataset_files import dataset_folder
 from ...errors import InputError, require_among
 from ...problem import Problem
 
-_CHECKOUT = Path(__file__).parents[3]
+CHECKOUT = Path(__file__).parents[3]
 # Licence of the curves of rubber.
 HYPERELASTICS_LICENCE = "collocation_sysid/datasets/LICENSE_Hyperelastics.md"
 
@@ -59,7 +59,7 @@ class BenchmarkBody:
     @property
     def data_folder(self) -> Path | None:
         """Folder with the problem file and all data; None if files are missing."""
-        folder = _CHECKOUT / "problems" / self.folder
+        folder = CHECKOUT / "problems" / self.folder
         if not self.script:
             try:
                 folder = dataset_folder(self.folder)
@@ -72,7 +72,7 @@ class BenchmarkBody:
     @property
     def licence_file(self) -> Path | None:
         """Text of the licence of the recordings; None if there is none in the repository."""
-        return _CHECKOUT / self.licence_path if self.licence_path else None
+        return CHECKOUT / self.licence_path if self.licence_path else None
 
     @property
     def is_available(self) -> bool:

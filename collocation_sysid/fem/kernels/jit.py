@@ -203,7 +203,7 @@ def _object_code(code: NativeCode, machine: llvm.TargetMachine) -> bytes:
     )
     code_bytes = load_object(cache_key)
     if code_bytes is None:
-        code_bytes = _compile(code.build(), machine, code.is_unoptimised)
+        code_bytes = compile_module(code.build(), machine, code.is_unoptimised)
         store_object(cache_key, code_bytes)
     return code_bytes
 
@@ -219,7 +219,7 @@ def _source_digest() -> str:
     return digest.hexdigest()
 
 
-def _compile(
+def compile_module(
     module: ir.Module, machine: llvm.TargetMachine, quickly: bool
 ) -> bytes:
     """Return the object code of an LLVM module for a machine, without optimisation if `quickly`; the

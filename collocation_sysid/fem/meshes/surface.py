@@ -31,7 +31,7 @@ MOST_ELEMENTS = 2_000_000
 
 # Program of a separate process: fTetWild writes a file to its working directory and cannot be
 # interrupted.
-_WORKER = """
+WORKER = """
 import pytetwild
 points, tetrahedra = pytetwild.tetrahedralize(
     given["points_m"], given["triangles"], edge_length_abs=float(sys.argv[1]),
@@ -81,7 +81,7 @@ def tetrahedralize_surface(
     _require_suitable_edge_length(points, faces, edge_length_m=edge_length_m)
     mesher = _pytetwild_version()
     if cache_dir is None:
-        return _run_ftetwild(points, faces, edge_length_m=edge_length_m)
+        return run_ftetwild(points, faces, edge_length_m=edge_length_m)
     digest = hashlib.sha256(
         f"{mesher} {_RECIPE} {float(edge_length_m)!r} {points.shape}".encode()
     )
@@ -93,7 +93,7 @@ def tetrahedralize_surface(
         with replaced_file(cached) as draft:
             # A mesh that is refused must not be kept.
             cleaned = clean_mesh(
-                *_run_ftetwild(points, faces, edge_length_m=edge_length_m)
+                *run_ftetwild(points, faces, edge_length_m=edge_length_m)
             )
             write_tetrahedra(
                 draft, cleaned.points_m, tetrahedra=cleaned.tetrahedra
@@ -212,7 +212,7 @@ def _pytetwild_version() -> str:
         ) from missing
 
 
-def _run_ftetwild(
+def run_ftetwild(
     points: np.ndarray, triangles: np.ndarray, edge_length_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes (n, 3) [m] and tetrahedra (E, 4) of fTetWild, run in a separate process.
@@ -230,7 +230,7 @@ def _run_ftetwild(
     words = [repr(float(length)) for length in lengths]
     try:
         mesh = run_isolated(
-            _WORKER, *words, points_m=points, triangles=triangles.astype("i4")
+            WORKER, *words, points_m=points, triangles=triangles.astype("i4")
         )
     except Failed as error:
         raise InputError(

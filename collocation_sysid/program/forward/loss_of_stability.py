@@ -199,7 +199,7 @@ def find_stability_loss(
     mode = mode.reshape(-1, 3)[:own]
     mode = mode / np.linalg.norm(mode, axis=1).max()
     positions_m = x.reshape(-1, 3)[:own]
-    return _on_surface(
+    return is_on_surface(
         nodes.points_m,
         positions_m,
         mode=mode,
@@ -237,7 +237,7 @@ def _lowest(
     return float(values[0]), np.asarray(root @ vectors[:, 0])
 
 
-def _on_surface(
+def is_on_surface(
     points_m: Array, positions_m: Array, mode: Array, surface: Index
 ) -> StabilityLoss:
     """Return the mode with stretches and wavelength on the surface's triangles.

@@ -224,7 +224,7 @@ class ModalResponse:
         step_s = float(declared.t_s[1] - declared.t_s[0])
         omega = self._frequencies(scale)
         states = [
-            _oscillator_responses(
+            oscillator_responses(
                 omega,
                 ratio,
                 loads=loads,
@@ -303,7 +303,7 @@ def _second_differences(x: Array, step_s: float) -> Array:
     return second
 
 
-def _oscillator_responses(
+def oscillator_responses(
     omega: Array,
     ratio: float,
     loads: Array,

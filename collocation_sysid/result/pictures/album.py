@@ -81,7 +81,7 @@ def all_pictures(
         for name, values in body.fields.items():
             pictures[f"field_{name}"] = field_picture(body, name, values=values)
     drawn = (
-        named for replay in replays for named in _experiment_pictures(replay)
+        named for replay in replays for named in experiment_pictures(replay)
     )
     return with_unique_names(chain(pictures.items(), drawn))
 
@@ -102,7 +102,7 @@ def with_unique_names(
     return named
 
 
-def _experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
+def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
     """Yield name and picture of everything that is known of one experiment.
 
     A name is the kind of picture before the name of the experiment, such as "tracks_swing", and of
