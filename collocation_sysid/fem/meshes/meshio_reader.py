@@ -30,7 +30,7 @@ LONGEST_REASON = 300
 
 # Program of the isolated process. It returns all data as arrays, and their names as JSON in a
 # further array.
-_WORKER = """
+WORKER = """
 import contextlib, io, json, warnings
 said = io.StringIO()
 try:
@@ -121,7 +121,7 @@ def read_content(path: str | Path) -> MeshContent:
     try:
         absolute = str(Path(path).resolve())
         arrays = run_isolated(
-            _WORKER, absolute, limits=ProcessLimits.for_file(path)
+            WORKER, absolute, limits=ProcessLimits.for_file(path)
         )
     except Failed as error:
         raise InputError(str(error)) from error

@@ -25,7 +25,7 @@ _SGI = 86
 # Largest frame number that the header's 16 bits can hold.
 _COUNTER_LIMIT = 65535
 # On damaged files ezc3d may crash, which a process of its own survives.
-_WORKER = r"""
+WORKER = r"""
 import re, ezc3d
 file = ezc3d.c3d(sys.argv[1])
 of_points = file["parameters"]["POINT"]
@@ -63,7 +63,7 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
     header_points, header_frames = _header_counts(content)
     try:
         read = run_isolated(
-            _WORKER,
+            WORKER,
             str(Path(path).resolve()),
             limits=ProcessLimits.for_file(path),
         )
