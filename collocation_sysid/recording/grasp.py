@@ -206,7 +206,8 @@ def prescribed_dofs(grasps: Sequence[Grasp]) -> Index:
             )
             raise InputError(
                 f"node {node} is held by the grasps {i} and {j} at the same time{on_axis}; select "
-                "the nodes so that each is held by one grasp"
+                "the nodes so that each is held by one grasp, or the axes so that each axis of a node "
+                'is (axes = "z" for both platens, if the body slides on them)'
             )
     return np.unique(
         np.concatenate(
