@@ -139,6 +139,7 @@ def live(options: LiveCommand) -> None:
     and the exit code is then 2. An empty datagram ends the recording.
     """
     from ..extras.live.frames import FrameReader
+    from ..extras.live.gripper_transforms import gripper_transforms
     from ..extras.live.sources import (
         decode_lines,
         receive_datagrams,
@@ -171,6 +172,11 @@ def live(options: LiveCommand) -> None:
         source=source,
         gauges=estimator.model.experiment.readings,
         wrenches=estimator.model.wrenches,
+        gripper_transforms=gripper_transforms(
+            estimator.problem,
+            estimator.model.experiment.name,
+            estimator.model.moving_grasps,
+        ),
     )
     bad = 0
     with options.open_recording(estimator) as recording:

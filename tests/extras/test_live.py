@@ -10,6 +10,7 @@ import sys
 import threading
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,6 +40,7 @@ from collocation_sysid.extras.live import (
     estimator,
 )
 from collocation_sysid.extras.live.frame_buffer import FrameBuffer
+from collocation_sysid.extras.live.gripper_transforms import gripper_transforms
 from collocation_sysid.extras.live.sources import (
     paced_frames,
     receive_datagrams,
@@ -49,7 +51,12 @@ from collocation_sysid.extras.live.window_pass import WindowPass
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program import streaming_model, streaming_sweep
-from collocation_sysid.recording import Markers, Nuisance, PoseSequence
+from collocation_sysid.recording import (
+    Markers,
+    Nuisance,
+    PoseSequence,
+    read_poses,
+)
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 TWENTY = 20 * "9"
@@ -1053,3 +1060,39 @@ def test_a_recording_is_replayed_and_filmed(tiny):
     )
     ended = run_command("replay", "problem.toml", "--rate", 1000, "--json")
     assert json.loads(ended.out.splitlines()[-1])["t_s"] == pytest.approx(0.08)
+
+
+def test_poses_of_frames_are_of_the_gripper_if_the_problem_says_so(tiny: Path):
+    """As the poses of a file: both lead to the poses of the body in the recording."""
+    file = tiny / "problem.toml"
+    transform = (
+        "position_m = [0.01, 0.0, 0.02], quaternion_xyzw = [0, 0.6, 0, 0.8]"
+    )
+    text = file.read_text()
+    keys = 'poses = "swing_motion.csv"'
+    file.write_text(
+        text.replace(keys, f"{keys}, gripper_to_body = {{ {transform} }}")
+    )
+    problem = cs.Problem.read(file)
+    (experiment,) = problem.experiments
+    (matrix,) = gripper_transforms(problem, experiment.name, [0])
+    reader = FrameReader([1], ["a"], gripper_transforms=[matrix])
+    recorded = read_poses(tiny / "swing_motion.csv")
+    rotations, positions_m = experiment.grasps[0].poses.at(recorded.t_s)
+    for k, t_s in enumerate(recorded.t_s):
+        pose = {
+            "position_m": recorded.positions_m[k].tolist(),
+            "quaternion_xyzw": recorded.quaternions_xyzw[k].tolist(),
+        }
+        frame = reader.read(json.dumps({"t_s": float(t_s), "pose": pose}))
+        found_m, quaternions = frame.pose
+        np.testing.assert_allclose(found_m[0], positions_m[k], atol=1e-12)
+        turned = Rotation.from_quat(quaternions[0]).as_matrix()
+        np.testing.assert_allclose(turned, rotations[k], atol=1e-12)
+
+
+def test_a_problem_without_a_gripper_frame_has_no_transforms(tiny: Path):
+    problem = cs.Problem.read(tiny / "problem.toml")
+    assert gripper_transforms(problem, "swing", [0]) == [None]
+    from_python = replace(problem, origin=None)
+    assert gripper_transforms(from_python, "swing", [0]) == [None]

@@ -109,6 +109,22 @@ def test_the_order_and_signs_of_the_tracks_axes_are_stated(rng):
     )
 
 
+def test_a_missing_sample_of_a_fast_motion_is_no_jump():
+    """The samples around it are twice as far apart as the others."""
+    (experiment,) = soft("bar").experiments
+    markers = experiment.markers
+    way_m = np.outer(experiment.t_s, [8.0, 0.0, 0.0])
+    tracks_m = markers.positions_m + way_m[:, None]
+    tracks_m[20, 0] = np.nan
+    fast = replace(experiment, markers=replace(markers, positions_m=tracks_m))
+    causes = [each.cause for each in step_hypotheses(fast)]
+    assert "markers-jump" not in causes
+    tracks_m[21:] += [0.0, 0.2, 0.0]
+    jumped = replace(experiment, markers=replace(markers, positions_m=tracks_m))
+    causes = [each.cause for each in step_hypotheses(jumped)]
+    assert "markers-jump" in causes
+
+
 @pytest.mark.long
 def test_a_body_held_still_after_it_is_let_go_undeformed_may_swing():
     tracks = simulate(released_cube(20), TRUTH, "newmark").markers_m

@@ -386,6 +386,9 @@ class FrameReader:
         state.
     wrenches : mapping of grasp number to Wrench
         Sensors of grasps of the problem.
+    gripper_transforms : sequence of (4, 4) array or None
+        Pose of the undeformed body in the frame of each moving grasp's gripper, by which the poses
+        in the lines are multiplied; None, and an empty sequence, for poses of the body itself.
 
     Attributes
     ----------
@@ -400,8 +403,10 @@ class FrameReader:
         source: str = "input",
         gauges: Sequence[Gauge] = (),
         wrenches: Mapping[int, Wrench] = MappingProxyType({}),
+        gripper_transforms: Sequence[Array | None] = (),
     ) -> None:
         self.grasps = list(grasps)
+        self.gripper_transforms = list(gripper_transforms)
         self.names = list(names)
         self.source = source
         self.gauges = gauges
@@ -449,7 +454,9 @@ class FrameReader:
             )
         if "t_s" not in json_object:
             raise InputError("there is no t_s; expected the time in seconds")
-        pose = parse_pose(json_object.get("pose"), self.grasps)
+        pose = self._pose_of_body(
+            parse_pose(json_object.get("pose"), self.grasps)
+        )
         tracks = parse_markers(json_object.get("markers"), self.names)
         t_s = parse_time(json_object["t_s"])
         wrench = json_object.get("wrench")
@@ -466,6 +473,26 @@ class FrameReader:
             has_wrench=wrench is not None,
             instrument_samples=samples,
         )
+
+    def _pose_of_body(
+        self, pose: tuple[Array, Array] | None
+    ) -> tuple[Array, Array] | None:
+        """Return positions (G, 3) [m] and quaternions (G, 4) of the body in the moving grasps from
+        those in a line; None for None.
+        """
+        if pose is None or not any(
+            each is not None for each in self.gripper_transforms
+        ):
+            return pose
+        positions = pose[0].copy()
+        quaternions = pose[1].copy()
+        for k, transform in enumerate(self.gripper_transforms):
+            if transform is not None:
+                rotation = Rotation.from_quat(pose[1][k])
+                positions[k] += rotation.apply(transform[:3, 3])
+                body = rotation * Rotation.from_matrix(transform[:3, :3])
+                quaternions[k] = body.as_quat()
+        return positions, quaternions
 
     def _parse_row(self, cells: list[str]) -> Frame | None:
         """Return the frame of a row of a table; None for the first row, the header, whose columns
@@ -494,7 +521,9 @@ class FrameReader:
         each = [(values[:3], values[3:]) for values in poses]
         is_complete = not np.isnan(poses).any()
         pose = (
-            parse_pose(each[0] if len(each) == 1 else each, self.grasps)
+            self._pose_of_body(
+                parse_pose(each[0] if len(each) == 1 else each, self.grasps)
+            )
             if is_complete
             else None
         )

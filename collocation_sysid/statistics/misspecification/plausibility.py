@@ -236,9 +236,10 @@ def _common_jump(
     rows = np.flatnonzero(complete)
     if len(rows) < FEWEST:
         return
-    sizes = step_sizes(tracks_m[rows]).min(axis=1)
+    times_s = experiment.t_s[rows]
+    sizes = step_sizes(tracks_m[rows], times_s).min(axis=1)
     k = int(sizes.argmax())
-    grasp_step_m = step_sizes(moved_m[rows]).max(axis=1)[k]
+    grasp_step_m = step_sizes(moved_m[rows], times_s).max(axis=1)[k]
     usual_m = max(
         _usual_change(sizes), float(grasp_step_m), 2 * float(np.median(sigma_m))
     )
@@ -317,11 +318,28 @@ def _marker_box_m(experiment: Experiment) -> Array:
     return np.vstack([places.min(axis=0), places.max(axis=0)])
 
 
-def step_sizes(x: Array) -> Array:
-    """Return the size (T − 3, M) [m] of a step between samples k + 1 and k + 2 of tracks x (T, M,
-    3), from second differences of opposite directions; 0 for smooth motion, NaN in gaps.
+def step_sizes(x: Array, t_s: Array | None = None) -> Array:
+    """Return the size of a step between samples k + 1 and k + 2, from second differences of
+    opposite directions; 0 for smooth motion, NaN in gaps.
+
+    Parameters
+    ----------
+    x : (T, M, 3) array
+        Tracks [m].
+    t_s : (T,) array, optional
+        Times of the samples [s]; without them the samples are evenly spaced. A step within a longer
+        interval counts by the change in an interval of median length.
+
+    Returns
+    -------
+    (T − 3, M) array
+        Sizes [m].
     """
-    second = x[2:] - 2 * x[1:-1] + x[:-2]
+    changes = np.diff(x, axis=0)
+    if t_s is not None:
+        intervals_s = np.diff(t_s)
+        changes *= (np.median(intervals_s) / intervals_s)[:, None, None]
+    second = np.diff(changes, axis=0)
     opposite = -np.sum(second[:-1] * second[1:], axis=2)
     return np.sqrt(np.maximum(opposite, 0.0))
 

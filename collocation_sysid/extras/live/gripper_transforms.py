@@ -1,0 +1,53 @@
+"""Poses of the body in the grippers whose poses a stream contains."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ...common.array_types import Array
+from ...problem import Problem
+from ...problem.schema import ProblemFile
+
+
+def gripper_transforms(
+    problem: Problem, experiment: str, grasps: Iterable[int]
+) -> list[Array | None]:
+    """Return the key `gripper_to_body` of grasps and obstacles, as transformation matrices.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem; its file has the key.
+    experiment : str
+        Name of the experiment.
+    grasps : iterable of int
+        Indices of grasps, obstacles after them, counted from 0.
+
+    Returns
+    -------
+    list of (4, 4) array or None
+        Pose of the undeformed body in the frame of each gripper; None where the key is not stated,
+        and for a problem that was not read from a file.
+    """
+    indices = list(grasps)
+    if problem.origin is None:
+        return [None] * len(indices)
+    sections = ProblemFile.model_validate(
+        tomllib.loads(problem.origin.text)
+    ).recordings
+    (section,) = (each for each in sections if each.name == experiment)
+    transforms: list[Array | None] = []
+    for k in indices:
+        stated = section.moved_sections[k].gripper_to_body
+        if stated is None:
+            transforms.append(None)
+            continue
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_quat(stated.quaternion_xyzw).as_matrix()
+        matrix[:3, 3] = stated.position_m
+        transforms.append(matrix)
+    return transforms
