@@ -117,7 +117,7 @@ def test_negative_elements_are_reoriented_and_noted(box):
         np.sort(mesh.tetrahedra), np.sort(box.tetrahedra)
     )
     assert mesh.notes == (
-        "2 of 120 elements had a negative volume and were re-oriented.",
+        "2 of 120 elements had a negative volume and were re-oriented, which is harmless.",
     )
 
 

@@ -197,7 +197,7 @@ def clean_mesh(points_m: np.ndarray, tetrahedra: np.ndarray) -> CleanedMesh:
     if len(reversed_elements):
         notes.append(
             f"{len(reversed_elements)} of {len(oriented)} elements had a negative volume and were "
-            "re-oriented."
+            "re-oriented, which is harmless."
         )
     notes += _note_parts(used_points, oriented)
     return CleanedMesh(used_points, oriented, used=used, notes=tuple(notes))
