@@ -177,7 +177,8 @@ class InteriorPoint(Options):
         called with every entry of the history. See `Method`.
 
         With contact as complementarity, and obstacles, further solves follow a converged one, see
-        `solve_complementarity`.
+        `solve_complementarity`; the limits of iterations and time hold for each of them. Exceptions
+        of `watch` are not caught.
 
         Raises
         ------
@@ -356,8 +357,11 @@ class InteriorPoint(Options):
 
 
 def _largest_curvature(collocation: Collocation) -> float:
-    """Return the largest curvature of the objective with respect to a scaled position, at
-    least one.
+    """Return an estimate of the largest curvature of the objective with respect to a scaled
+    position, at least one.
+
+    Only markers count, each as if it were a node: the curvature is that of the smallest `sigma_m`
+    of an experiment in its unit of length. Without markers it is one.
     """
     units = (
         segment.length_m / float(np.min(segment.experiment.markers.sigma_m))

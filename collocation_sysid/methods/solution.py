@@ -562,6 +562,13 @@ class Method(Protocol):
         -------
         Solution
             The best iterate if the method did not converge or was interrupted (Ctrl-C).
+
+        Raises
+        ------
+        InputError
+            If the method cannot solve such a problem, or not with its options.
+        Exception
+            Those of `watch`, which end the solve.
         """
         ...
 
@@ -619,7 +626,8 @@ def _set_grasp_multipliers(
     """Set the multipliers (constraints,) of prescribed displacements at variables z to minus the
     remaining gradient of the Lagrangian, in place; the others are unchanged.
 
-    The constraints of prescribed displacements have unit Jacobian rows.
+    On entry those of prescribed displacements must be zero, because the remaining gradient is that
+    with the given multipliers. The constraints of prescribed displacements have unit Jacobian rows.
     """
     slope = collocation.gradient(z) + collocation.jacobian_vjp(z, multipliers)
     for part in collocation.iterates(slope):
