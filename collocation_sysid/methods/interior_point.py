@@ -302,7 +302,10 @@ class InteriorPoint(Options):
     def _settings(
         self, functions: NlpFunctions, *, is_warm: bool
     ) -> dict[str, Any]:
-        """Return the options for CasADi and IPOPT, except IPOPT's time limit.
+        """Return the options for CasADi and IPOPT, except IPOPT's time limit; those of the user
+        (`ipopt`) replace the others.
+
+        The callbacks that they contain are new, and are added to `functions`.
 
         Parameters
         ----------
@@ -399,7 +402,11 @@ class _DampedHessian:
     def __call__(
         self, z: Array, weight: float, multipliers: Array, values: Array
     ) -> None:
-        """Write the upper triangle of the Hessian at z to `values`.
+        """Write the upper triangle of the Hessian at z to `values`: the exact one, or that of
+        Gauss–Newton during the warm-up or by the options, with `proximal` on the diagonal of the
+        positions and, during the warm-up, the damping on that of q.
+
+        The parameters are stored, and the damping is adapted, see `_ends_warm_up`.
 
         Parameters
         ----------

@@ -499,6 +499,11 @@ def custom_sensor_rms(
     predicted : mapping of str to (S, m) array
         Predicted values by sensor name, for each sensor of the experiment. Samples that are NaN,
         predicted or measured, are ignored; a sensor without any other has the value NaN.
+
+    Raises
+    ------
+    KeyError
+        If `predicted` lacks a sensor.
     """
     residuals = (
         (g.name, predicted[g.name] - g.measured_values)

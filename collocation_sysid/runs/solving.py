@@ -56,8 +56,8 @@ def solve(
     There may be several searches, one after another: from the results of a scan, if guesses are
     missing or a search from guesses fails; a second one in reduced space, if the first converges
     near ν = ½; with correspondences of measurements that the estimates change; and with other
-    correlation lengths or phases of fields. `watch` receives the iterations of all of them, and one of
-    them gives the solution. Nothing is written.
+    correlation lengths or phases of fields. `watch` receives the iterations of all of them, and one
+    of them gives the solution. Nothing is written.
 
     Parameters
     ----------

@@ -108,7 +108,8 @@ class CasadiSolver(Options):
 
     def _settings(self, functions: NlpFunctions) -> dict[str, Any]:
         """Return the options of the plugin with its cache of functions; options of the user
-        (`casadi`) replace those of the method, and mappings are merged.
+        (`casadi`) replace those of the method, and mappings are merged. The functions of the cache
+        are new, and are added to `functions`.
         """
         cache = {
             n: functions.function(n, *o.split())
