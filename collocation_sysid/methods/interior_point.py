@@ -210,6 +210,7 @@ class InteriorPoint(Options):
         Parameters
         ----------
         collocation : Collocation
+            Problem.
         watch : callable or None
             Called with each entry of the history.
         start : (variables,) array or None

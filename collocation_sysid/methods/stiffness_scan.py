@@ -386,8 +386,9 @@ def _misfit(
     Parameters
     ----------
     collocation : Collocation
+        Problem; not modified.
     p : (np,) array
-        Parameters.
+        Parameters (q, φ).
     positions : sequence of (rows, 3n) array
         First rows of each trajectory [m].
     """

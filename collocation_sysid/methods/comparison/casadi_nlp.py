@@ -254,7 +254,9 @@ def _judge(
     status : Status
         Status by the solver.
     z : (variables,) array
+        Variables of the given problem.
     multipliers : (constraints,) array
+        Multipliers of its constraints, in the scaling of the NLP.
     """
     if status.converged:
         violation = np.abs(collocation.constraint_values(z)).max(initial=0.0)

@@ -115,7 +115,9 @@ def simulate_variables(
     Parameters
     ----------
     collocation : Collocation
+        Problem.
     p : (np,) array
+        Shared and nuisance parameters (q, φ).
     stopwatch : Stopwatch, optional
         Measures the simulations.
 
