@@ -91,8 +91,10 @@ class TimedFunction(ca.Callback):
         """Evaluate the function and write its outputs to `results`, in place; return 0, or 1 if it
         fails (CasADi's interface).
 
-        Exceptions are stored for the caller of the solver instead of being raised, except where no
-        stress-free shape exists: that counts as a failed evaluation alone.
+        Exceptions are stored in `errors` for the caller of the solver instead of being raised,
+        except where no stress-free shape exists: that counts as a failed evaluation alone. Once
+        `errors` contains one, nothing is evaluated any more. `calls` counts every call, `seconds`
+        only adds the time of those that succeed.
         """
         began = time.perf_counter()
         self.calls += 1
@@ -191,7 +193,8 @@ class NlpFunctions:
         """Return a new callback, and keep it for `seconds` and `calls`.
 
         Its inputs are z and p, and also w and y if an output is of the Lagrangian. For "grad_l"
-        alone it is a `LagrangianGradient`, which has a directional derivative.
+        alone it is a `LagrangianGradient`, which has a directional derivative; the evaluations of
+        that are not part of `seconds` and `calls`.
 
         Parameters
         ----------
@@ -449,10 +452,16 @@ class IterationMonitor(ca.Callback):
         return [1 if self.stop or self.recorder.is_late or self.errors else 0]
 
     def _record(self, arguments) -> None:
-        """Add an entry to the history, and store the iterate if it is the best.
+        """Add an entry to the recorder's history, count it in `lines`, and store the iterate in
+        `best` if it is the best.
 
         The best has the smallest sum of the objective and the largest violation of a constraint.
-        `arguments` are the outputs of `nlpsol` in CasADi's order.
+        The recorder calls `watch` with the entry; exceptions of `watch` are not caught here.
+
+        Parameters
+        ----------
+        arguments : sequence of DM
+            Outputs of `nlpsol` in CasADi's order.
         """
         z, value, rows, _, multipliers, *_ = (
             argument.full().ravel() for argument in arguments

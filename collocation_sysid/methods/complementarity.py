@@ -58,8 +58,8 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
     -------
     Solution
         Solution of the last solve, with the history and the times of all; the sequence ends with
-        the first solve that does not converge. It has no `initial_multipliers`, and a note on the
-        solves.
+        the first solve that does not converge. It has no `initial_multipliers`, and the notes of
+        `first` with one on the solves; notes of later solves are left out.
     """
     obstacles_by_experiment = {
         segment.experiment.name: reachable_obstacles(

@@ -616,6 +616,7 @@ class CondensedCollocation(Collocation):
         Parameters
         ----------
         z : (complete variables,) array
+            Variables of the complete program; not modified.
         loss_weight : float
             Weight of the objective.
         multipliers : (complete constraints,) array or None

@@ -102,7 +102,8 @@ class Continuation(Options):
 
         Numbers and times of the history, with whose entries `watch` is called, continue from part
         to part. The solve ends with a part that was interrupted or refused; the notes contain the
-        result of each part.
+        result of each part. A part that does not converge otherwise is followed by the next one.
+        Exceptions of the method are not caught.
         """
         climb = _ContinuationState(
             self.method, Recorder(self.name, collocation, watch=watch)

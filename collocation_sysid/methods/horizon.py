@@ -144,12 +144,16 @@ class Horizon:
     ) -> Iterate:
         """Sweep all experiments at parameters p and trajectories x, and return the iterate.
 
+        Its changes since a previous iterate (`position_change_m` and the measurements' part of
+        `previous_slopes_residual`) are zero. The times of the sweeps are added to the stopwatch, as
+        in `evaluate_step` and `reassociate`.
+
         Parameters
         ----------
         p : (np,) array
             All parameters (q, φ).
         trajectories : sequence
-            Trajectories, one per experiment.
+            Trajectories, one per experiment, with the rows of the horizon.
         known_iterate : Iterate, optional
             Iterate of the first rows at the same p and positions, which is continued.
 
@@ -195,6 +199,8 @@ class Horizon:
     def reassociate(self, p: Array, iterate: Iterate) -> Iterate:
         """Return an iterate at parameters p (np,) with the measurements of the present collocation;
         positions and sensitivities are those of `iterate`, not computed again.
+
+        Its changes since a previous iterate are zero, as in `evaluate`.
         """
         return self._run(p, reassociate, iterate.trajectories)
 
@@ -217,6 +223,13 @@ class Horizon:
             Function of (solver, transcription, huber, p of the experiment, entries of the columns).
         columns : sequence
             Further arguments, one entry per experiment each.
+
+        Raises
+        ------
+        SearchEnded
+            If the workers are lost.
+        Exception
+            Those of the function, as `SimulationError`.
         """
         thresholds = self._repeat(self.collocation.huber)
         trajectories = self.workers.map_experiments(
@@ -263,7 +276,8 @@ class Horizon:
         trajectories: Sequence[Any] | None = None,
         guess: Iterate | None = None,
     ) -> tuple[list[Any], SimulationError | None]:
-        """Simulate all experiments at parameters p, as far as the simulations succeed.
+        """Simulate all experiments at parameters p, as far as the simulations succeed; their times
+        are added to the stopwatch.
 
         Parameters
         ----------

@@ -27,10 +27,11 @@ from ..program.transcription import Transcription
 
 
 def associated_at_guess(collocation: Collocation) -> Collocation:
-    """Associate markers and cameras of unknown position with the body's initial shape at the guess.
+    """Return the problem with markers and cameras of unknown position associated with the body's
+    initial shape at the guess.
 
     The initial shape is the initial equilibrium or, if that fails, the undeformed shape moved with
-    the grasp. The collocation is returned unchanged if all positions are known.
+    the grasp. The given problem is not modified; it is returned itself if all positions are known.
     """
     if not any(segment.rows_to_place for segment in collocation.transcriptions):
         return collocation
@@ -53,7 +54,8 @@ def associated_at_guess(collocation: Collocation) -> Collocation:
 
 
 def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
-    """Return variables z (variables,) at the guess, and notes for the user.
+    """Return variables z (variables,) at the guess, and notes for the user, one for each simulation
+    that failed.
 
     Each experiment is simulated at the guess with the collocation scheme. If that fails, the
     initial shape is moved rigidly with the grasp instead and a note is added, because collocation

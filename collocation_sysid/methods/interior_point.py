@@ -177,7 +177,8 @@ class InteriorPoint(Options):
         called with every entry of the history. See `Method`.
 
         With contact as complementarity, and obstacles, further solves follow a converged one, see
-        `solve_complementarity`.
+        `solve_complementarity`; the limits of iterations and time hold for each of them. Exceptions
+        of `watch` are not caught.
 
         Raises
         ------
@@ -209,6 +210,7 @@ class InteriorPoint(Options):
         Parameters
         ----------
         collocation : Collocation
+            Problem.
         watch : callable or None
             Called with each entry of the history.
         start : (variables,) array or None
@@ -301,7 +303,10 @@ class InteriorPoint(Options):
     def _settings(
         self, functions: NlpFunctions, *, is_warm: bool
     ) -> dict[str, Any]:
-        """Return the options for CasADi and IPOPT, except IPOPT's time limit.
+        """Return the options for CasADi and IPOPT, except IPOPT's time limit; those of the user
+        (`ipopt`) replace the others.
+
+        The callbacks that they contain are new, and are added to `functions`.
 
         Parameters
         ----------
@@ -356,8 +361,11 @@ class InteriorPoint(Options):
 
 
 def _largest_curvature(collocation: Collocation) -> float:
-    """Return the largest curvature of the objective with respect to a scaled position, at
-    least one.
+    """Return an estimate of the largest curvature of the objective with respect to a scaled
+    position, at least one.
+
+    Only markers count, each as if it were a node: the curvature is that of the smallest `sigma_m`
+    of an experiment in its unit of length. Without markers it is one.
     """
     units = (
         segment.length_m / float(np.min(segment.experiment.markers.sigma_m))
@@ -395,7 +403,11 @@ class _DampedHessian:
     def __call__(
         self, z: Array, weight: float, multipliers: Array, values: Array
     ) -> None:
-        """Write the upper triangle of the Hessian at z to `values`.
+        """Write the upper triangle of the Hessian at z to `values`: the exact one, or that of
+        Gauss–Newton during the warm-up or by the options, with `proximal` on the diagonal of the
+        positions and, during the warm-up, the damping on that of q.
+
+        The parameters are stored, and the damping is adapted, see `_ends_warm_up`.
 
         Parameters
         ----------

@@ -68,6 +68,10 @@ def with_curvature(
 ) -> SquareRootInformation:
     """Return a least-squares problem with the normal matrix SᵀS + B instead of SᵀS.
 
+    The gradient at zero is unchanged, so the minimiser is that of the model with B. Only np rows
+    are kept, without the part of the residual that no step can reduce: losses of the result differ
+    from the model's by a constant.
+
     The problem is returned unchanged if B is zero, S is rank-deficient, B reduces the curvature too
     much (`LARGEST_SHARE`), or B is so much larger than SᵀS that rounding makes their sum
     indefinite.
@@ -75,9 +79,9 @@ def with_curvature(
     Parameters
     ----------
     fit : SquareRootInformation
-        Residuals with slopes S.
+        Residuals with slopes S, in np parameters; not modified.
     curvature : (np, np) array
-        B, symmetric.
+        B, symmetric and finite.
     """
     triangle = fit.jacobian[: len(curvature)]
     right = fit.residual[: len(curvature)]

@@ -55,7 +55,10 @@ def solve(
     """Solve the recorder's collocation, and return the solution; if the solver did not converge,
     its best iterate.
 
-    Ctrl-C stops the solver after the iteration, or after 2 s; a second one ends the process.
+    Ctrl-C stops the solver after the iteration, or abandons it after 2 s; the status is then
+    `INTERRUPTED`. If the recorder's time is over before convergence it is `TIME_LIMIT`. This holds
+    on the main thread; on others Ctrl-C is not handled. The recorder gets an entry of its history
+    for each iteration, notes, and the times of its stopwatch.
 
     Parameters
     ----------
@@ -82,9 +85,11 @@ def solve(
     ------
     InputError
         If the solver does not know an option, with the solver's message.
+    KeyboardInterrupt
+        At a second Ctrl-C.
     Exception
         The first exception of a function of the program or of the recorder's `watch`, which ends
-        the solver.
+        the solver. Where no stress-free shape exists the solver takes a shorter step instead.
     """
     collocation = recorder.collocation
     watch = recorder.stopwatch
@@ -173,7 +178,8 @@ def _create_solver(
     Raises
     ------
     InputError
-        If the plugin cannot be set up, with the first line of its message.
+        If the plugin cannot be set up, as for an unknown option or a plugin that is not installed,
+        with the line of its message that says why.
     """
     z = ca.MX.sym("z", functions.collocation.variable_count)
     value, rows = functions.nlp(z, ca.MX(0, 1))

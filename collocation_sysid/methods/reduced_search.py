@@ -231,7 +231,10 @@ class ReducedSearch:
         Raises
         ------
         SimulationError
-            If the simulation cannot be extended even after a fit of the rows that were reached.
+            If the simulation cannot be extended even after a fit of the rows that were reached, or
+            the sweep at the start of a horizon fails.
+        SearchEnded
+            If the workers are lost.
         """
         status = self._solve_from_start() or self._solve_horizons()
         return status, status.sentence
@@ -239,7 +242,8 @@ class ReducedSearch:
     def _solve_from_start(self) -> Status | None:
         """Return the status of a solve of the complete problem from the given trajectories.
 
-        None if there are none or the sweep fails; the trajectories are then discarded.
+        None if there are none, or if the search raises a `SimulationError`; trajectories and point
+        are then discarded, parameters, associations and the count of sweeps remain.
         """
         if self.trajectories is None:
             return None
@@ -256,6 +260,11 @@ class ReducedSearch:
     def _solve_horizons(self) -> Status:
         """Solve one horizon after the other, up to the complete problem or a limit of iterations,
         and return the last status.
+
+        Raises
+        ------
+        SimulationError
+            If a horizon cannot be reached or started, see `_extend_to` and `_minimise`.
         """
         status = Status.CONVERGED
         for share in self.options.ladder:
@@ -354,7 +363,8 @@ class ReducedSearch:
         Raises
         ------
         SimulationError
-            If the sweep at the start fails; failed trials are only rejected.
+            If the sweep at the start fails, or a time step is singular in the exact curvature at an
+            accepted step; failed trials are only rejected.
         """
         assert self.trajectories is not None
         tolerance = self.options.tolerance
@@ -438,6 +448,11 @@ class ReducedSearch:
     ) -> Array:
         """Return the part of the Hessian (np, np) at `after` that Gauss–Newton neglects: exact, or
         by a secant update of `curvature` from the point `previous`, as the options state.
+
+        Raises
+        ------
+        SimulationError
+            If a time step is singular in the sweep for the exact one.
         """
         if self.options.hessian == "exact":
             return exact_curvature(
@@ -465,7 +480,7 @@ class ReducedSearch:
         self, horizon: Horizon, point: Iterate, step: Array
     ) -> Iterate | None:
         """Return the point after a step (np,) of the parameters from `point`, clipped to the
-        bounds, by one sweep; None if that fails or is not finite.
+        bounds, by one sweep, which is counted; None if that fails or is not finite.
         """
         self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
@@ -600,10 +615,14 @@ class ReducedSearch:
         self.p = p
 
     def _reassociate(self, horizon: Horizon, point: Iterate) -> Iterate:
-        """Return the point with measurements associated at its estimates, and use that collocation,
-        in place; the point itself if nothing changes, or after `REREADINGS` updates.
+        """Return the point with measurements associated at its estimates; the point itself if
+        nothing changes, or after `REREADINGS` updates.
 
-        For the trial that `_is_better_for_cameras` has associated, that association is used.
+        The collocation with this association and its parameters replace those of the search, of the
+        recorder and of the horizon, see `_set_collocation`, and `reassociations` is increased by
+        one. For the trial that `_is_better_for_cameras` has associated last, that association is
+        used; else positions and sensitivities of the point are kept, and measurements are evaluated
+        again.
         """
         stored = self.camera_trial
         if stored is not None and stored.trial is point:
@@ -630,9 +649,23 @@ class ReducedSearch:
     ) -> bool:
         """Return whether a trial is still acceptable with depth points associated at its estimates.
 
-        A depth point may then belong to another part of the surface, or to none. True without depth
-        cameras; false if the association may not be updated any more. The collocation is as before
-        afterwards; the association at the trial is stored for `_reassociate`.
+        A depth point may then belong to another part of the surface, or to none. The number of
+        measurements must be at least `LEAST_VISIBLE_SHARE` of the largest so far, and the loss per
+        measurement at most `EQUAL_MISFIT_RATIO` times that of the point. True without depth
+        cameras; false if the association may not be updated any more.
+
+        Afterwards collocation and parameters are those of the point, in the search, the recorder
+        and the horizon. The association at the trial is stored in `camera_trial` for
+        `_reassociate`, and `most_measurements` is updated; `reassociations` is unchanged.
+
+        Parameters
+        ----------
+        horizon : Horizon
+            Problem on which both were evaluated.
+        point : Iterate
+            Best point so far, with the present association.
+        trial : Iterate
+            Point after a step that `_judge` accepts, with the same association.
         """
         before = self.collocation
         if not self.has_depth_cameras:
@@ -660,6 +693,10 @@ class ReducedSearch:
     def _accept(self, horizon: Horizon, point: Iterate) -> Iterate:
         """Make a point the best so far: associate its measurements with its estimates, store and
         record it, and return it as associated.
+
+        `point`, `indefinite_steps`, `p` and `trajectories` are set, and where measurements are
+        associated differently also the collocation of the search, the recorder and the horizon.
+        Exceptions of the recorder's `watch` are not caught.
         """
         self.point = point = self._reassociate(horizon, point)
         self.indefinite_steps = sum(
@@ -676,9 +713,12 @@ class ReducedSearch:
     ) -> None:
         """Store parameters and trajectories as the best so far, and add an entry to the history.
 
+        The recorder calls `watch` with the entry; exceptions of `watch` are not caught.
+
         Parameters
         ----------
         p : (np,) array
+            All parameters (q, φ).
         x : list
             Trajectories, as the workers store them.
         loss : float

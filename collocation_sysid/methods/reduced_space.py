@@ -64,7 +64,10 @@ class ReducedSpace(SearchOptions):
         """Solve the NLP, see `Method`.
 
         Entries of the history count sweeps, including rejected ones; the first belong to short
-        horizons.
+        horizons. A search that fails, is interrupted or loses its workers gives the best point so
+        far, and `status` says why it ended. Rows that were not simulated are then those of a rigid
+        motion with the grasp, and the solution's `initial_multipliers` are zeros; else they are
+        None. Exceptions of `watch` are not caught.
 
         Parameters
         ----------

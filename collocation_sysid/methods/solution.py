@@ -499,6 +499,11 @@ def custom_sensor_rms(
     predicted : mapping of str to (S, m) array
         Predicted values by sensor name, for each sensor of the experiment. Samples that are NaN,
         predicted or measured, are ignored; a sensor without any other has the value NaN.
+
+    Raises
+    ------
+    KeyError
+        If `predicted` lacks a sensor.
     """
     residuals = (
         (g.name, predicted[g.name] - g.measured_values)
@@ -562,6 +567,13 @@ class Method(Protocol):
         -------
         Solution
             The best iterate if the method did not converge or was interrupted (Ctrl-C).
+
+        Raises
+        ------
+        InputError
+            If the method cannot solve such a problem, or not with its options.
+        Exception
+            Those of `watch`, which end the solve.
         """
         ...
 
@@ -619,7 +631,8 @@ def _set_grasp_multipliers(
     """Set the multipliers (constraints,) of prescribed displacements at variables z to minus the
     remaining gradient of the Lagrangian, in place; the others are unchanged.
 
-    The constraints of prescribed displacements have unit Jacobian rows.
+    On entry those of prescribed displacements must be zero, because the remaining gradient is that
+    with the given multipliers. The constraints of prescribed displacements have unit Jacobian rows.
     """
     slope = collocation.gradient(z) + collocation.jacobian_vjp(z, multipliers)
     for part in collocation.iterates(slope):

@@ -92,8 +92,8 @@ class Recorder:
         Parameters
         ----------
         start : (variables,) array or None
-            Variables to start from, which are returned as they are; None means a simulation at the
-            guess, whose notes are added to `notes`.
+            Variables to start from, which are returned themselves; None means a simulation at the
+            guess, whose notes on failures are added to `notes`.
         """
         if start is not None:
             return start

@@ -126,7 +126,8 @@ def start_problem(
     Raises
     ------
     InputError
-        If parameters have no guess and the body cannot be simulated at any stiffness.
+        If a modulus has no guess and the body cannot be simulated at any stiffness, or with
+        `is_complete` to the end at none from the best one on.
     """
     unguessed = collocation.parameters.names_without_guess
     if any(is_modulus(name) for name in unguessed):
@@ -155,8 +156,8 @@ def start_problem(
 def rescue(
     collocation: Collocation, reason: str, is_complete: bool = False
 ) -> Scan | None:
-    """Return a scan without the given guesses; None if no modulus is free on a logarithmic scale,
-    or the body cannot be simulated at any stiffness.
+    """Return a scan without the given guesses, see `without_guesses`; None if no modulus is free on
+    a logarithmic scale, or `scan_stiffness` finds no start.
 
     Parameters
     ----------
@@ -182,6 +183,9 @@ def scan_stiffness(
 ) -> Scan:
     """Simulate the problem at stiffnesses from stiff to soft, and return the best as a start.
 
+    With `is_complete` it is the best, or else the next stiffer one, at which the complete
+    recordings can be simulated; there are then no `others`. The problem is not modified.
+
     Parameters
     ----------
     collocation : Collocation
@@ -194,7 +198,8 @@ def scan_stiffness(
     Raises
     ------
     InputError
-        If the body cannot be simulated at any stiffness.
+        If the body cannot be simulated at any stiffness, or with `is_complete` to the end at none
+        from the best one on.
     """
     began = time.perf_counter()
     trial = TrialSimulation(
@@ -279,7 +284,9 @@ def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
     """Return parameters in which missing guesses are replaced by typical values at a Young's
     modulus [Pa], within their bounds.
 
-    Parameters with a prior get its mean instead. Fixed parameters and those with a guess are kept.
+    Parameters with a prior get its mean instead. Fixed parameters and those with a guess are kept;
+    units that are missing are added, see `_with_units`. Every free parameter without a guess must
+    have a prior or a typical value, which parameters are required to have where they are made.
     """
     guesses = {
         i.name: i.guess
@@ -349,7 +356,8 @@ def _has_free_modulus(collocation: Collocation) -> bool:
 
 def without_guesses(collocation: Collocation) -> Collocation:
     """Return the problem without the guesses of those free parameters that have a prior or a
-    typical value, which can replace the guess.
+    typical value, which can replace the guess; other guesses are kept, and the given problem is not
+    modified.
     """
 
     def without_guess(item: Parameter) -> Parameter:
@@ -378,8 +386,9 @@ def _misfit(
     Parameters
     ----------
     collocation : Collocation
+        Problem; not modified.
     p : (np,) array
-        Parameters.
+        Parameters (q, φ).
     positions : sequence of (rows, 3n) array
         First rows of each trajectory [m].
     """
@@ -598,10 +607,11 @@ class ScanState:
         self.is_ended_early = False
 
     def try_sequence(self, young_pa: Sequence[float]) -> None:
-        """Try Young's moduli in the given order [Pa] until several in a row fail or fit badly; then
-        `is_ended_early` is set.
+        """Try Young's moduli in the given order [Pa] until `CONSECUTIVE_FAILURES` in a row fail or
+        fit badly; then `is_ended_early` is set. Their misfits are stored.
 
-        Of neighbours that give the same parameters only one is tried.
+        Failures before the first simulation that succeeds do not count. Of neighbours that give the
+        same parameters only one is tried.
         """
         failures = 0
         first, *others = (
@@ -621,15 +631,18 @@ class ScanState:
                 return
 
     def extend_range(self, young_pa: float, factor: float) -> None:
-        """Try moduli beyond an end of the range, as long as the misfit decreases, within
-        `LIMITS_PA`; their misfits are stored.
+        """Try moduli beyond an end of the range, as long as each decreases the misfit by more than
+        the share `BETTER`, within `LIMITS_PA`; their misfits are stored, also that of the last one.
+
+        It also ends where a simulation fails, or where the parameters are at their bounds and no
+        longer change.
 
         Parameters
         ----------
         young_pa : float
-            Modulus at the end, which was tried [Pa].
+            Modulus at the end, which was simulated [Pa].
         factor : float
-            Ratio of successive moduli.
+            Ratio of successive moduli, below one towards softer ones.
         """
         best = self.misfits[young_pa]
         beyond = young_pa * factor
@@ -659,7 +672,9 @@ class ScanState:
 
     def _try(self, young_pa: float) -> float:
         """Simulate at a Young's modulus [Pa], store its misfit and trajectories, and return the
-        misfit; NaN if the simulation fails.
+        misfit; NaN if the simulation fails, and then the last trajectories are kept.
+
+        The step is counted in the display of progress, see `complete_steps`.
         """
         misfit, warm = self.trial.evaluate_at(young_pa, self.last_trajectories)
         self.last_trajectories = warm or self.last_trajectories

@@ -272,7 +272,8 @@ def reassociate(
 ) -> SweepResult:
     """Return the sweep with its measurements evaluated by another transcription.
 
-    The positions and sensitivities are not computed again.
+    The positions and sensitivities are not computed again. The change of positions and
+    `previous_slopes_residual` are zero. The given sweep is not modified.
 
     Parameters
     ----------

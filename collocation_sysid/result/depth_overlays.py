@@ -101,8 +101,8 @@ class DepthProjection:
         )
 
     def outlines(self, shape_m: Array, sample: int) -> Array:
-        """Return u and v (k, 2) of the corners of the faces that are turned to the camera; NaN in
-        the row after each face.
+        """Return u and v (5 F, 2) of the edges of the F faces that are turned to the camera, as
+        closed lines: for each face its three corners, the first corner again, and a row of NaN.
 
         Faces that are partly behind a camera with an image are left out. Units are those of
         `image_points`.
@@ -260,8 +260,16 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
 def save_overlays(
     experiments: Iterable[Experiment], folder: Path
 ) -> list[Path]:
-    """Draw `undeformed_rows` of all experiments into an existing folder, a picture for each depth
-    camera, and return the files; empty without depth cameras.
+    """Draw the first image of each depth camera with the outlines of the undeformed body, see
+    `undeformed_rows`, and return the files; empty without depth cameras.
+
+    The pictures are written to `folder`, which must exist, as ``depth_<experiment>_<camera>.png``;
+    existing ones are replaced.
+
+    Raises
+    ------
+    InputError
+        If a picture cannot be written.
     """
     return save_pictures(
         folder,

@@ -297,6 +297,9 @@ class _FrameWindow:
     def show_nearest_frame(self, time_s: float) -> None:
         """Show the frame nearest to a time [s], with measured markers, grasped nodes and obstacles
         of the nearest sample, in place of the last one.
+
+        If no marker is measured, or no node grasped, at that sample, those of the last one stay in
+        the view. Grasped nodes are at their fitted positions, and are not drawn without a fit.
         """
         mesh = self.meshes[int(np.abs(self.times - time_s).argmin())]
         sample = int(np.abs(self.replay.t_s - time_s).argmin())

@@ -348,8 +348,8 @@ def require_replaceable(
     marker_file: str = RESULT_FILE,
     content_word: str = "run",
 ) -> None:
-    """Raise an `InputError` if a place for a run folder holds anything but an earlier run; a
-    missing or empty folder passes.
+    """Raise an `InputError` if a place for a run folder holds anything but an earlier run, or one
+    that may not be overwritten; a missing or empty folder passes.
 
     Parameters
     ----------
@@ -361,7 +361,9 @@ def require_replaceable(
     Raises
     ------
     InputError
-        Naming the place, and the first link or file there that this program did not write.
+        Naming the place: for a link, a file, a mount point, a folder with files but no
+        `marker_file`, an earlier run unless `overwrite`, and a run with a link or a file that this
+        program did not write or that was changed since, which is named too.
     """
     require_no_link(target)
     if not target.exists():
@@ -428,8 +430,13 @@ def require_only_written(folder: Path) -> None:
 
 
 def _replace_folder(new: Path, target: Path, backup: Path) -> None:
-    """Rename the folder `new` to `target`, moving an existing `target` to `backup` until that
-    succeeded.
+    """Rename the folder `new` to `target`; an existing `target` is moved to `backup`, which must
+    not exist, and removed once that succeeded.
+
+    Raises
+    ------
+    OSError
+        If a folder cannot be renamed; an existing `target` is then back in its place.
     """
     if not target.exists():
         new.rename(target)

@@ -201,8 +201,10 @@ class SolveProgress(Watched):
         self._state = describe
 
     def _update_activity(self, activity: str, line: str = "") -> None:
-        """Update the display with the current activity, and print `line` if verbose and not empty;
-        a new activity restarts its elapsed time.
+        """Show the current activity in the display, and print `line` if verbose and not empty.
+
+        A new activity restarts its elapsed time; the state of the previous one is no longer shown,
+        see `state`, also if the activity is the same.
         """
         if activity != self._doing:
             self._activity_began_s = time.monotonic()

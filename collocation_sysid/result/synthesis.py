@@ -123,7 +123,8 @@ def write_data(
         force sensor, ``<experiment>_reading_<name>.csv`` for custom sensors, and ``<experiment>/``
         with frames if requested. An experiment whose displacements come from a table, as on a test
         bench, gets its tables of displacement and load under their names in the problem file, in
-        place of poses and wrenches.
+        place of poses and wrenches. Earlier files of these names that this program wrote are
+        replaced. The list of written files `LIST_FILE` in the folder is made or extended.
     recipe : Recipe, optional
         Integrator, noise and seed; without noise by default.
     progress : callable, optional
@@ -132,7 +133,8 @@ def write_data(
     Returns
     -------
     list of Path
-        The files written.
+        The files written, in the order of the experiments, without the list of files; for frames
+        only the file `FRAMES_FILE` of each folder.
 
     Raises
     ------

@@ -53,6 +53,12 @@ def solve(
 ) -> Solution:
     """Solve a problem, without the checks of `run`.
 
+    There may be several searches, one after another: from the results of a scan, if guesses are
+    missing or a search from guesses fails; a second one in reduced space, if the first converges
+    near ν = ½; with correspondences of measurements that the estimates change; and with other
+    correlation lengths or phases of fields. `watch` receives the iterations of all of them, and one
+    of them gives the solution. Nothing is written.
+
     Parameters
     ----------
     problem : Problem
@@ -78,7 +84,9 @@ def solve(
     ------
     InputError
         For an unknown method, a start that is no run or shares no parameter name, if no start is
-        found, for a scheduler that does not answer, and when the solver refuses the problem.
+        found, if the machine lacks memory, for a scheduler that does not answer or a method that
+        cannot use it, for two-phase fields that cannot be searched, and when the solver refuses the
+        problem.
     """
     solver = problem.solver(method)
     if scheduler is not None and not isinstance(solver, ReducedSpace):

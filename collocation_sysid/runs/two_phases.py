@@ -222,7 +222,11 @@ def solve_two_phases(
 
 
 def _phases_of_solution(solution: Solution, search: _PhaseSearch) -> Array:
-    """Return the phases (E,) of the two-phase field in a solution: 1 in inclusions, 0 elsewhere."""
+    """Return the phases (E,) of the two-phase field in a solution, for the E elements of the part
+    that has the field: 1 in inclusions, 0 elsewhere.
+
+    It is the array of the field itself, not a copy.
+    """
     modes = _two_phase_body(solution, search).parts[search.number].field
     assert isinstance(modes, TwoPhaseModes)
     return modes.phase
@@ -385,7 +389,14 @@ def _linearise_in_elements(
 
 
 def _columns(fit: LinearisedFit, search: _PhaseSearch) -> Index:
-    """Return the column (E,) of each element's logarithm in a fit."""
+    """Return the column (E,) in a fit of the logarithm of each element of the part that has the
+    field.
+
+    Raises
+    ------
+    KeyError
+        If the fit does not have these parameters, as that of the two-phase field itself.
+    """
     places = {name: k for k, name in enumerate(fit.names)}
     return np.array([places[name] for name in search.elements])
 

@@ -404,8 +404,10 @@ def modes_by_experiment(
     """Return the natural modes of each body at the estimates, by experiment; empty if the search
     failed.
 
-    All moving experiments of the problem count, also those for validation; those without an
-    equilibrium of the body are left out.
+    The search failed if its status is not that of convergence. All moving experiments of the
+    problem count, also those for validation; those whose modes cannot be computed, as without a
+    stress-free shape, are left out. Without an equilibrium the modes are those about the undeformed
+    shape, see `check_modes`.
     """
     motions = {}
     substeps = solution.collocation.substeps

@@ -108,7 +108,8 @@ class CasadiSolver(Options):
 
     def _settings(self, functions: NlpFunctions) -> dict[str, Any]:
         """Return the options of the plugin with its cache of functions; options of the user
-        (`casadi`) replace those of the method, and mappings are merged.
+        (`casadi`) replace those of the method, and mappings are merged. The functions of the cache
+        are new, and are added to `functions`.
         """
         cache = {
             n: functions.function(n, *o.split())
@@ -253,7 +254,9 @@ def _judge(
     status : Status
         Status by the solver.
     z : (variables,) array
+        Variables of the given problem.
     multipliers : (constraints,) array
+        Multipliers of its constraints, in the scaling of the NLP.
     """
     if status.converged:
         violation = np.abs(collocation.constraint_values(z)).max(initial=0.0)

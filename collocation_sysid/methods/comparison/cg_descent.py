@@ -158,12 +158,13 @@ def minimise_cg_descent(
         Function that returns value and gradient (n,) at x; an infinite value where x is out of the
         domain.
     x0 : (n,) array
-        Initial variables.
+        Initial variables; not modified.
     options : CgDescentOptions, optional
         Options.
     callback : callable, optional
         Function that is called with the start and every iterate; it stops the minimisation by
-        returning true.
+        returning true. Its exceptions are not caught. The direction of the start is that of the
+        steepest descent.
     value : callable, optional
         Function that returns the value alone, if that is cheaper.
 
@@ -455,7 +456,8 @@ class _LineSearch:
         return self.function.value(self.x + step * self.direction)
 
     def search(self, step: float) -> _LineTrial | None:
-        """Return a trial that satisfies the Wolfe conditions (L0 … L3), starting at a step size.
+        """Return a trial that satisfies the Wolfe conditions (L0 … L3), starting at a step size
+        above zero.
 
         None if the allowed number of trials does not contain one, or no number lies between the
         ends of the interval.
@@ -507,6 +509,8 @@ class _LineSearch:
     def _satisfies_wolfe(self, trial: _LineTrial) -> bool:
         """Return whether a trial satisfies the Wolfe conditions: T2, the approximate ones with a
         value up to `limit`, or, unless only these count, T1.
+
+        Both require a slope of at least `curvature` times that at the start; false if it is NaN.
         """
         decrease = self.options.decrease
         curvature = self.options.curvature

@@ -52,19 +52,24 @@ def minimise_merit(
     merit : MeritFunction
         Merit function.
     z : (variables,) array
-        Initial variables.
+        Initial variables, within their bounds; not modified.
     tolerance : float
         Largest entry of the projected gradient ∂m/∂z at the end.
     max_iterations : int
         Largest number of iterations.
     report : callable
         Function that is called with every iterate z, its value and its projected gradient; an
-        exception ends the minimisation.
+        exception ends the minimisation and is not caught. The last iterate is the result.
 
     Returns
     -------
     bool
         Whether the tolerance was reached.
+
+    Raises
+    ------
+    InputError
+        If the factor of "levenberg-marquardt" needs too much memory.
     """
     if inner == "levenberg-marquardt":
         return levenberg_marquardt(
@@ -158,7 +163,8 @@ class _ConvergenceCheck:
         """Report the iterate s (free variables,), and return whether its gradient is within the
         tolerance.
 
-        `converged` and the replacement value of the scaled problem are updated.
+        `converged` and the replacement value of the scaled problem are updated. Exceptions of
+        `report` are not caught.
         """
         point = self.scaled.evaluate_at(s)
         self.scaled.replacement_value = STEEP * abs(point.value) + 1e-300

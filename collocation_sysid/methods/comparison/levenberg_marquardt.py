@@ -74,6 +74,11 @@ def minimise_levenberg_marquardt(
     bool
         Whether the tolerance was reached; false after `max_iterations` steps, or if rounding
         prevents it.
+
+    Raises
+    ------
+    InputError
+        If the factor needs more memory than `MOST_MEMORY`.
     """
     damping = DAMPING
     growth = 2.0
@@ -220,6 +225,9 @@ def _quadratic_model(
 class _QuadraticModel:
     """Quadratic model of a merit function at z.
 
+    Its matrix is H + ρ JᵀJ with J = ∂g/∂z, without damping. The parameters and the positions that
+    are not constant have blocks of it.
+
     Attributes
     ----------
     problem : PenaltyProblem
@@ -257,15 +265,24 @@ class _QuadraticModel:
         return -float(self.gradient @ step) - curvature / 2
 
     def step(self, damping: float) -> Array | None:
-        """Return the damped step (variables,), within the bounds of the parameters and zero for
-        constant variables; None if the damped matrix is not positive definite.
+        """Return the damped step (variables,), within bounds and reach of the parameters, see
+        `_bounded_step`, and zero for constant variables; None if the damped matrix is not positive
+        definite.
+
+        `damping` is added to the diagonal of the matrix. Bounds of positions are not regarded. The
+        time is added to the stopwatch.
+
+        Raises
+        ------
+        InputError
+            If the factor needs more memory than `MOST_MEMORY`.
         """
         with self.problem.stopwatch.solving(), one_blas_thread():
             return self._step(damping)
 
     def _step(self, damping: float) -> Array | None:
-        """Return the step (variables,) of the model with `damping` added to the diagonal of the
-        positions; None if the matrix is not positive definite.
+        """Return the step (variables,) of the model with `damping` added to the diagonal, of the
+        positions and of the parameters; None if the matrix is not positive definite.
         """
         positions = self._positions
         border = self.problem.parameter_indices
@@ -299,13 +316,16 @@ class _QuadraticModel:
         return step
 
     def _bounded_step(self, schur: Array, slope: Array) -> Array | None:
-        """Return the steps d of the parameters that minimise ½ dᵀ S d + sᵀ d within bounds and
-        reach; None if S is not positive definite.
+        """Return the steps d of the parameters that minimise ½ dᵀ S d + sᵀ d; None if S is not
+        positive definite.
+
+        Each step stays within the bounds of its parameter, and is at most `REACH` times its entry
+        of `reach_p`.
 
         Parameters
         ----------
         schur : (parameters, parameters) array
-            S.
+            S, symmetric and finite.
         slope : (parameters,) array
             s.
         """
@@ -355,7 +375,7 @@ class _QuadraticModel:
 
     @cached_property
     def _mixed_block(self) -> Array:
-        """Block (positions, parameters) of the matrix."""
+        """Dense block (free positions, parameters) of the matrix, without damping."""
         of_x, of_p = self._jacobian_blocks
         rows = sp.csr_array(self.hessian)[self._positions]
         return (
@@ -365,7 +385,7 @@ class _QuadraticModel:
 
     @cached_property
     def _parameter_block(self) -> Array:
-        """Block (parameters, parameters) of the matrix."""
+        """Dense block (parameters, parameters) of the matrix, without damping."""
         of_p = self._jacobian_blocks[1]
         border = self.problem.parameter_indices
         return (
@@ -374,7 +394,9 @@ class _QuadraticModel:
 
     @cached_property
     def _position_block(self) -> sp.coo_array:
-        """Block (positions, positions) of the matrix, without damping."""
+        """Sparse block (free positions, free positions) of the matrix, with both triangles and
+        without damping.
+        """
         of_x = self._jacobian_blocks[0]
         positions = self._positions
         position_hessian = sp.csr_array(self.hessian)[positions][:, positions]
@@ -382,7 +404,10 @@ class _QuadraticModel:
 
     @cached_property
     def _band(self) -> Array:
-        """Lower band (half-bandwidth + 1, n) of the positions' block.
+        """Lower band (half-bandwidth + 1, n) of the positions' block, with the n free positions in
+        the order that is the entry of `order`.
+
+        The order is computed and appended to `order` if that is empty.
 
         Raises
         ------

@@ -176,7 +176,13 @@ class MeritFunction:
     multipliers: Array
 
     def value(self, z: Array) -> float:
-        """Return m(z); infinite if an element is inverted."""
+        """Return m(z); infinite if an element is inverted, or if m is not finite.
+
+        Raises
+        ------
+        SimulationError
+            If the body has no stress-free shape at these parameters.
+        """
         if not self.problem.has_valid_elements(z):
             return np.inf
         return self.value_from_constraints(z, self.problem.constraint_values(z))
@@ -185,6 +191,11 @@ class MeritFunction:
         """Return m(z) and ∇m (variables,), which is zero for constant variables.
 
         If an element is inverted, m is infinite and ∇m NaN.
+
+        Raises
+        ------
+        SimulationError
+            If the body has no stress-free shape at these parameters.
         """
         if not self.problem.has_valid_elements(z):
             return np.inf, np.full(len(z), np.nan)

@@ -167,7 +167,8 @@ class PenaltyOptions(Options):
         Raises
         ------
         InputError
-            For a start with inverted elements.
+            For a start with inverted elements, or if the factor of the inner solver
+            "levenberg-marquardt" needs too much memory.
         """
         climb = _PenaltySolve(
             self,
@@ -241,10 +242,14 @@ class Penalty(PenaltyOptions):
         """Return the next stage, with a larger ρ if an increase is due by the schedule, or the
         stage reached its minimum; see `PenaltyOptions.next_stage` for the arguments.
 
+        ρ increases by `rho_factor`, up to `last_rho`. If neither holds, ρ is that of the stage.
+        The multipliers stay zero.
+
         Raises
         ------
         SearchEnded
-            If an increase is due, but ρ is at its limit.
+            If an increase is due by the schedule, but ρ is at its limit: with the status `STALLED`
+            if the stage reached its minimum, else with `ITERATION_LIMIT`.
         """
         rho = stage.merit.rho
         is_increase_due = (
@@ -288,7 +293,8 @@ class AugmentedLagrangian(PenaltyOptions):
         Raises
         ------
         SearchEnded
-            If ρ is at its limit and the violation does not decrease.
+            With the status `STALLED`, if the tolerance is the last one, ρ is at its limit or the
+            violation within `violation`, and more than the share `STUCK` of it remained.
         """
         rho = stage.merit.rho
         tolerance = stage.tolerance
@@ -385,7 +391,10 @@ class _PenaltySolve:
         Raises
         ------
         SearchEnded
-            If no further progress is possible or a limit is reached.
+            If no further progress is possible or a limit is reached; `variables` are then the last
+            iterate.
+        InputError
+            If the factor of the inner solver needs too much memory.
         """
         options = self.options
         previous_violation = ConstraintViolation()
@@ -485,7 +494,9 @@ class _PenaltySolve:
         )
 
     def _record(self) -> None:
-        """Add the last iterate to the history, as variables of the given problem with its loss."""
+        """Add the last iterate to the history, as variables of the given problem with its loss;
+        exceptions of the recorder's `watch` are not caught.
+        """
         nlp = self.problem.original
         z = self.problem.to_original(self.variables)
         self.recorder.add_variables(

@@ -115,7 +115,9 @@ def simulate_variables(
     Parameters
     ----------
     collocation : Collocation
+        Problem.
     p : (np,) array
+        Shared and nuisance parameters (q, φ).
     stopwatch : Stopwatch, optional
         Measures the simulations.
 
@@ -220,12 +222,16 @@ class _ShootingSearch:
             )
 
     def run(self) -> tuple[Status, str]:
-        """Search, and return the status and a sentence with SciPy's message.
+        """Search, and return the status and a sentence with SciPy's message; the result is `best`.
+
+        Without parameters there is only one simulation, and the status is that of convergence.
 
         Raises
         ------
         SimulationError
             If the first simulation fails.
+        SearchEnded
+            If a limit of simulations or time is reached, or failed simulations stop the search.
         """
         self.last = self._simulate(self.first)
         if not len(self.first):
@@ -235,8 +241,8 @@ class _ShootingSearch:
     # Optimisers -------------------------------------------------------------------------------
 
     def _gauss_newton(self) -> tuple[Status, str]:
-        """Minimise by SciPy's `least_squares`; return the status and a sentence with SciPy's
-        message.
+        """Minimise by SciPy's `least_squares`, from the first parameters; return the status and a
+        sentence with SciPy's message. `_try` updates `best`, and states the exceptions.
         """
         result = least_squares(
             self._residual,
@@ -255,8 +261,8 @@ class _ShootingSearch:
         return status, f"{status.sentence} (SciPy: {result.message})"
 
     def _residual(self, step: Array) -> Array:
-        """Return the residuals after a step (np,) from the first parameters; infinite if the
-        simulation fails.
+        """Return the residuals (m,) after a step (np,) from the first parameters; infinite if the
+        simulation fails. See `_try` for the exceptions.
         """
         shot = self._try(self.first + step)
         assert self.best is not None
@@ -275,7 +281,8 @@ class _ShootingSearch:
         return shot.slope
 
     def _quasi_newton(self) -> tuple[Status, str]:
-        """Minimise by SciPy's L-BFGS-B; return the status and a sentence with SciPy's message.
+        """Minimise by SciPy's L-BFGS-B, from the first parameters; return the status and a sentence
+        with SciPy's message. `_try` updates `best`, and states the exceptions.
 
         Without success by SciPy's criteria the status is acceptable if the projected gradient is
         within `LEAST_GRADIENT_TOLERANCE`, and stalled otherwise.
@@ -312,7 +319,7 @@ class _ShootingSearch:
 
         If the simulation fails they are those of a parabola along the step from the best
         simulation, above the best objective and with its minimum at a quarter of the step, so that
-        the line search returns there.
+        the line search returns there. See `_try` for the exceptions.
         """
         shot = self._try(p)
         if shot is not None:
@@ -327,7 +334,10 @@ class _ShootingSearch:
     # Simulations ------------------------------------------------------------------------------
 
     def _try(self, p: Array) -> _SimulatedPoint | None:
-        """Return the simulation at p, which is not repeated if it is the last; None if it fails.
+        """Return the simulation at p (np,), which is not repeated if it is the last; None if it
+        fails or its objective is not finite.
+
+        `last`, `best`, `simulations` and `failures` are updated.
 
         Raises
         ------
@@ -350,15 +360,16 @@ class _ShootingSearch:
         return shot
 
     def _simulate(self, p: Array) -> _SimulatedPoint:
-        """Return the simulation at p with derivatives, and count it. If its objective is the
-        smallest, it becomes the best one and part of the history.
+        """Return the simulation at p (np,) with derivatives, and count it, also if it fails. If its
+        objective is the smallest, it becomes the best one and part of the history; exceptions of
+        the recorder's `watch` are not caught.
 
         Raises
         ------
         SearchEnded
-            If a limit of simulations or time is reached.
+            If a limit of simulations or time is reached; not at the first simulation.
         SimulationError
-            If the simulation fails.
+            If the simulation fails, or a time step is singular in the sweep for the derivatives.
         """
         if self.simulations and self.simulations >= self.options.max_iterations:
             raise SearchEnded(Status.ITERATION_LIMIT)

@@ -285,6 +285,9 @@ def check_problem(
     ------
     InputError
         Where no start is found.
+    SimulationError
+        If a body has no stress-free shape at the guess. A simulation that fails otherwise raises
+        nothing: a note states it, and the body is moved rigidly with the grasp instead.
     """
     report_progress = report_progress or (lambda _: None)
     collocation = problem.collocation()
@@ -498,6 +501,11 @@ def _natural_modes(
 ) -> tuple[ModesCheck, ...]:
     """Return the natural modes at the guess of each fitted experiment that moves, in their order,
     with the scheme and step of the collocation; static and held out experiments are left out.
+
+    Raises
+    ------
+    SimulationError
+        If a body has no stress-free shape at the guess, or a factorisation fails.
     """
     scheme = as_scheme(collocation.scheme)
     guesses = problem.parameters.guesses

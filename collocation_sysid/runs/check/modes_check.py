@@ -124,6 +124,11 @@ def check_modes(
         Step of the time grid [s].
     theta : array
         Constants θ of the body.
+
+    Raises
+    ------
+    SimulationError
+        If the body has no stress-free shape at θ, or a factorisation fails.
     """
     is_prescribed = experiment.is_prescribed(experiment.t_s)
     count = is_prescribed.sum(axis=(1, 2))
