@@ -237,7 +237,8 @@ class Dynamics:
         return _evaluation_mean(self.tables, evaluation_values)
 
     def truncated_to(self, rows: int) -> Dynamics:
-        """Return these equations on the first grid times only; self if there are no more.
+        """Return these equations on the first grid times only, with views of the arrays; self if
+        there are no more.
 
         Parameters
         ----------
@@ -272,7 +273,10 @@ class Dynamics:
 
     @property
     def step_s(self) -> float:
-        """Time step Δt of the grid; 1 s for a static experiment, which does not depend on Δt."""
+        """Time step Δt of the grid [s]; 1 s for a static experiment, which does not depend on Δt.
+
+        Another experiment needs at least two grid times (IndexError otherwise).
+        """
         return 1.0 if self.is_static else float(self.t_s[1] - self.t_s[0])
 
     @property
@@ -502,7 +506,7 @@ class Dynamics:
         histories: Sequence[AnyHistory] = (),
     ) -> Linearisation:
         """Return forces and derivatives at the evaluation states of x, for the rows from `first_row`
-        on.
+        on: T = N − first_row in the shapes of `Linearisation`.
 
         Forces at temporarily prescribed dofs are included, see `zero_prescribed_forces`.
 
@@ -675,7 +679,8 @@ class StencilRow:
 def weighted_sum_of_past(
     coefficients: Sequence[float], past: Iterable[Array], shape: tuple[int, ...]
 ) -> Array:
-    """Return Σ_i coefficients[i] past[i − 1] over the lags i from 1 on.
+    """Return Σ_i coefficients[i] past[i − 1] over the lags i from 1 on, as a new array; lags for
+    which there is no past are omitted.
 
     Parameters
     ----------

@@ -197,8 +197,11 @@ class Pointwise(ForceTerm):
         places: AssemblyIndices,
         states: States,
     ) -> None:
-        """Add the forces and their first derivatives to a linearisation, in place, at the entries
-        and input columns `places`.
+        """Add the forces and their first derivatives by positions, velocities and the constants of
+        the law to a linearisation, in place, at the entries and input columns `places`.
+
+        Internal variables of the previous evaluations are constant. Skew parts are added where they
+        can exist; those by positions only if the linearisation has room for them.
         """
         evaluated = self._inputs_at(states)
         points = self.points
@@ -601,7 +604,7 @@ def air_drag_terms(
     ----------
     experiment : Experiment
     t_s : (T,)
-        Times.
+        Times [s].
     """
     if not experiment.has_air_drag:
         return ()

@@ -457,7 +457,9 @@ def _sum_over_nodes(dofs: Array) -> Array:
 
 
 def _as_constant_view(rows: Array) -> Array:
-    """Return equal rows as a read-only view of one row with stride 0; other arrays unchanged."""
+    """Return equal rows as a read-only view of a copy of one row, with stride 0; another array
+    itself, also if a value is NaN. There must be at least one row.
+    """
     return (
         np.broadcast_to(rows[0].copy(), rows.shape)
         if (rows == rows[:1]).all()

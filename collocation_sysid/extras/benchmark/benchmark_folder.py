@@ -176,7 +176,20 @@ def _parameter_values(
 
 
 def _write_body(task: BodyTask, folder: Path) -> None:
-    """Write the folder of a body."""
+    """Write the data of a body to a new folder: mesh, nodes and tetrahedra, licence if there is
+    one, recordings, description and README.
+
+    Parameters
+    ----------
+    task : BodyTask
+    folder : Path
+        Folder of the body, which is created; its parent must exist.
+
+    Raises
+    ------
+    FileExistsError
+        If the folder exists; other faults of the file system are OSErrors, too.
+    """
     mesh = _mesh(task.experiments[0])
     folder.mkdir()
     if (licence := task.body.licence_file) is not None:
