@@ -754,7 +754,8 @@ def contact_terms(
 def contact_law(
     body: Body, obstacle: Obstacle, *, static: bool, averaged: bool = False
 ) -> ContactLaw:
-    """Return the contact law between an obstacle and a body; the last 32 laws are cached.
+    """Return the contact law between an obstacle and a body; the last 32 laws are cached, so that
+    the same arguments give the same object.
 
     Parameters
     ----------

@@ -201,11 +201,15 @@ class Dynamics:
         )
 
     def with_inputs(self, u: Array) -> Dynamics:
-        """Return these equations at inputs u (N, U), see `inputs`."""
+        """Return these equations at inputs u (N, U), see `inputs`, with the masses that follow from
+        them; self is unchanged.
+        """
         return self._with_forces(self.forces.with_inputs(u))
 
     def with_theta(self, theta: Sequence[float] | Array) -> Dynamics:
-        """Return these equations for a body with constants θ (k,)."""
+        """Return these equations for a body with constants θ (k,), which are copied, with the
+        masses that follow from them; self is unchanged.
+        """
         return self._with_forces(self.forces.with_theta(theta))
 
     def _with_forces(self, forces: Forces) -> Dynamics:
@@ -230,9 +234,9 @@ class Dynamics:
         )
 
     def evaluations_to_rows(self, evaluation_values: Array) -> Array:
-        """Return the mean over the evaluations of each row (N, …), weighted like the forces; a row
-        without forces has the value of its own evaluation. If all values are equal, the argument
-        itself.
+        """Return the mean over the evaluations of each row (N, …), weighted like the forces, of
+        values (N, …) at the evaluations; a row without forces has the value of its own evaluation.
+        If all values are equal, the argument itself is returned.
         """
         return _evaluation_mean(self.tables, evaluation_values)
 
@@ -400,6 +404,7 @@ class Dynamics:
         Parameters
         ----------
         histories : sequence of histories
+            Histories of the complete motion; without any, forces have no internal variables.
         rows : slice, optional
             Indices of the rows; by default all from `first_row` on.
         """

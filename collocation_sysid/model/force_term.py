@@ -213,7 +213,7 @@ class Potential(ForceTerm):
         return replace(self, amplitude=u)
 
     def at_times(self, rows: slice) -> Self:
-        """Return this force at some of the times."""
+        """Return this force at some of the T times, given as a slice."""
         return self.with_inputs(self.amplitude[rows])
 
     def scaled(self, factor: float) -> Self:

@@ -742,7 +742,11 @@ def _strain_shifts_m(experiment: Experiment) -> Array:
 
 
 def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
-    """Yield every nuisance parameter of an experiment, in the order of φ."""
+    """Yield every nuisance parameter of an experiment, in the order of φ.
+
+    Consecutive kinds of one sort of component are ordered by component, then by kind and axis; the
+    unknowns of custom sensors come last. Exact quantities are left out.
+    """
     for _, rows in groupby(experiment.nuisance.kinds, key=lambda row: row.of):
         applicable = [row for row in rows if row.applies(experiment)]
         for number, component_name in (

@@ -241,12 +241,14 @@ def complete_parameter(
 ) -> Parameter:
     """Return the complete definition of a parameter, with defaults from its constant.
 
-    The coefficient of a field has the prior N(0, 1) if none is stated.
+    The coefficient of a field has the prior N(0, 1) if none is stated. A linear modulus without
+    guess and typical change has the unit NaN, until the scan of the stiffness sets it.
 
     Parameters
     ----------
     name : str
-        Name with unit and, if it applies to one region only, region.
+        Name with unit and, if it applies to one region only, region; a constant that is not known
+        has default properties.
     user_statement : Unknown, Tied or float
         The user's statement; a number is a fixed value.
 
@@ -453,7 +455,8 @@ class Parameters:
         """Return whether a parameter has a linear scale (else a logarithmic one), and the (lower,
         upper) bounds of its value.
 
-        The bounds of a derived modulus, or of a fixed or tied parameter, are infinite.
+        The bounds of a derived modulus, or of a fixed or tied parameter, are infinite; so are those
+        of an unknown name, whose scale counts as logarithmic.
         """
         item = next((each for each in self.free if each.name == name), None)
         if item is None:

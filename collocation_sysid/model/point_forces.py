@@ -544,7 +544,9 @@ class CustomForce(Pointwise):
         return self
 
     def at_times(self, rows: slice) -> Self:
-        """Return this force at some of the times."""
+        """Return this force at some of the T times, given as a slice; internal variables of the
+        previous evaluations are kept as they are, see `with_previous_state`.
+        """
         return replace(self, t_s=self.t_s[rows])
 
     def interpolate(self, other: Self, share: float) -> Self:

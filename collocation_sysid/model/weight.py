@@ -53,7 +53,7 @@ class DofMasses:
     added_kg: Array
 
     def at_times(self, rows: slice) -> DofMasses:
-        """Return these masses at some of the times."""
+        """Return these masses at some of the T times, given as a slice."""
         return replace(self, tied_kg=self.tied_kg[rows])
 
     @cached_property

@@ -294,7 +294,9 @@ def _add_material(
 
 
 def _bind_material(pxr: Any, prim: Any, material: Any) -> None:
-    """Bind a physics material to a prim."""
+    """Bind a physics material to a prim, in place; materials bound to its descendants prevail.
+    `pxr` are the modules of `_import_usd`.
+    """
     binding = pxr.UsdShade.MaterialBindingAPI.Apply(prim)
     binding.Bind(material, pxr.UsdShade.Tokens.weakerThanDescendants, "physics")
 

@@ -403,7 +403,11 @@ def _result_record(
 
 @contextmanager
 def _thread_executor(limits: RunOptions) -> Iterator[RunExecutor]:
-    """Context with an executor of threads, which wait for processes on this machine."""
+    """Context with an executor of threads, which wait for processes on this machine: as many at
+    once as `limits` states, else one for each available thread.
+
+    The end of the context waits for submitted runs; only `RunExecutor.stop` ends running ones.
+    """
     worker_count = limits.workers or available_threads()
     stop = threading.Event()
     with ThreadPoolExecutor(worker_count) as executor:
