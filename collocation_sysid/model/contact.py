@@ -575,7 +575,11 @@ class Contact(Pointwise):
 
     @property
     def internal_variable_count(self) -> int:  # type: ignore[override]
-        """Number of values that are given at each point: 1 where b is given, else 0."""
+        """Number of values that are given at each point: 1 where b is given, else 0.
+
+        With a given b, what `internal_variables` and derivatives of h contain are the residuals of
+        complementarity.
+        """
         return int(self.previous_state is not None)
 
     def scaled_pressures(self, xi: Array) -> Array:

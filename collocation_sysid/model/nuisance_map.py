@@ -147,7 +147,8 @@ class NuisanceEntry:
 class NuisanceMap:
     """Nuisance parameters φ of one experiment, and the quantities that depend on them.
 
-    In all methods φ (k,) is in prior standard deviations: values with units are φ · `scales`.
+    All methods take φ in prior standard deviations, all k of them unless an argument is described
+    otherwise; values with units are φ · `scales`.
 
     Attributes
     ----------
