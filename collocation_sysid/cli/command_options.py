@@ -85,7 +85,13 @@ Quiet = Annotated[
 def command(
     group: typer.Typer, *examples: str
 ) -> Callable[[Callable[[Any], None]], Any]:
-    """Return a decorator that registers a function of a dataclass of options as a command.
+    """Return a decorator that registers a function of a dataclass of options as a command, and
+    returns the function unchanged.
+
+    The function must have one argument, annotated with its dataclass. The command has the name and
+    the docstring of the function, and calls it with the options of the command line. An option
+    without help in its annotation or in the docstring of the dataclass is a KeyError of the
+    decorator.
 
     Parameters
     ----------

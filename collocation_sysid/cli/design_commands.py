@@ -73,7 +73,7 @@ def design(options: DesignCommand) -> None:
     The motion begins and ends at rest in the first pose, keeps to the limits, and is optimised for
     a prior of the parameters. The output folder contains poses.csv, the error bars before and
     after, pictures, a film and a problem file that simulates the motion. Ctrl-C stops the search
-    and keeps the best motion so far.
+    and keeps the best motion so far; the exit code is then 130.
     """
     from ..extras.design.design_folder import (
         DESIGN_FILE,

@@ -188,8 +188,10 @@ def _thread_rows(report: InstallationReport) -> dict[str, str]:
 
 
 def _conclusion(report: InstallationReport) -> Line:
-    """Return the outcome of the self test and of the whole check as a line, with packages to
-    install.
+    """Return the outcome of the self test and of the whole check as a line: "good", or "doubtful"
+    if the installation does not work.
+
+    Only the latter names the required packages that are missing or unsuitable, if there are any.
     """
     test = report.self_test
     outcome = "passed" if test.is_passed else "FAILED"

@@ -69,8 +69,8 @@ class Linearisation:
     by_position_skew : (T, m) or (T, 0)
         Lower triangles of the skew part of ∂f/∂x; empty if it is zero.
     by_velocity_skew : (T, m) or (T, 0)
-        Lower triangles of the skew part of ∂f/∂v; only custom forces have one, such as gyroscopic
-        forces.
+        Lower triangles of the skew part of ∂f/∂v; only external forces have one: custom forces,
+        such as gyroscopic ones, and contact whose pressure is averaged over a step.
     """
 
     force: Array

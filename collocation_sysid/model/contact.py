@@ -133,7 +133,7 @@ class ContactLaw:
 
     @property
     def largest_width_m(self) -> float:
-        """Largest width δ of all points."""
+        """Largest width δ of all points [m]."""
         return float(self.widths_m.max())
 
     @property
@@ -280,7 +280,7 @@ class ContactLaw:
 
     @cached_property
     def gap_function(self) -> GeneratedFunction:
-        """Expression of the gap g of y, with derivatives."""
+        """Expression of the gap g [m] of y (12,), with derivatives; it has no data."""
         return GeneratedFunction(
             lambda y, _: self.gap_at(self.to_obstacle_frame(y)[0]),
             3 * VECTORS_PER_POINT,
@@ -379,7 +379,7 @@ class ContactLaw:
 
     @cached_property
     def scaled_pressure_function(self) -> GeneratedFunction:
-        """Expression of b of the gap."""
+        """Expression of b [m] of the gap [m] and the data (5,) of the point."""
         return GeneratedFunction(self.scaled_pressure, 1, data_size=DATA_COUNT)
 
     def force_expression(
@@ -502,10 +502,10 @@ class ContactLaw:
 
     @cached_property
     def friction_function(self) -> GeneratedFunction:
-        """Expression of friction of (y, ẏ, c), 6 values.
+        """Expression of friction of (y, ẏ, c), 6 values; only for an obstacle with friction.
 
-        These are the limit μ N, the same where the point slips (else 0), the friction force (3,)
-        and the dissipated power.
+        These are the limit μ N [N], the same where the point slips (else 0), the friction force
+        (3,) [N] in the axes of the world, and the dissipated power [W].
         """
 
         def friction_values(u: ca.SX, data: ca.SX) -> ca.SX:
@@ -575,7 +575,11 @@ class Contact(Pointwise):
 
     @property
     def internal_variable_count(self) -> int:  # type: ignore[override]
-        """Number of values that are given at each point: 1 where b is given, else 0."""
+        """Number of values that are given at each point: 1 where b is given, else 0.
+
+        With a given b, what `internal_variables` and derivatives of h contain are the residuals of
+        complementarity.
+        """
         return int(self.previous_state is not None)
 
     def scaled_pressures(self, xi: Array) -> Array:
@@ -614,7 +618,12 @@ class Contact(Pointwise):
         return self.factor * self.points.assemble(change, evaluated.chosen)
 
     def friction_sums(self, states: States) -> Array:
-        """Return the sums over the points (6, T) of `ContactLaw.friction_function`."""
+        """Return the sums over the points (6, T) of `ContactLaw.friction_function`: five forces
+        [N], then the power [W]; in a static experiment the work of the displacements [J].
+
+        The obstacle must have friction, and b must not be given (`previous_state`): the inputs
+        would have another length.
+        """
         evaluated = self._inputs_at(states)
         return self.law_of_contact.friction_function.evaluate(
             evaluated.u, evaluated.data
@@ -749,7 +758,8 @@ def contact_terms(
 def contact_law(
     body: Body, obstacle: Obstacle, *, static: bool, averaged: bool = False
 ) -> ContactLaw:
-    """Return the contact law between an obstacle and a body; the last 32 laws are cached.
+    """Return the contact law between an obstacle and a body; the last 32 laws are cached, so that
+    the same arguments give the same object.
 
     Parameters
     ----------

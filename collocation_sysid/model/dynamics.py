@@ -201,11 +201,15 @@ class Dynamics:
         )
 
     def with_inputs(self, u: Array) -> Dynamics:
-        """Return these equations at inputs u (N, U), see `inputs`."""
+        """Return these equations at inputs u (N, U), see `inputs`, with the masses that follow from
+        them; self is unchanged.
+        """
         return self._with_forces(self.forces.with_inputs(u))
 
     def with_theta(self, theta: Sequence[float] | Array) -> Dynamics:
-        """Return these equations for a body with constants θ (k,)."""
+        """Return these equations for a body with constants θ (k,), which are copied, with the
+        masses that follow from them; self is unchanged.
+        """
         return self._with_forces(self.forces.with_theta(theta))
 
     def _with_forces(self, forces: Forces) -> Dynamics:
@@ -230,14 +234,15 @@ class Dynamics:
         )
 
     def evaluations_to_rows(self, evaluation_values: Array) -> Array:
-        """Return the mean over the evaluations of each row (N, …), weighted like the forces; a row
-        without forces has the value of its own evaluation. If all values are equal, the argument
-        itself.
+        """Return the mean over the evaluations of each row (N, …), weighted like the forces, of
+        values (N, …) at the evaluations; a row without forces has the value of its own evaluation.
+        If all values are equal, the argument itself is returned.
         """
         return _evaluation_mean(self.tables, evaluation_values)
 
     def truncated_to(self, rows: int) -> Dynamics:
-        """Return these equations on the first grid times only; self if there are no more.
+        """Return these equations on the first grid times only, with views of the arrays; self if
+        there are no more.
 
         Parameters
         ----------
@@ -272,7 +277,10 @@ class Dynamics:
 
     @property
     def step_s(self) -> float:
-        """Time step Δt of the grid; 1 s for a static experiment, which does not depend on Δt."""
+        """Time step Δt of the grid [s]; 1 s for a static experiment, which does not depend on Δt.
+
+        Another experiment needs at least two grid times (IndexError otherwise).
+        """
         return 1.0 if self.is_static else float(self.t_s[1] - self.t_s[0])
 
     @property
@@ -396,6 +404,7 @@ class Dynamics:
         Parameters
         ----------
         histories : sequence of histories
+            Histories of the complete motion; without any, forces have no internal variables.
         rows : slice, optional
             Indices of the rows; by default all from `first_row` on.
         """
@@ -502,7 +511,7 @@ class Dynamics:
         histories: Sequence[AnyHistory] = (),
     ) -> Linearisation:
         """Return forces and derivatives at the evaluation states of x, for the rows from `first_row`
-        on.
+        on: T = N − first_row in the shapes of `Linearisation`.
 
         Forces at temporarily prescribed dofs are included, see `zero_prescribed_forces`.
 
@@ -675,7 +684,8 @@ class StencilRow:
 def weighted_sum_of_past(
     coefficients: Sequence[float], past: Iterable[Array], shape: tuple[int, ...]
 ) -> Array:
-    """Return Σ_i coefficients[i] past[i − 1] over the lags i from 1 on.
+    """Return Σ_i coefficients[i] past[i − 1] over the lags i from 1 on, as a new array; lags for
+    which there is no past are omitted.
 
     Parameters
     ----------

@@ -77,7 +77,8 @@ class ForceHistory:
         since_s : (N,)
             Time since the previous evaluation; 0 at the start.
         before : (n, N, I), optional
-            Given variables h_{k−1} at each evaluation; computed from the states by default.
+            Given variables h_{k−1} at each evaluation, which are kept, not copied; computed from
+            the states by default.
         """
         term = forces.pointwise_term(number)[0]
         shape = term.internal_variable_count, len(xi), term.points.count
@@ -120,8 +121,8 @@ class ForceHistory:
         return self.forces.states_of_terms(self.xi[rows], self.nu[rows])(term)
 
     def insert_into(self, forces: Forces, rows: slice) -> Forces:
-        """Return the forces of the evaluations `rows` with the previous internal variables of this
-        force.
+        """Return `forces`, given at the evaluations `rows` alone, with the previous internal
+        variables of this force; the argument is unchanged.
         """
         return forces.with_term(self.number, self.term_at(rows))
 
@@ -157,8 +158,8 @@ class ForceHistory:
     # Second derivatives of weights · F + μ · h ----------------------------------------------------
 
     def with_variable_weights(self, forces: Forces, mu: Array) -> Forces:
-        """Return the forces of all evaluations, with weights μ (n, N, I) of h in second
-        derivatives.
+        """Return `forces`, given at all N evaluations, with the previous internal variables of this
+        force and with weights μ (n, N, I) of h in second derivatives; the argument is unchanged.
         """
         return forces.with_term(self.number, self.term_at(slice(None), mu))
 
@@ -277,8 +278,8 @@ class ForcePreviousState:
         )
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
-        """Return forces in the same state, with the internal variables before it inserted;
-        unchanged if there are none.
+        """Return `forces`, given at one time, in the same state, with the internal variables before
+        it; the argument itself if there are none. It is unchanged.
         """
         previous = self.term.previous_state
         if previous is None:
@@ -291,8 +292,9 @@ class ForcePreviousState:
     def insert_after_interval(
         self, forces: Forces, interval_s: float
     ) -> Forces:
-        """Return forces in a state one interval [s] later, with the internal variables after this
-        evaluation inserted as the previous ones.
+        """Return `forces`, given at one time, an interval [s] later than this state, with the
+        internal variables after this evaluation as the previous ones. The argument and self are
+        unchanged.
         """
         previous = PreviousState(self.after, np.array([interval_s]))
         return forces.with_term(
@@ -303,15 +305,17 @@ class ForcePreviousState:
     def advance(
         self, forces: Forces, x: Array, v: Array, interval_s: float
     ) -> ForcePreviousState:
-        """Return the internal variables in the state (x, v) one interval later.
+        """Return the internal variables in the state (x, v) one interval later; self is unchanged.
 
         Parameters
         ----------
         forces : Forces
             Forces at the later time.
         x, v : (3n,)
-            Position [m] and velocity [m/s] at the later time.
+            Position [m] and velocity [m/s] at the later time; in a static experiment the
+            displacement since the previous sample [m].
         interval_s : float
+            Interval [s], positive: 0 would mean a start.
         """
         return ForcePreviousState.from_state(
             self.insert_after_interval(forces, interval_s),
@@ -368,7 +372,14 @@ class ForceForwardColumns(_DerivativeIterator):
     done : int
         Number of evaluations that have been passed already.
     known : (n, I, columns), optional
-        Columns after those evaluations; 0 by default.
+        Columns after those evaluations, which are copied; 0 by default.
+
+    Attributes
+    ----------
+    columns : (n, I, columns)
+        Derivatives of h_{k−1} at the next evaluation k.
+    next : int
+        Index of the next evaluation.
     """
 
     def __init__(
@@ -385,7 +396,7 @@ class ForceForwardColumns(_DerivativeIterator):
 
     def force_columns(self) -> Array:
         """Return the contribution of the internal variables to dF at the next evaluation, (3n,
-        columns).
+        columns) [N]; the iterator does not advance.
         """
         contribution = np.einsum(
             "abi,bic->aci", self.derivatives()[0].b, self.columns
@@ -423,6 +434,13 @@ class ForceAdjoint(_DerivativeIterator):
     Parameters
     ----------
     history : ForceHistory
+
+    Attributes
+    ----------
+    columns : (n, I)
+        Weights μ_k of the internal variables after the next evaluation k; zero at first.
+    next : int
+        Index of the next evaluation: at first that of the last one, −1 after all.
     """
 
     def __init__(self, history: ForceHistory) -> None:
@@ -430,7 +448,9 @@ class ForceAdjoint(_DerivativeIterator):
         self.columns = np.zeros(self.shape)
 
     def state_gradient(self) -> tuple[Array, Array]:
-        """Return the derivatives of μ · h by ξ and ν of the evaluation, (3n,) each."""
+        """Return the derivatives of μ · h by ξ and ν of the next evaluation, (3n,) each; the
+        iterator does not advance.
+        """
         by = self.derivatives()[1]
         by_x, by_v = (
             self.points.assemble(self._weighted_by_mu(each)[:, None])[0]
@@ -439,7 +459,9 @@ class ForceAdjoint(_DerivativeIterator):
         return by_x, by_v
 
     def input_gradient(self) -> Array:
-        """Return the derivatives of μ · h by the constants (c,) of the force."""
+        """Return the derivatives (c,) of μ · h of the next evaluation by the constants of the
+        force; the iterator does not advance.
+        """
         return self._weighted_by_mu(self.derivatives()[1].c).sum(axis=1)
 
     def _weighted_by_mu(self, by: Array) -> Array:

@@ -85,15 +85,19 @@ class ForceTerm(ABC):
 
     @abstractmethod
     def with_inputs(self, u: Array) -> Self:
-        """Return this force at inputs u (T, size)."""
+        """Return this force at inputs u (T, size), of which it may keep views; self if it has no
+        inputs. Like all methods that return a force, it does not modify self.
+        """
 
     @abstractmethod
     def at_times(self, rows: slice) -> Self:
-        """Return this force at some of the times."""
+        """Return this force at some of the T times, given as a slice; self if it is the same at all
+        times.
+        """
 
     @abstractmethod
     def scaled(self, factor: float) -> Self:
-        """Return this force multiplied by a factor."""
+        """Return this force multiplied by a factor; its masses and internal variables stay."""
 
     @abstractmethod
     def interpolate(self, other: Self, share: float) -> Self:
@@ -138,7 +142,8 @@ class ForceTerm(ABC):
         states: States,
         weights: Array,
     ) -> None:
-        """Add the derivatives of weightsᵀ F to a curvature, in place.
+        """Add the second derivatives of weightsᵀ F by positions, velocities and inputs to a
+        curvature, in place, and its first ones by the inputs.
 
         Parameters
         ----------
@@ -208,7 +213,7 @@ class Potential(ForceTerm):
         return replace(self, amplitude=u)
 
     def at_times(self, rows: slice) -> Self:
-        """Return this force at some of the times."""
+        """Return this force at some of the T times, given as a slice."""
         return self.with_inputs(self.amplitude[rows])
 
     def scaled(self, factor: float) -> Self:
@@ -233,8 +238,8 @@ class Potential(ForceTerm):
         places: AssemblyIndices,
         states: States,
     ) -> None:
-        """Add the forces and their first derivatives to a linearisation, in place, at the entries
-        and input columns `places`.
+        """Add the forces and their first derivatives by positions and by the amplitude to a
+        linearisation, in place, at the entries and the input column `places`.
         """
         gradient = self.scalar.gradient(states.xi)
         np.subtract(

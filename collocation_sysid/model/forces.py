@@ -167,8 +167,10 @@ class Forces:
         return self.weight.mass_derivatives(self._input_offsets[0])
 
     def with_inputs(self, u: Array) -> Forces:
-        """Return these forces at inputs u (T, U): θ from the first time, then the inputs of each
-        term, in the order of `terms`.
+        """Return these forces at inputs u (T, U); self is unchanged.
+
+        The constants θ are copied from the first time. The inputs of each term follow, in the order
+        of `terms`; terms may keep views of u.
         """
         forces = self.with_theta(u[0, : self._input_offsets[0]])
         if self._input_offsets[0] == self._input_offsets[-1]:
@@ -196,7 +198,7 @@ class Forces:
     def scaled(self, factor: float) -> Forces:
         """Return these forces with weight, loads and other external forces multiplied by a factor.
 
-        Masses and internal forces are unchanged.
+        Masses, internal forces and internal variables are unchanged, and so is self.
         """
         further = tuple(term.scaled(factor) for term in self.external_terms)
         return replace(
@@ -204,9 +206,11 @@ class Forces:
         )
 
     def interpolate(self, other: Forces, share: float) -> Forces:
-        """Return forces with the loads interpolated linearly to those of another time.
+        """Return forces with the loads interpolated linearly to those of another time: applied
+        forces, tied masses, amplitudes of actuators and the times of custom forces.
 
-        Internal variables, constants and couplings are those of `other`.
+        Gravity and the masses of the body are those of this time; internal variables, constants and
+        couplings those of `other`. Self and `other` are unchanged.
 
         Parameters
         ----------
@@ -228,13 +232,14 @@ class Forces:
         )
 
     def with_term(self, number: int, term: ForceTerm) -> Forces:
-        """Return these forces with one of the further terms replaced.
+        """Return these forces with one of the further terms replaced; self is unchanged.
 
         Parameters
         ----------
         number : int
             Index in `external_terms`.
         term : ForceTerm
+            New term, with the couplings and the number of inputs of the previous one.
         """
         before = self.external_terms[:number]
         after = self.external_terms[number + 1 :]
@@ -268,7 +273,7 @@ class Forces:
 
     def only_loads(self) -> Forces:
         """Return these forces without the external terms besides weight and loads; internal forces
-        stay.
+        and `memory_state` stay. The sparsity pattern is that of the body alone.
         """
         return replace(
             self,
@@ -363,7 +368,8 @@ class Forces:
         inputs.
 
         The weighted internal variables are Σ σ · S of a memory with stress weights, and those that
-        `Pointwise.variable_weights` weights in forces.
+        `Pointwise.variable_weights` weights in forces. In a static experiment derivatives by ν have
+        only the parts of terms with `uses_increments`.
 
         Parameters
         ----------
@@ -371,7 +377,7 @@ class Forces:
             Positions [m] and velocities [m/s].
         weights : (T, 3n)
         out : (T, curvature_width), optional
-            Memory for the body's part of the result, which holds views of it.
+            Memory for the body's part of the result, which holds views of it; overwritten.
         """
         states_for = self.states_of_terms(xi, nu)
         at = self.body.second_derivatives(
@@ -447,7 +453,7 @@ class Forces:
 
         In a static experiment only terms that use displacements since the previous sample
         (`uses_increments`) get ν, all others zero. The states of the weight are also those of the
-        body.
+        body. Arrays of the states are views of ξ and ν, except zeros.
         """
         size = self.body.pattern.size
         moving = States(

@@ -35,6 +35,10 @@ class _Symbols(NamedTuple):
 class GeneratedFunction:
     """Expression y(u, data), evaluated at all instances, with first and second derivatives by u.
 
+    The expression is called at the first use of a method, not by the constructor, and its errors
+    come then. The first evaluation of values, of slopes and of second derivatives generates, and
+    with `is_compiled` compiles, their code; it is kept with the object.
+
     Attributes
     ----------
     expression : callable
@@ -103,7 +107,9 @@ class GeneratedFunction:
         return mask
 
     def depends_on_datum(self, datum: int) -> bool:
-        """Return whether any value y depends on the datum with this index."""
+        """Return whether any value y depends structurally on the datum with this index; the answer
+        is kept.
+        """
         _, data, y = self._symbols
         if datum not in self._datum_dependence:
             self._datum_dependence[datum] = ca.depends_on(y, data[datum])

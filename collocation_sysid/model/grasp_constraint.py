@@ -72,6 +72,9 @@ class GraspConstraint:
         """Return the prescribed positions at all nuisance parameters φ of the experiment, with
         derivatives by the m φ of the motion; positions are NaN and derivatives zero while a dof is
         free.
+
+        φ (k,) is in prior standard deviations. If no φ affects the grasps, the result is the same
+        object for all φ, without derivatives (m = 0).
         """
         if not self.nuisance.affects_grasps:
             return self._constant_positions

@@ -72,8 +72,13 @@ class Inputs:
     def evaluate_at(self, p: Array) -> tuple[Array, Array]:
         """Return the inputs u (N, U) and their derivatives ∂u/∂p (N, U, m) at parameters p (m,).
 
-        If all entries are constant in time, both arrays are read-only views with stride 0 along the
-        time.
+        If all entries are constant in time and N > 1, both arrays are read-only views with stride 0
+        along the time; otherwise they are new.
+
+        Raises
+        ------
+        InputError
+            If the parameters do not determine the constants of the body.
         """
         values = []
         slopes = []
@@ -130,7 +135,7 @@ class Inputs:
 
 def with_inputs(dynamics: Dynamics, nuisance: NuisanceMap) -> Dynamics:
     """Return equations of motion whose weight has the inputs that φ changes: gravity, if a parameter
-    rotates it, and the shares of loads with an estimated time.
+    rotates it, and the shares of loads with an estimated time. The argument is not modified.
 
     Values are unchanged until `Dynamics.with_inputs` sets the inputs.
     """
@@ -151,6 +156,9 @@ def inputs_from_experiment(
 ) -> Inputs:
     """Return the inputs of an experiment, in the order that the module states.
 
+    If the parameters do not determine the constants of the body, evaluating the inputs is an
+    `InputError`; see `Parameters.require_constants_of` to check this before.
+
     Parameters
     ----------
     experiment : Experiment
@@ -159,12 +167,7 @@ def inputs_from_experiment(
     nuisance : NuisanceMap
         Nuisance parameters of the experiment; p ends with those of `motion_indices`.
     evaluated_s : (N,)
-        Times at which forces are evaluated.
-
-    Raises
-    ------
-    InputError
-        If the parameters do not determine the constants of the body.
+        Times at which forces are evaluated [s].
     """
     constants = ThetaMap(parameters, experiment.body)
     no_data = np.zeros((0, 1))

@@ -123,15 +123,17 @@ def start_states(
 def insert_previous_states(
     forces: Forces, previous_states: Sequence[PreviousState], interval_s: float
 ) -> Forces:
-    """Return the forces in a state that follows the previous states after an interval [s].
+    """Return the forces in a state that follows the previous states after an interval; the argument
+    itself if there are no previous states.
 
     Parameters
     ----------
     forces : Forces
-        Forces at one time.
+        Forces at the later time alone; not modified.
     previous_states : sequence
         Internal variables at the previous time.
     interval_s : float
+        Interval [s].
     """
     for each in previous_states:
         forces = each.insert_after_interval(forces, interval_s)
@@ -145,8 +147,19 @@ def advance_states(
     v: Array,
     interval_s: float,
 ) -> tuple[PreviousState, ...]:
-    """Return the internal variables in a state (x, v), (3n,) each, `interval_s` [s] after that of
-    `previous_states`; `forces` are those at the later time.
+    """Return the internal variables in a state that follows the previous states after an interval,
+    in the order of `previous_states`; no argument is modified.
+
+    Parameters
+    ----------
+    forces : Forces
+        Forces at the later time alone.
+    previous_states : sequence
+        Internal variables at the previous time.
+    x, v : (3n,)
+        Positions [m] and velocities [m/s] at the later time.
+    interval_s : float
+        Interval [s].
     """
     return tuple(
         each.advance(forces, x, v=v, interval_s=interval_s)

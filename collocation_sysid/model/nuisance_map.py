@@ -147,6 +147,9 @@ class NuisanceEntry:
 class NuisanceMap:
     """Nuisance parameters φ of one experiment, and the quantities that depend on them.
 
+    All methods take φ in prior standard deviations, all k of them unless an argument is described
+    otherwise; values with units are φ · `scales`.
+
     Attributes
     ----------
     entries : (k,)
@@ -373,8 +376,8 @@ class NuisanceMap:
         return CalibrationIndices(*indices)
 
     def actuator_calibration(self, phi: Array) -> Array:
-        """Return factor f, offset b and logarithm of the lag over the stated lag (A, 3) of each
-        tendon and pressure at φ, the stated ones where they are not estimated.
+        """Return factor f, loss b and logarithm of the lag over the stated lag of each tendon and
+        pressure at φ (k,), as a new array (A, 3); the stated ones where they are not estimated.
         """
         calibration = self.declared_calibration.copy()
         values = phi * self.scales
@@ -564,7 +567,8 @@ class NuisanceMap:
         )
 
     def bounds(self, samples: int) -> tuple[Array, Array]:
-        """Return the lowest and the highest φ with valid measurements and loads, (k,) each.
+        """Return the lowest and the highest φ with valid measurements and loads, (k,) each, in
+        prior standard deviations.
 
         They are those of the rows, except for the clock and the times of loads, whose bounds follow
         from the recording. They may be infinite.
@@ -600,7 +604,9 @@ class NuisanceMap:
 
     def with_times(self, experiment: Experiment, phi: Array) -> Experiment:
         """Return the experiment with its loads joining and leaving at the times estimated by φ
-        (k,); the experiment itself if no time is estimated.
+        (k,); the experiment itself if no time is estimated. The argument is not modified.
+
+        Its loads must be those from which this map was made: other objects keep their times.
         """
         if not self.timed_loads:
             return experiment
@@ -646,7 +652,9 @@ class NuisanceMap:
         return point
 
     def grasp_motion_matrix(self, phi: Array) -> Array:
-        """Return the hand–eye transform H at φ as a 4×4 matrix [[R, p], [0, 1]]; p in metres."""
+        """Return the hand–eye transform H at φ (k,) as a matrix (4, 4), [[R, p], [0, 1]], with p in
+        metres; the identity if it is not estimated.
+        """
         points = np.hstack([np.zeros((3, 1)), np.eye(3)])
         images = self.grasp_motion.evaluate(phi[self.grasp_indices], points)
         matrix = np.eye(4)
@@ -656,8 +664,8 @@ class NuisanceMap:
         return matrix
 
     def gravity(self, phi: Array) -> Array:
-        """Return gravity (3,) in the frame of the body at φ (k,) [m/s²]; `gravity_m_s2` itself if
-        no parameter rotates it.
+        """Return gravity (3,) [m/s²] in the frame of the body at φ (k,), in prior standard
+        deviations; the array `gravity_m_s2` itself if no parameter rotates it.
         """
         if not len(self.gravity_indices):
             return self.gravity_m_s2
@@ -735,7 +743,11 @@ def _strain_shifts_m(experiment: Experiment) -> Array:
 
 
 def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
-    """Yield every nuisance parameter of an experiment, in the order of φ."""
+    """Yield every nuisance parameter of an experiment, in the order of φ.
+
+    Consecutive kinds of one sort of component are ordered by component, then by kind and axis; the
+    unknowns of custom sensors come last. Exact quantities are left out.
+    """
     for _, rows in groupby(experiment.nuisance.kinds, key=lambda row: row.of):
         applicable = [row for row in rows if row.applies(experiment)]
         for number, component_name in (

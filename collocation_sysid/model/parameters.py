@@ -210,8 +210,8 @@ class Parameter:
             )
 
     def to_coordinate(self, value: float) -> float:
-        """Return the solver's coordinate q of a value: its logarithm, or the value divided by
-        `unit`.
+        """Return the solver's coordinate q of a value: its logarithm, −∞ for 0, or the value
+        divided by `unit`, NaN while `unit` is.
         """
         return (
             float(np.log(value)) if self.scale == "log" else value / self.unit
@@ -241,12 +241,14 @@ def complete_parameter(
 ) -> Parameter:
     """Return the complete definition of a parameter, with defaults from its constant.
 
-    The coefficient of a field has the prior N(0, 1) if none is stated.
+    The coefficient of a field has the prior N(0, 1) if none is stated. A linear modulus without
+    guess and typical change has the unit NaN, until the scan of the stiffness sets it.
 
     Parameters
     ----------
     name : str
-        Name with unit and, if it applies to one region only, region.
+        Name with unit and, if it applies to one region only, region; a constant that is not known
+        has default properties.
     user_statement : Unknown, Tied or float
         The user's statement; a number is a fixed value.
 
@@ -414,6 +416,11 @@ class Parameters:
 
         Other parameters and names that do not exist are omitted; see `with_fixed` to keep the other
         parameters.
+
+        Raises
+        ------
+        InputError
+            If a value is inadmissible for its constant.
         """
         selected = (item for item in self.items if item.name in values)
         return Parameters(
@@ -448,7 +455,8 @@ class Parameters:
         """Return whether a parameter has a linear scale (else a logarithmic one), and the (lower,
         upper) bounds of its value.
 
-        The bounds of a derived modulus, or of a fixed or tied parameter, are infinite.
+        The bounds of a derived modulus, or of a fixed or tied parameter, are infinite; so are those
+        of an unknown name, whose scale counts as logarithmic.
         """
         item = next((each for each in self.free if each.name == name), None)
         if item is None:
@@ -462,7 +470,8 @@ class Parameters:
 
     @property
     def guess_q(self) -> Array:
-        """Coordinates (nq,) of the guesses.
+        """Coordinates (nq,) of the guesses, in the order of `free`; NaN for a linear parameter
+        whose `unit` is not known yet.
 
         Raises
         ------
@@ -475,7 +484,9 @@ class Parameters:
 
     @property
     def bounds_q(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of q, (nq,) each, in the order of `free`."""
+        """Lower and upper bounds of q, (nq,) each, in the order of `free`; infinite where there is
+        none.
+        """
         return (
             np.array([item.to_coordinate(item.lower) for item in self.free]),
             np.array([item.to_coordinate(item.upper) for item in self.free]),
@@ -497,7 +508,7 @@ class Parameters:
 
     def values(self, q: Sequence[float] | Array) -> dict[str, float]:
         """Return the value of every parameter in SI units at q (nq,), by name; fixed and tied ones
-        are included.
+        are included. Another length of q is a ValueError.
         """
         by_name = {item.name: float(item.guess or 0.0) for item in self.items}
         for item, coordinate in zip(self.free, q, strict=True):
@@ -655,6 +666,9 @@ def _describe(item: Parameter) -> str:
 @dataclass(frozen=True, eq=False)
 class ThetaMap:
     """Constants θ of a body, and moduli derived from them, as functions of q.
+
+    If the parameters do not determine the constants of the body, its methods raise an `InputError`,
+    not its constructor.
 
     Attributes
     ----------

@@ -197,8 +197,11 @@ class Pointwise(ForceTerm):
         places: AssemblyIndices,
         states: States,
     ) -> None:
-        """Add the forces and their first derivatives to a linearisation, in place, at the entries
-        and input columns `places`.
+        """Add the forces and their first derivatives by positions, velocities and the constants of
+        the law to a linearisation, in place, at the entries and input columns `places`.
+
+        Internal variables of the previous evaluations are constant. Skew parts are added where they
+        can exist; those by positions only if the linearisation has room for them.
         """
         evaluated = self._inputs_at(states)
         points = self.points
@@ -541,7 +544,9 @@ class CustomForce(Pointwise):
         return self
 
     def at_times(self, rows: slice) -> Self:
-        """Return this force at some of the times."""
+        """Return this force at some of the T times, given as a slice; internal variables of the
+        previous evaluations are kept as they are, see `with_previous_state`.
+        """
         return replace(self, t_s=self.t_s[rows])
 
     def interpolate(self, other: Self, share: float) -> Self:
@@ -601,7 +606,7 @@ def air_drag_terms(
     ----------
     experiment : Experiment
     t_s : (T,)
-        Times.
+        Times [s].
     """
     if not experiment.has_air_drag:
         return ()

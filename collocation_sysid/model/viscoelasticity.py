@@ -91,8 +91,15 @@ OVERSTRESS = Recursion(
 
 
 def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
-    """Return the coefficients c, d and a of an evaluation, with u = (g, τ); see `_overstress` for
-    the data.
+    """Return the coefficients (3,) of an evaluation: c of the stress in its overstress
+    Q_k = m_{k−1} + c S_k, then d and a of the recursion m_k = d m_{k−1} + a S_k.
+
+    Parameters
+    ----------
+    u : (2,) SX
+        Share g and relaxation time τ [s].
+    data : (3,) SX
+        Times, see `_overstress`.
     """
     return ca.vertcat(
         _stiffening(u, data), OVERSTRESS.linear_coefficients(u, data)[:2]
@@ -137,6 +144,7 @@ class FadingCoefficients:
         Parameters
         ----------
         body : Body
+            Body with memory (IndexError otherwise).
         theta : (k,)
             Constants of the body.
         until_next_s : (N,)
@@ -211,6 +219,7 @@ class MemoryHistory:
         Parameters
         ----------
         body : Body
+            Body with memory (IndexError otherwise).
         xi : (N, 3n)
             Positions at the evaluations, the first of which is the start [m].
         theta : (k,)
@@ -220,7 +229,8 @@ class MemoryHistory:
         loaded_s : float
             Time for which the body has been in its start shape; infinite if its memory has relaxed.
         previous_variables : (N, all branches), optional
-            Given internal variables m_{k−1}; computed from the states by default.
+            Given internal variables m_{k−1} [Pa], which are kept, not copied; computed from the
+            states by default.
         """
         stress = body.stresses.stress(xi, theta)
         fades = FadingCoefficients.from_body(
@@ -271,15 +281,18 @@ class MemoryHistory:
         return past
 
     def insert_into(self, forces: Forces, rows: slice) -> Forces:
-        """Return the forces of the evaluations `rows` with the memory inserted."""
+        """Return `forces`, given at the evaluations `rows` alone, with the memory at these
+        evaluations, which replaces their `memory_state`; the argument is unchanged.
+        """
         return replace(forces, memory_state=self.past_at(rows))
 
     def with_variable_weights(self, forces: Forces, mu: Array) -> Forces:
-        """Return the forces of all evaluations, with weights μ of a_k S_k in second derivatives.
+        """Return forces with the memory and with weights μ of a_k S_k in second derivatives.
 
         Parameters
         ----------
         forces : Forces
+            Forces at all N evaluations; not modified.
         mu : (N, all branches)
         """
         past = replace(
@@ -491,6 +504,8 @@ class MemoryState:
     ) -> MemoryState:
         """Return the memory in the start shape x (3n,) [m] of a body with constants θ (k,), which
         has been loaded for a time `loaded_s` [s]; infinite if the memory has relaxed.
+
+        The body must have memory (IndexError otherwise).
         """
         return MemoryHistory.from_states(
             body,
@@ -501,7 +516,9 @@ class MemoryState:
         ).final_state
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
-        """Return forces in the state of this memory, with its overstress Q inserted."""
+        """Return `forces`, given at one time, in the state of this memory: with its overstress Q,
+        which replaces their `memory_state`. The argument and self are unchanged.
+        """
         past = self.body.memory.relaxed(1)
         past.overstress[0] = self.body.memory.sum_over_branches(self.overstress)
         return replace(forces, memory_state=past)
@@ -509,8 +526,9 @@ class MemoryState:
     def insert_after_interval(
         self, forces: Forces, interval_s: float
     ) -> Forces:
-        """Return forces in a state one interval [s] later, with the memory inserted; self is
-        unchanged.
+        """Return `forces`, given at one time, an interval [s] later than this state: their
+        `memory_state` is replaced by the overstress that remains and the stiffening by the memory.
+        The argument and self are unchanged.
         """
         past = self.body.memory.relaxed(1)
         previous, c = self._after_interval(interval_s)
@@ -554,7 +572,9 @@ def with_start_memory(forces: Forces, loaded_s: float) -> Forces:
     """Return forces on the start shape, with the additional stiffness of a load that was applied a
     time `loaded_s` [s] ago: Q = g e^(−t/τ) S.
 
-    The forces are unchanged for a body without memory, or if `loaded_s` is infinite.
+    For a body without memory, or if `loaded_s` is infinite, the argument itself is returned.
+    Otherwise it is unchanged; it must be given at one time, and its `memory_state` is replaced in
+    the result.
     """
     body = forces.body
     if not body.has_memory or np.isinf(loaded_s):
@@ -579,7 +599,14 @@ class MemoryForwardColumns:
     done : int
         Number of evaluations that have been passed already.
     known : (columns, all branches), optional
-        Columns after those evaluations; 0 by default.
+        Columns after those evaluations, which are copied; 0 by default.
+
+    Attributes
+    ----------
+    columns : (columns, all branches)
+        Derivatives dm_{k−1} at the next evaluation k.
+    next : int
+        Index of the next evaluation.
     """
 
     def __init__(
@@ -691,6 +718,13 @@ class MemoryAdjoint:
     Parameters
     ----------
     history : MemoryHistory
+
+    Attributes
+    ----------
+    columns : (all branches,)
+        Weights μ_k of the internal variables after the next evaluation k; zero at first.
+    next : int
+        Index of the next evaluation: at first that of the last one, −1 after all.
     """
 
     def __init__(self, history: MemoryHistory) -> None:

@@ -53,7 +53,7 @@ class DofMasses:
     added_kg: Array
 
     def at_times(self, rows: slice) -> DofMasses:
-        """Return these masses at some of the times."""
+        """Return these masses at some of the T times, given as a slice."""
         return replace(self, tied_kg=self.tied_kg[rows])
 
     @cached_property
@@ -223,7 +223,8 @@ class Weight(ForceTerm):
         """Return this weight at inputs u (T, size): gravity from the first time if it is an input,
         then the shares of the loads, as changes from the stated shares.
 
-        Tied masses and applied forces follow the shares; self if there are no inputs.
+        Tied masses and applied forces follow the shares. The result keeps views of u; it is self if
+        there are no inputs. Self is unchanged.
         """
         if not self.size:
             return self
@@ -263,9 +264,11 @@ class Weight(ForceTerm):
         )
 
     def interpolate(self, other: Self, share: float) -> Self:
-        """Return this weight with masses and loads interpolated linearly to those of another time.
+        """Return this weight with tied masses and loads interpolated linearly to those of another
+        time.
 
-        Gravity stays that of this time. `share` is 0 for this time and 1 for the other.
+        Gravity and the masses of body and air stay those of this time. `share` is 0 for this time
+        and 1 for the other.
         """
 
         def between(a: Array, b: Array) -> Array:
@@ -457,7 +460,9 @@ def _sum_over_nodes(dofs: Array) -> Array:
 
 
 def _as_constant_view(rows: Array) -> Array:
-    """Return equal rows as a read-only view of one row with stride 0; other arrays unchanged."""
+    """Return equal rows as a read-only view of a copy of one row, with stride 0; another array
+    itself, also if a value is NaN. There must be at least one row.
+    """
     return (
         np.broadcast_to(rows[0].copy(), rows.shape)
         if (rows == rows[:1]).all()

@@ -176,7 +176,20 @@ def _parameter_values(
 
 
 def _write_body(task: BodyTask, folder: Path) -> None:
-    """Write the folder of a body."""
+    """Write the data of a body to a new folder: mesh, nodes and tetrahedra, licence if there is
+    one, recordings, description and README.
+
+    Parameters
+    ----------
+    task : BodyTask
+    folder : Path
+        Folder of the body, which is created; its parent must exist.
+
+    Raises
+    ------
+    FileExistsError
+        If the folder exists; other faults of the file system are OSErrors, too.
+    """
     mesh = _mesh(task.experiments[0])
     folder.mkdir()
     if (licence := task.body.licence_file) is not None:
@@ -240,7 +253,21 @@ def _body_content(task: BodyTask) -> dict[str, Any]:
 def _write_recording(
     task: BodyTask, experiment: Experiment, folder: Path
 ) -> dict[str, Any]:
-    """Write the tables of a recording, and return what is written about it as JSON."""
+    """Write the tables of a recording to the existing folder of its body, and return what the
+    description of the body states about it, for JSON.
+
+    Its "files" are names in this folder by role: "times", "measured", "simulated", "undeformed",
+    and "stretches" of a specimen without a mesh or "markers" where markers were measured.
+
+    Parameters
+    ----------
+    task : BodyTask
+        Task with the signals of the recording, by its name.
+    experiment : Experiment
+        The recording.
+    folder : Path
+        Folder of the body.
+    """
     signals = task.signals[experiment.name]
     measured = signals.measured
     name = safe_name(experiment.name)
@@ -281,7 +308,19 @@ def _write_recording(
 def _write_grasps(
     experiment: Experiment, folder: Path, name: str
 ) -> list[dict[str, Any]]:
-    """Write the nodes and poses of the grasps, and return what is written about them as JSON."""
+    """Write the nodes and poses of the grasps, and return what is written about them as JSON: for
+    each grasp its "axes" and the file names "nodes" and "poses", None for a grasp at rest.
+
+    Nodes are those of the linear mesh, numbered from 0; nodes on edges are left out.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    folder : Path
+        Existing folder of the body.
+    name : str
+        Beginning of the file names.
+    """
     grasps = []
     corner_count = len(experiment.body.mesh.points_m)
     for number, grasp in enumerate(experiment.grasps, start=1):

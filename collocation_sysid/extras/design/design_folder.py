@@ -308,10 +308,16 @@ def _designed_wrench(wrench: dict[str, Any]) -> dict[str, Any]:
 
 
 def _relative_to(value: Any, old: Path, new: Path) -> Any:
-    """Return a copy of nested content of a problem with file names relative to the folder `new`
-    instead of `old`.
+    """Return nested content of a problem with file names relative to the folder `new` instead of
+    `old`, in new lists and dictionaries; whether the files exist does not matter.
 
-    Names of columns are not file names.
+    File names are the texts at the keys in `OF_FILES`, at any depth; absolute ones become relative,
+    too. What is at the key "columns" and all other values are returned as they are.
+
+    Raises
+    ------
+    ValueError
+        On Windows, if a file is on another drive than `new`.
     """
     if isinstance(value, list):
         return [_relative_to(each, old, new=new) for each in value]

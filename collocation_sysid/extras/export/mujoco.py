@@ -430,8 +430,10 @@ def _set_grasp_state(
     """Set pose and velocity of the bodies that carry grasped nodes, and the pose of obstacles, in
     `data`, in place.
 
-    Grasped bodies are free: entries k of `qpos` and `qvel`. Obstacles are mocap bodies: only
-    `mocap_pos` and `mocap_quat`. After the last sample they stay at its pose.
+    Grasped bodies are free: that of grasp k has entries 7 k … 7 k + 6 of `qpos` and 6 k … 6 k + 5
+    of `qvel`. Obstacles are mocap bodies, after those of the grasps in `mocap_pos` and
+    `mocap_quat`; the mocap bodies of the grasps are not changed. After the last sample all stay at
+    its pose.
 
     Parameters
     ----------

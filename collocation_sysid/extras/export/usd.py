@@ -294,7 +294,9 @@ def _add_material(
 
 
 def _bind_material(pxr: Any, prim: Any, material: Any) -> None:
-    """Bind a physics material to a prim."""
+    """Bind a physics material to a prim, in place; materials bound to its descendants prevail.
+    `pxr` are the modules of `_import_usd`.
+    """
     binding = pxr.UsdShade.MaterialBindingAPI.Apply(prim)
     binding.Bind(material, pxr.UsdShade.Tokens.weakerThanDescendants, "physics")
 
@@ -374,10 +376,24 @@ def _set_poses(
 def _add_obstacle(
     pxr: Any, stage: Any, path: str, obstacle: Obstacle, body: IdentifiedBody
 ) -> None:
-    """Add an obstacle with its friction to the stage, in place, under `path`.
+    """Add an obstacle with its friction to the stage, in place: its shape at or under `path`, and
+    its material as /World/Materials/NAME with the last name in `path`.
 
-    It is a kinematic rigid body if it moves; otherwise it stays at its pose of the first sample of
-    `body`. Rounded edges are left out.
+    It is a kinematic rigid body, with a pose for each sample of `body`, if it has more than one
+    pose; otherwise it stays at its pose of the first sample. Rounded edges are left out.
+
+    Parameters
+    ----------
+    pxr : namespace
+        Modules of `_import_usd`.
+    stage : Stage
+        Modified in place.
+    path : str
+        Path of the obstacle in the stage.
+    obstacle : Obstacle
+        Its friction coefficient must be a number.
+    body : IdentifiedBody
+        Body with the times of the samples.
     """
     shape = Primitive.from_solid(obstacle.shape)
     t_s = body.experiment.t_s

@@ -204,7 +204,15 @@ def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
     one; 0 for the best.
 
     It is the larger of the errors from the scatter between blocks in time and from the scatter
-    `logs` between recordings.
+    between recordings; NaN if there is only one block in total.
+
+    Parameters
+    ----------
+    row, best : Row
+        Rows of `model_rows` with predictions of the same recordings: "blocks" has the squared
+        errors of each block by recording, as many in both.
+    logs : sequence of float
+        Logarithmic ratio for each recording; fewer than two have no scatter.
     """
     if row is best:
         return 0.0

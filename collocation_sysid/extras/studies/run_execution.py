@@ -403,7 +403,11 @@ def _result_record(
 
 @contextmanager
 def _thread_executor(limits: RunOptions) -> Iterator[RunExecutor]:
-    """Context with an executor of threads, which wait for processes on this machine."""
+    """Context with an executor of threads, which wait for processes on this machine: as many at
+    once as `limits` states, else one for each available thread.
+
+    The end of the context waits for submitted runs; only `RunExecutor.stop` ends running ones.
+    """
     worker_count = limits.workers or available_threads()
     stop = threading.Event()
     with ThreadPoolExecutor(worker_count) as executor:
@@ -419,8 +423,16 @@ def _thread_executor(limits: RunOptions) -> Iterator[RunExecutor]:
 
 @contextmanager
 def _cluster_executor(limits: RunOptions) -> Iterator[RunExecutor]:
-    """Context with an executor on the workers of the scheduler in `limits`; running runs are
-    stopped through an event of the cluster.
+    """Context with an executor on the workers of the scheduler in `limits`, one run at once for
+    each of their threads.
+
+    `RunExecutor.stop` tells running runs to end, through an event of the cluster; the end of the
+    context alone does not stop them. It waits for submitted runs, and closes the connection.
+
+    Raises
+    ------
+    InputError
+        If dask.distributed is not installed, or the scheduler does not answer.
     """
     flag = f"collocation-sysid-stop-{secrets.token_hex(8)}"
     with connected(limits.scheduler) as client:
@@ -441,7 +453,17 @@ def _cluster_executor(limits: RunOptions) -> Iterator[RunExecutor]:
 def _execute_on_worker(
     planned: dict[str, Any], time_limit_s: float | None, flag: str
 ) -> Record:
-    """Execute a run on a worker until the event named `flag` is set, and return its record."""
+    """Execute a run in a process of its own on a worker, and return its record, see `execute`.
+
+    Parameters
+    ----------
+    planned : dict
+        A `PlannedRun` as a dictionary.
+    time_limit_s : float or None
+        Time limit of the run [s]; None for no limit.
+    flag : str
+        Name of an event of the cluster; once it is set, the process is killed.
+    """
     return execute(
         planned, time_limit_s, is_stopped=distributed().Event(flag).is_set
     )

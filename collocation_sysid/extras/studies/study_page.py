@@ -620,7 +620,8 @@ def _varied_cell(key: str) -> Cell:
 def _number_cell(
     name: str, factor: float = 1.0, form: str = ".2g", among: str = ""
 ) -> Cell:
-    """Return the cell of a number, "–" if unknown.
+    """Return the cell of a number: a function of a row that returns the number as text, "–" if it
+    is unknown.
 
     Parameters
     ----------

@@ -164,7 +164,7 @@ def remaining_time_s(
     waiting : sequence of str
         Method of each waiting run.
     walls : mapping of str to sequence of float
-        Durations of the finished runs by method [s].
+        Durations of the finished runs by method [s], at least one for each method that is a key.
     worker_count : int
         Number of runs that are executed at once.
     """
