@@ -36,7 +36,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Self
+from typing import NamedTuple, Self
 
 import casadi as ca
 import numpy as np
@@ -77,6 +77,45 @@ POINT_BATCH = 16
 TINY_M = 1e-30
 # Largest b of relaxed contact in widths, which limits the pressure at gaps near zero or below.
 LARGEST_SCALED_PRESSURE = 50.0
+
+
+class NormalContact(NamedTuple):
+    """Expressions of the contact of a point without friction.
+
+    Attributes
+    ----------
+    point : (3,) SX
+        The point in obstacle axes [m].
+    axes : (3, 3) SX
+        Axes of the obstacle, one per column, in the axes of the world.
+    gap_gradient : (3,) SX
+        Gradient of the gap at the point, in obstacle axes.
+    force_n : SX
+        Normal force N [N].
+    """
+
+    point: ca.SX
+    axes: ca.SX
+    gap_gradient: ca.SX
+    force_n: ca.SX
+
+
+class FrictionAtPoint(NamedTuple):
+    """Expressions of the friction of a point.
+
+    Attributes
+    ----------
+    limit_n : SX
+        Limit μ N of the friction force [N].
+    force : (3,) SX
+        Friction force [N], in the axes of the world.
+    velocity : (3,) SX
+        Tangential velocity relative to the obstacle [m/s], in the axes of the world.
+    """
+
+    limit_n: ca.SX
+    force: ca.SX
+    velocity: ca.SX
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,28 +436,23 @@ class ContactLaw:
         scaled_pressure : SX, optional
             Given b; that of the gap by default.
         """
-        place, axes, slope, normal_n = self._normal(
-            u, data, pressing=scaled_pressure
-        )
+        contact = self._normal_contact(u, data, pressing=scaled_pressure)
         # The forces on the ends of the axes follow from the coordinates of the point in these axes.
-        push = normal_n * slope
+        push = contact.force_n * contact.gap_gradient
         force = ca.vertcat(
-            axes @ push, ca.vec(u[:3] @ push.T) / self._frame_size_m
+            contact.axes @ push, ca.vec(u[:3] @ push.T) / self._frame_size_m
         )
         if not self.obstacle.has_friction:
             return force
-        _, friction, _ = self._friction(
-            u, place, slope=axes @ slope, normal_n=normal_n
-        )
+        friction = self._friction(u, contact).force
         return force + ca.vertcat(
-            friction, -ca.vec(friction @ (place / self._frame_size_m).T)
+            friction, -ca.vec(friction @ (contact.point / self._frame_size_m).T)
         )
 
-    def _normal(
+    def _normal_contact(
         self, u: ca.SX, data: ca.SX, pressing: ca.SX | None
-    ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        """Return the point in obstacle axes (3,), these axes (3, 3), the gradient of the gap there
-        (3,), in obstacle axes, and the normal force N.
+    ) -> NormalContact:
+        """Return the point in the axes of its obstacle, and its normal force.
 
         Parameters
         ----------
@@ -443,15 +477,13 @@ class ContactLaw:
             )
         else:
             scaled_pressure = self.scaled_pressure(gap, data)
-        return (
-            place,
-            axes,
-            slope,
+        force_n = (
             data[0]
             * data[3]
             * self.stiffness(self._constants(u))
-            * scaled_pressure,
+            * scaled_pressure
         )
+        return NormalContact(place, axes, gap_gradient=slope, force_n=force_n)
 
     def _end_gaps(self, u: ca.SX, half_s: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Return the gaps [m] at both ends of a step: `half_s` [s] before and after the state in u,
@@ -469,35 +501,28 @@ class ContactLaw:
         """Return the constants (c,), which are the last entries of u."""
         return u[u.numel() - len(self.constant_columns) :]
 
-    def _friction(
-        self, u: ca.SX, place: ca.SX, slope: ca.SX, normal_n: ca.SX
-    ) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Return friction limit μ N, friction force (3,) and tangential relative velocity (3,).
+    def _friction(self, u: ca.SX, contact: NormalContact) -> FrictionAtPoint:
+        """Return the friction of a point with a normal force.
 
         Parameters
         ----------
         u : SX
             Stacked (y, ẏ, c).
-        place : (3,) SX
-            Point in obstacle axes.
-        slope : (3,) SX
-            Gradient of the gap, in the axes of the world.
-        normal_n : SX
-            Normal force N.
+        contact : NormalContact
+            The point and its normal force.
         """
+        slope = contact.axes @ contact.gap_gradient
         relative, *ends = ca.vertsplit(
             u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT], 3
         )
-        relative -= ca.horzcat(*ends) @ (place / self._frame_size_m)
+        relative -= ca.horzcat(*ends) @ (contact.point / self._frame_size_m)
         normal = slope / ca.norm_2(slope)
         tangential = relative - normal * ca.dot(normal, relative)
-        limit_n = self.friction_coefficient(self._constants(u)) * normal_n
-        return (
-            limit_n,
-            -limit_n
-            / ca.sqrt(ca.sumsqr(tangential) + self.slip**2)
-            * tangential,
-            tangential,
+        coefficient = self.friction_coefficient(self._constants(u))
+        limit_n = coefficient * contact.force_n
+        speed = ca.sqrt(ca.sumsqr(tangential) + self.slip**2)
+        return FrictionAtPoint(
+            limit_n, -limit_n / speed * tangential, velocity=tangential
         )
 
     @cached_property
@@ -510,16 +535,15 @@ class ContactLaw:
 
         def friction_values(u: ca.SX, data: ca.SX) -> ca.SX:
             """Return the 6 values of friction, with u = (y, ẏ, c)."""
-            place, axes, slope, normal_n = self._normal(u, data, pressing=None)
-            limit_n, friction, tangential = self._friction(
-                u, place, slope=axes @ slope, normal_n=normal_n
-            )
-            slips = ca.sumsqr(tangential) > (SLIP_THRESHOLD * self.slip) ** 2
+            contact = self._normal_contact(u, data, pressing=None)
+            friction = self._friction(u, contact)
+            slip_speed = SLIP_THRESHOLD * self.slip
+            slips = ca.sumsqr(friction.velocity) > slip_speed**2
             return ca.vertcat(
-                limit_n,
-                limit_n * slips,
-                friction,
-                -ca.dot(friction, tangential),
+                friction.limit_n,
+                friction.limit_n * slips,
+                friction.force,
+                -ca.dot(friction.force, friction.velocity),
             )
 
         return GeneratedFunction(

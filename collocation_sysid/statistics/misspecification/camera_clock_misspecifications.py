@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +77,25 @@ def camera_clock_hypotheses(part: ExperimentIterate) -> Iterator[Hypothesis]:
             reading, positions_m, is_simulated=within
         )
         yield from comparison.hypotheses(name)
+
+
+class _AlignedPoints(NamedTuple):
+    """Alignment of measured points with a surface.
+
+    Attributes
+    ----------
+    turn_rad : (3,) array
+        Rotation vector of the points about the pivot of the camera [rad].
+    shift_m : (3,) array
+        Shift of the points [m].
+    misfit_m : float
+        Root mean square distance of the surface from the points along its normal [m] before the
+        last step, at most the gate for each point; infinite before the first step.
+    """
+
+    turn_rad: Array
+    shift_m: Array
+    misfit_m: float
 
 
 class _MotionComparison:
@@ -183,13 +203,10 @@ class _MotionComparison:
         Before its first time the body rests at its first position.
         """
         shapes = self._shapes_in_camera(described)
-        turn_rad = np.zeros(3)
-        shift_m = np.zeros(3)
+        aligned = _AlignedPoints(np.zeros(3), np.zeros(3), misfit_m=np.inf)
         for _ in range(ALIGNMENTS):
-            turn_rad, shift_m, misfit_m = self._align(
-                described.images, shapes, turn_rad=turn_rad, shift_m=shift_m
-            )
-        return misfit_m
+            aligned = self._align(described.images, shapes, start=aligned)
+        return aligned.misfit_m
 
     def _shapes_in_camera(
         self, described: ImageTimes
@@ -225,12 +242,9 @@ class _MotionComparison:
         self,
         images: Sequence[int] | NDArray[np.int64],
         shapes: list[tuple[Array, Array]],
-        turn_rad: Array,
-        shift_m: Array,
-    ) -> tuple[Array, Array, float]:
-        """Return rotation vector (3,) [rad] and shift (3,) [m] of the points after one more
-        Gauss–Newton step, and the misfit before it: the root mean square distance of the surface
-        from the points along its normal [m], at most the gate for each point.
+        start: _AlignedPoints,
+    ) -> _AlignedPoints:
+        """Return the rotation and shift of the points after one more Gauss–Newton step.
 
         Parameters
         ----------
@@ -239,9 +253,11 @@ class _MotionComparison:
         shapes : list of pairs of (P, 3) arrays
             Visible points of the surface [m] and their normals at each of these images, in the
             camera's stated frame.
-        turn_rad, shift_m : (3,) arrays
-            Rotation vector [rad] and shift [m] before the step; not modified.
+        start : _AlignedPoints
+            Rotation and shift before the step; not modified.
         """
+        turn_rad = start.turn_rad
+        shift_m = start.shift_m
         pivot_m = self.camera.pivot_m
         rows = []
         right = []
@@ -270,4 +286,6 @@ class _MotionComparison:
             -np.concatenate([*right, prior * estimate]),
         )[0]
         misfit_m = float(np.sqrt(np.mean(np.concatenate(distances_m) ** 2)))
-        return turn_rad + step[:3], shift_m + step[3:], misfit_m
+        return _AlignedPoints(
+            turn_rad + step[:3], shift_m + step[3:], misfit_m=misfit_m
+        )
