@@ -154,8 +154,8 @@ class NuisanceRow:
 
     @property
     def prior(self) -> str:
-        """Key of the prior standard deviation in the problem file: "prior_" and the unit in lower
-        case, such as "prior_m".
+        """Key of the prior standard deviation in the problem file: "prior", an underscore and the
+        unit in lower case, such as "prior_m".
 
         It is "prior" for the unit "1", "prior_sigmas" for "σ" and "prior_1_m2" for "1/m²".
         """
