@@ -17,15 +17,12 @@ from numpy.typing import NDArray
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import splu
 from skfem import (
-    Basis,
     BilinearForm,
-    ElementTetP1,
-    ElementVector,
     LinearForm,
-    MeshTet,
 )
 
 import collocation_sysid as cs
+from kit.scikit_fem import Library
 
 Array = NDArray[np.float64]
 # Untyped: scikit-fem's annotations exclude what its helpers return, MuJoCo's lack its names.
@@ -202,9 +199,9 @@ class ScikitFemCylinder:
     def __init__(self, experiment: cs.Experiment) -> None:
         body = experiment.body
         self.rest_m = body.nodes_m
-        mesh = MeshTet(body.nodes_m.T, np.asarray(body.mesh.tetrahedra).T)
-        element = ElementVector(ElementTetP1())
-        self.basis = Basis(mesh, element, intorder=1)
+        library = Library(body.mesh)
+        self.basis = library.basis
+        self.order = library.dofs
         masses = body.node_mass.copy()
         for added in experiment.masses:
             masses[added.nodes] += added.mass_kg
@@ -221,7 +218,6 @@ class ScikitFemCylinder:
         at_s = np.minimum(step_s * np.arange(count), experiment.t_s[-1])
         held_m = grasp.positions_at(body.nodes_m, at_s)
         self.prescribed_m = held_m.reshape(count, -1)
-        self.order = _node_major_order(self.basis, self.rest_m)
 
     def simulate(self, values: dict[str, float]) -> Array:
         """Return the node positions (T, n, 3) [m] at the samples, from equilibrium."""
@@ -337,12 +333,6 @@ class ScikitFemCylinder:
             "displacement": self.basis.interpolate(displacement),
             "speed": self.basis.interpolate(speed),
         }
-
-
-def _node_major_order(basis: Basis, nodes_m: Array) -> NDArray[np.intp]:
-    """Return the unknown of the basis for each coordinate of each node."""
-    dofs: Any = basis.nodal_dofs
-    return dofs.T.ravel()[: nodes_m.size]
 
 
 def _lame_constants(values: dict[str, float]) -> tuple[float, float]:
