@@ -5,7 +5,8 @@ check), `run_commands` (refine, export, plot, report, animate, view), `study_com
 (compare-methods, compare-models, sweep), `design_commands` (design), `stream_commands` (live,
 replay), `benchmark_commands` (benchmark), `installation_commands` (doctor, completion) and `texts`
 (methods, schema, explain, log, new). `command_options` makes command-line options from dataclasses,
-`common` has exit codes and output, and `markdown` shows documentation on a terminal.
+`common` has exit codes and output, `shell_completion` scripts that complete commands in a shell,
+and `markdown` shows documentation on a terminal.
 
 Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 2 bad input,
 130 interrupted.

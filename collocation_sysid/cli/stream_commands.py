@@ -139,13 +139,13 @@ def live(options: LiveCommand) -> None:
     and the exit code is then 2. An empty datagram ends the recording.
     """
     from ..extras.live.frames import FrameReader
-    from ..extras.live.gripper_transforms import gripper_transforms
     from ..extras.live.sources import (
         decode_lines,
         receive_datagrams,
         update_as_json,
         without_garbage_of_startup,
     )
+    from ..problem.gripper_transforms import gripper_transforms
 
     if (
         options.udp is None and sys.stdin is None

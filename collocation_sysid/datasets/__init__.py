@@ -2,7 +2,7 @@
 
 Each function returns experiments that can be solved with `Problem`. A dataset is a folder with a
 problem file and tables, which ``collocation-sysid new NAME --dataset DATASET`` copies;
-`read_problem` reads it with its parameters.
+`read_problem` reads it with its parameters. `dataset_files` finds the folders.
 
 >>> import collocation_sysid as cs
 >>> tests = cs.datasets.kawabata_1981("mooney-rivlin")  # doctest: +SKIP

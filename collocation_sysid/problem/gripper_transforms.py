@@ -1,4 +1,4 @@
-"""Poses of the body in the grippers whose poses a stream contains."""
+"""Poses of the undeformed body in the frames of grippers, as a problem file states them."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Iterable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...common.array_types import Array
-from ...problem import Problem
-from ...problem.schema import ProblemFile
+from ..common.array_types import Array
+from .problem import Problem
+from .schema import ProblemFile
 
 
 def gripper_transforms(

@@ -4,14 +4,16 @@ Begin with `experiment` (one recording with all its parts). Its parts are in:
 
 - `grasp`, `poses`, `measured_wrench`: prescribed displacements, the rigid motions that prescribe
   them, and measured reaction forces.
-- `obstacle`, `obstacle_solids`: rigid obstacles for contact, and their shapes.
+- `obstacle`, `obstacle_solids`, `solid_sections`: rigid obstacles for contact, their shapes, and the
+  tables that state them.
 - `loads`, `tendon`, `pressure`, `actuator`: point masses, forces, tendons and pressures.
 - `markers`, `placement`: tracked markers and where they sit on the body.
 - `depth_camera`: depth cameras and scanners.
 - `custom_sensor`: custom sensors.
 - `nuisance`: unknowns of a single recording, with their priors.
 - `environment`: the density of the air.
-- `specimen`, `specimen_stretches`, `homogeneous_deformation`: material tests without a mesh.
+- `specimen`, `specimen_stretches`, `homogeneous_deformation`: material tests without a mesh;
+  `specimen_files` reads their tables, and `specimen_checks` finds mistakes in them.
 
 Files are read by `marker_files` (markers), `pose_files` (poses), `time_tables` (forces,
 displacements, pressures, custom sensors) and the subpackage `formats`; `recording_writers` writes

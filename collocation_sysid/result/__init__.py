@@ -1,4 +1,4 @@
-"""Output of a finished run: files, reports on a terminal, web pages, pictures, films and exports.
+"""Output of a finished run: files, reports on a terminal, web pages, pictures and films.
 
 Files: `run_record` writes a run folder, `replay` reads one back, `run_writers` writes ParaView
 frames and replaces folders safely, `run_refinement` adds measured discretisation errors to a run
@@ -8,10 +8,9 @@ Text: `run_sections` describes a run, `probe_sections` its probes, and `check_se
 of a check; `report` turns such sections into an HTML page or Markdown, and `solve_progress` shows a
 solve while it runs.
 
-Pictures: the package `pictures` has static figures in the look of `figure_style`; `animation`
-makes films, `interactive_view` an interactive window, and `web_page` a web page with the moving
-body. `depth_overlays` prepares the points of depth cameras for all of these, and `element_fields`
-evaluates stress and energy in each element.
-
-Other simulators: the package `export` writes the identified body.
+Pictures: the package `pictures` has static figures in the look of `figure_style`; `animation` makes
+films, `interactive_view` an interactive window, and `web_page` a web page with the moving body;
+`parameter_sliders` shows simulations at other parameters in a notebook. `depth_overlays` prepares
+the points of depth cameras for all of these, and `element_fields` evaluates stress and energy in
+each element.
 """

@@ -40,7 +40,6 @@ from collocation_sysid.extras.live import (
     estimator,
 )
 from collocation_sysid.extras.live.frame_buffer import FrameBuffer
-from collocation_sysid.extras.live.gripper_transforms import gripper_transforms
 from collocation_sysid.extras.live.sources import (
     paced_frames,
     receive_datagrams,
@@ -50,6 +49,7 @@ from collocation_sysid.extras.live.time_budget import TimeBudget
 from collocation_sysid.extras.live.window_pass import WindowPass
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.problem.gripper_transforms import gripper_transforms
 from collocation_sysid.program import streaming_model, streaming_sweep
 from collocation_sysid.recording import (
     Markers,

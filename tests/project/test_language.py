@@ -37,6 +37,14 @@ def trees() -> list[tuple[Path, ast.Module]]:
 
 
 @cache
+def trees_of_tests() -> list[tuple[Path, ast.Module]]:
+    return [
+        (path, ast.parse(path.read_text()))
+        for path in sorted(TESTS.rglob("*.py"))
+    ]
+
+
+@cache
 def summaries() -> list[tuple[str, str]]:
     """Place and first docstring line of everything that the package documents."""
     return [
@@ -126,8 +134,8 @@ def test_no_test_module_imports_another_one():
     names = {path.stem for path in TESTS.glob("*/test_*.py")}
     imported = [
         f"{path.name}: {module}"
-        for path in TESTS.rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text()))
+        for path, tree in trees_of_tests()
+        for node in ast.walk(tree)
         if isinstance(node, ast.ImportFrom | ast.Import)
         for module in (
             [node.module]
@@ -143,8 +151,8 @@ def test_no_test_replaces_a_private_function():
     """What tests replace is public, so that its docstring states what it may be replaced by."""
     replaced = [
         f"{path.name}:{node.lineno}"
-        for path in TESTS.rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text()))
+        for path, tree in trees_of_tests()
+        for node in ast.walk(tree)
         if isinstance(node, ast.Call)
         and isinstance(node.func, ast.Attribute)
         and node.func.attr in ("setattr", "object")
@@ -154,3 +162,17 @@ def test_no_test_replaces_a_private_function():
         and not str(node.args[1].value).startswith("__")
     ]
     assert replaced == []
+
+
+def test_the_docstring_of_a_package_names_its_modules():
+    unnamed = []
+    for path, tree in trees():
+        if path.name == "__init__.py" and path.parent != PACKAGE:
+            docstring = ast.get_docstring(tree) or ""
+            unnamed += [
+                f"{path.parent.relative_to(PACKAGE)}/{module.name}"
+                for module in path.parent.glob("*.py")
+                if module.stem != "__init__"
+                and not re.search(rf"\b{module.stem}\b", docstring)
+            ]
+    assert unnamed == []

@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 import tomli_w
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from ...common.serialisation import as_json, content
 from ...fem.laws.constants import is_field_coefficient
+from ...problem.gripper_transforms import gripper_transforms
 from ...problem.recording_schema import MovedSection
-from ...problem.schema import ProblemFile, with_experiment_defaults
+from ...problem.schema import with_experiment_defaults
 from ...recording import (
     PoseSequence,
     write_markers_csv,
@@ -208,19 +209,14 @@ def _gripper_poses(design: Design) -> PoseSequence:
     """Return the designed poses: of the gripper if the problem states `gripper_to_body`, else of
     the body.
     """
-    origin = design.recording.problem.origin
-    name = design.recording.template.name
-    if origin is None:
-        return design.poses
-    sections = ProblemFile.model_validate(tomllib.loads(origin.text)).recordings
-    (section,) = (section for section in sections if section.name == name)
-    if (transform := section.grasp_list[0].gripper_to_body) is None:
-        return design.poses
-    rotation = Rotation.from_quat(transform.quaternion_xyzw)
-    body_in_gripper = RigidTransform.from_components(
-        transform.position_m, rotation
+    recording = design.recording
+    (body_in_gripper,) = gripper_transforms(
+        recording.problem, recording.template.name, [0]
     )
-    return design.poses.after(body_in_gripper.inv().as_matrix())
+    if body_in_gripper is None:
+        return design.poses
+    gripper_in_body = RigidTransform.from_matrix(body_in_gripper).inv()
+    return design.poses.after(gripper_in_body.as_matrix())
 
 
 def _problem_content(design: Design, folder: Path) -> dict[str, Any]:

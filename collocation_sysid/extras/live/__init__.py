@@ -10,7 +10,7 @@ Use `LiveEstimator`: `LiveEstimator.update` takes one frame and returns estimate
   with its information and prior. Time marching with sensitivities is `program.streaming`.
 - `time_budget`: computing time per frame; `stiffness_search`: initial values without a guess.
 - `live_trust`: verdict of a live estimate; `batch_solution`: batch solution at the end;
-  `live_display`: terminal and film.
+  `live_display`: terminal and film; `live_recording`: file for the Rerun viewer.
 """
 
 from .estimator import LiveEstimator, LiveOptions, LiveUpdate

@@ -1,3 +1,6 @@
-"""Contact during a motion: `step_contact` limits the steps of Newton's method by the contact, and
-`contact_summary` describes the contact of a solved motion. The contact law is `model.contact`.
+"""Contact during a motion; the contact law is `model.contact`.
+
+- `step_contact`: contact forces of one time step, at the points that may touch.
+- `condensed_contact`: solution of a time step with the contact condensed to the dofs that touch.
+- `contact_summary`: contact of a solved motion in numbers.
 """

@@ -59,7 +59,8 @@ class ContactEquations:
     residual_without_contact : callable
         Residual (3n,) [N] at positions (3n,) [m], without contact.
     linearise_without_contact : callable
-        The same residual and its derivative by the positions.
+        Residual (3n,) [N] at positions (3n,) [m], without contact, and its derivative by the
+        positions.
     contact : StepContact
         Contact in the step.
     states : callable

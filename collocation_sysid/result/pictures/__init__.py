@@ -1,11 +1,11 @@
 """Pictures of a run, one kind per module; each function takes arrays and returns a Figure.
 
-Over time: `over_time` (markers, wrenches, custom sensors) and `spectrum_picture`. In space:
-`shapes_picture` (body and markers at several times), `mesh_pictures`, `field_intervals` (a
-spatially varying constant), `depth_comparison_picture` (images of depth cameras) and `instability`
-(a buckling mode). Statistics and method: `confidence`, `search_pictures` and `jacobian`.
-`all_pictures` collects all pictures of a run and writes them; `projection` and `scene` draw bodies
-in space for the others.
+Over time: `over_time` (markers, wrenches, custom sensors) and `spectrum`. In space: `shapes` (body
+and markers at several times), `mesh_pictures`, `field_intervals` (a spatially varying constant),
+`depth_comparison_picture` (images of depth cameras) and `instability` (a buckling mode). Of
+specimens: `stress_strain`. Statistics and method: `confidence`, `search_pictures` and `jacobian`.
+`album` collects all pictures of a run and writes them; `projection` and `scene` draw bodies in
+space for the others.
 
 Positions are in metres and drawn in millimetres; colours and type sizes are those of
 `result.figure_style`.
