@@ -254,7 +254,7 @@ class _ContinuationState:
         )
         values = ", ".join(
             f"{name} = {value:.4g}"
-            for name, value in solution.parameters.items()
+            for name, value in part.parameters.scalar_values(solution.q).items()
         )
         self.recorder.notes.append(
             f"{100 * share:.3g} % of the samples by {solution.method}: {solution.status.value} "

@@ -735,7 +735,9 @@ class ReducedSearch:
             )
         )
         violation_n = max(each.violation_n for each in summaries)
-        values = self.collocation.parameter_values(p)
+        values = self.collocation.parameters.scalar_values(
+            p[: self.collocation.nq]
+        )
         time_s = self.recorder.elapsed_s
         share = sum(each.rows for each in summaries) / sum(
             s.grid_times for s in self.collocation.transcriptions

@@ -163,7 +163,7 @@ def _parameter_values(
     """
     identified = {each.name: each.value for each in entry.constants}
     values = {}
-    for item in problem.parameters.items:
+    for item in problem.parameters.components:
         value = identified.get(item.name, item.guess if item.is_fixed else None)
         if value is None:
             raise InputError(

@@ -576,7 +576,7 @@ def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of a larger Poisson's ratio, per unit, where it is stated (fixed, or tied
     to a fixed one), in all such parts together; None if there is none.
     """
-    items = {item.name: item for item in at.parameters.items}
+    items = {item.name: item for item in at.parameters.components}
     constants = {
         name
         for name, item in items.items()
