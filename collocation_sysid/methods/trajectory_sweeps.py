@@ -18,6 +18,7 @@ from ..program.forward.newton_solver import NewtonOptions
 from ..program.forward.scheme_simulation import continue_simulation
 from ..program.least_squares import SquareRootInformation
 from ..program.measurement_residual import huber_as_least_squares
+from ..program.observable_response import ObservableResponse
 from ..program.sweep import Sweep, Tangent
 from ..program.transcription import Transcription
 from .initial_trajectories import continue_trajectory
@@ -397,13 +398,10 @@ def _sweep_result(
     times_s : tuple of three floats
         Times for `Stopwatch.add` [s].
     """
-    response = iterate.observation.response_of_array(
-        tangent.by_p, tangent.grasp_forces
+    response = ObservableResponse.from_array(
+        iterate, tangent.by_p, tangent.grasp_forces, step=tangent.step
     )
-    predictions = iterate.observation.linearise(
-        iterate.x, response, step=tangent.step
-    )
-    matches = zip(predictions, iterate.segment.residuals, strict=True)
+    matches = zip(response.linearise(), iterate.segment.residuals, strict=True)
     residuals_and_slopes = [
         huber_as_least_squares(*each, reading.huber)
         for each, reading in matches
