@@ -373,9 +373,7 @@ class Solution:
         """
         parts = [part for part in self.parts if part.segment.sensors]
         return {
-            part.segment.experiment.name: part.observation.predict_wrenches(
-                part.x
-            )
+            part.segment.experiment.name: part.predict_wrenches()
             for part in parts
         }
 
@@ -401,7 +399,9 @@ class Solution:
         return {
             part.segment.experiment.name: {
                 gauge.sensor.name: gauge.without_padding(
-                    gauge.predict_motion(part.motion, part.phi)
+                    gauge.predict_motion(
+                        part.motion_for(gauge.observable), part.phi
+                    )
                 )
                 for gauge in part.segment.custom_sensors
             }

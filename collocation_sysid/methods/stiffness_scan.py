@@ -405,7 +405,7 @@ def _residuals(iterate: ExperimentIterate) -> Array:
     """
     residuals = []
     slopes = []
-    predictions = iterate.observation.linearise_fixed_motion(iterate.x)
+    predictions = iterate.linearise_fixed_motion()
     for reading, (residual, slope) in zip(
         iterate.segment.residuals, predictions, strict=True
     ):
