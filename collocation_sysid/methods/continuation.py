@@ -250,11 +250,11 @@ class _ContinuationState:
         self.evaluations += solution.evaluations
         spent = solution.timing
         self.recorder.stopwatch.add(
-            spent.build, spent.evaluations, spent.linear_algebra
+            spent.build, spent.evaluations, linear_algebra=spent.linear_algebra
         )
         values = ", ".join(
             f"{name} = {value:.4g}"
-            for name, value in solution.parameters.items()
+            for name, value in part.parameters.scalar_values(solution.q).items()
         )
         self.recorder.notes.append(
             f"{100 * share:.3g} % of the samples by {solution.method}: {solution.status.value} "

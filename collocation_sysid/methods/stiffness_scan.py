@@ -290,7 +290,7 @@ def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
     """
     guesses = {
         i.name: i.guess
-        for i in parameters.items
+        for i in parameters.components
         if i.tied is None and i.guess is not None
     }
 
@@ -340,11 +340,8 @@ def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
     modulus [Pa].
     """
     unit = young_pa / 10
-    return Parameters(
-        tuple(
-            replace(i, unit=unit) if np.isnan(i.unit) else i
-            for i in parameters.items
-        )
+    return parameters.map_components(
+        lambda item: replace(item, unit=unit) if np.isnan(item.unit) else item
     )
 
 
@@ -372,8 +369,10 @@ def without_guesses(collocation: Collocation) -> Collocation:
         )
 
     free = collocation.parameters.free
-    items = tuple(map(without_guess, collocation.parameters.items))
-    return replace(collocation, parameters=Parameters(items))
+    return replace(
+        collocation,
+        parameters=collocation.parameters.map_components(without_guess),
+    )
 
 
 def _misfit(
@@ -406,7 +405,7 @@ def _residuals(iterate: ExperimentIterate) -> Array:
     """
     residuals = []
     slopes = []
-    predictions = iterate.observation.linearise_fixed_motion(iterate.x)
+    predictions = iterate.linearise_fixed_motion()
     for reading, (residual, slope) in zip(
         iterate.segment.residuals, predictions, strict=True
     ):

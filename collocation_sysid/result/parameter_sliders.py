@@ -17,7 +17,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.display import number
 from ..errors import InputError, SimulationError, require_among
-from ..fem.laws.constants import is_field_coefficient, symbol_with_unit
+from ..fem.laws.constants import symbol_with_unit
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.transcription import Transcription
@@ -201,11 +201,7 @@ class ParameterSliders:
         by_name = {each.name: each for each in run.problem.experiments}
         name = next(iter(by_name)) if experiment is None else experiment
         require_among(name, by_name)
-        names = [
-            each.name
-            for each in run.start_parameters.free
-            if not is_field_coefficient(each.name)
-        ]
+        names = [each.name for each in run.start_parameters.free_scalars]
         if not names:
             raise InputError(
                 "no parameter was estimated; expected a run with one that is not fixed, because "

@@ -278,7 +278,7 @@ def _simulate(
     return simulate(
         with_contact_energy(segment.corrected_experiment(phi)),
         segment.body.theta_from_values(parameters),
-        integrator,
+        integrator=integrator,
         timestep_s=_step_s(problem, segment),
         substeps=segment.substeps,
         progress=report,
@@ -487,7 +487,7 @@ def _sensor_differences(
         return []
     fitted = (
         part.x[segment.markers.sample_rows],
-        (ReactionGrid.from_dynamics(segment.dynamics), part.motion.reactions),
+        (ReactionGrid.from_dynamics(segment.dynamics), part.reactions),
     )
     rolled = (
         trajectory.positions_m.reshape(len(fitted[0]), -1),
@@ -553,11 +553,7 @@ def _predict_sensors(
         Nuisance parameters of the recording.
     """
     grid = reactions[0]
-
-    def forced() -> ReactionForces:
-        return reactions[1]
-
-    motion = ObservedMotion(x, forced)
+    motion = ObservedMotion(x, reactions[1])
     gauges = custom_sensor_residuals(
         segment.experiment,
         segment.experiment.t_s,

@@ -85,7 +85,7 @@ class BodyTask:
             signals[experiment.name] = RecordingSignals.from_trajectory(
                 experiment, trajectory
             )
-        return cls(body, entry, problem, values, signals)
+        return cls(body, entry, problem=problem, values=values, signals=signals)
 
     @property
     def experiments(self) -> list[Experiment]:
@@ -163,7 +163,7 @@ def _parameter_values(
     """
     identified = {each.name: each.value for each in entry.constants}
     values = {}
-    for item in problem.parameters.items:
+    for item in problem.parameters.components:
         value = identified.get(item.name, item.guess if item.is_fixed else None)
         if value is None:
             raise InputError(
@@ -217,7 +217,9 @@ def _mesh(experiment: Experiment) -> TetMesh:
     """Return the mesh of a body; a cube for a material test without a mesh."""
     if experiment.specimen is None:
         return experiment.body.mesh
-    return box_mesh((CELL_SIZE_M,) * 3, CUBE_DIVISIONS, (0.0, 0.0, 0.0))
+    return box_mesh(
+        (CELL_SIZE_M,) * 3, CUBE_DIVISIONS, origin_m=(0.0, 0.0, 0.0)
+    )
 
 
 def _body_content(task: BodyTask) -> dict[str, Any]:

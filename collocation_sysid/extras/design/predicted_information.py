@@ -31,7 +31,6 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array
 from ...errors import InputError, require_among
-from ...fem.laws.constants import is_field_coefficient
 from ...model.parameters import Parameters, ThetaMap
 from ...problem import Problem
 from ...program.collocation import Collocation
@@ -177,12 +176,10 @@ class PredictedErrors:
         covariance = units[:, None] * np.linalg.inv(scaled) * units
         values = dict[str, float]()
         slopes = dict[str, Array]()
-        for item, c, slope in zip(
-            parameters.free, q, np.diag(sizes), strict=True
-        ):
-            if not is_field_coefficient(item.name):
-                values[item.name] = item.from_coordinate(float(c))
-                slopes[item.name] = slope
+        for k in parameters.scalar_coordinates:
+            item = parameters.free[k]
+            values[item.name] = item.from_coordinate(float(q[k]))
+            slopes[item.name] = np.diag(sizes)[k]
         estimated_count = len(values)
         derived = DerivedModuli.from_bodies([constants], q)
         varying = {

@@ -10,7 +10,6 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...fem.body import Body
-from ...fem.laws.constants import is_field_coefficient
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.mesh import TetMesh
 from ...fem.meshes.mesh_checks import edge_lengths, mean_ratios
@@ -362,10 +361,9 @@ def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
             part.full_name("poisson"): poisson,
         }
     constants = zip(body.constants, theta.tolist(), strict=True)
+    coefficients = body.field_coefficient_names
     return moduli | {
-        name: value
-        for name, value in constants
-        if not is_field_coefficient(name)
+        name: value for name, value in constants if name not in coefficients
     }
 
 

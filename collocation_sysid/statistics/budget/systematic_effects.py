@@ -193,7 +193,7 @@ class ExperimentAtAnswer:
             evaluated.force(
                 xi / length_factor,
                 nu / (length_factor * time_factor),
-                undamped,
+                theta=undamped,
                 memory_input=histories,
             )
         )
@@ -577,7 +577,7 @@ def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of a larger Poisson's ratio, per unit, where it is stated (fixed, or tied
     to a fixed one), in all such parts together; None if there is none.
     """
-    items = {item.name: item for item in at.parameters.items}
+    items = {item.name: item for item in at.parameters.components}
     constants = {
         name
         for name, item in items.items()
@@ -806,7 +806,7 @@ def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
         at.dynamics.histories(at.iterate.x)
     ).memory_state
     forces_n = (
-        each.force(xi, nu, at.theta, memory_input=histories)
+        each.force(xi, nu, theta=at.theta, memory_input=histories)
         for each in (body.with_parts(parts), body)
     )
     return Effect(at.pad_rows(next(forces_n) - next(forces_n)))
