@@ -28,6 +28,9 @@ from collocation_sysid.recording import (
 )
 
 YOUNG_PA = 8e4
+SHEAR_MODULUS_PA = 1e5
+# Noise of the specimen's stress: one percent of the largest.
+STRESS_NOISE_PA = 1e3
 SWUNG = {
     "young_pa": 8000.0,
     "poisson": 0.3,
@@ -126,7 +129,29 @@ def benched(
     )
 
 
-KINDS = {"swing": swing, "compression": compression, "tension": tension}
+def specimen(folder: Path) -> None:
+    """A rubber strip pulled to one and a half times its length: stretch and engineering stress."""
+    stretch = np.linspace(1.02, 1.5, 25)
+    # Of an incompressible neo-Hookean material.
+    stress_pa = SHEAR_MODULUS_PA * (stretch - stretch**-2)
+    stress_pa += np.random.default_rng(BENCH_SEED).normal(
+        scale=STRESS_NOISE_PA, size=len(stretch)
+    )
+    rows = [
+        f"{each:.3f},{1e-3 * stress:.4f}"
+        for each, stress in zip(stretch, stress_pa, strict=True)
+    ]
+    write_text_file(
+        folder / "pull.csv", "\n".join(["stretch,stress (kPa)", *rows, ""])
+    )
+
+
+KINDS = {
+    "swing": swing,
+    "compression": compression,
+    "tension": tension,
+    "specimen": specimen,
+}
 
 if __name__ == "__main__":
     for kind, write in KINDS.items():

@@ -34,6 +34,7 @@ class NewProblemKind(StrEnum):
     """Kinds of a new problem's simulated recording."""
 
     COMPRESSION = "compression"
+    SPECIMEN = "specimen"
     TENSION = "tension"
     SWING = "swing"
 

@@ -201,7 +201,7 @@ class Parameter:
         """
         if not value < (limit := constant_named(self.name).below):
             why = (
-                ": an incompressible body has no finite λ"
+                ": an incompressible body has no finite λ; for rubber state 0.499"
                 if without_region(self.name) == "poisson"
                 else ""
             )

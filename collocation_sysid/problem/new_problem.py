@@ -17,6 +17,8 @@ from .editor_schema import (
 
 # A folder for each kind, see scripts/make_templates.py.
 TEMPLATES = Path(__file__).parent / "templates"
+# Comment on settings of a template that are right for its simulated recording only.
+SIMULATED_MARK = "for your own recordings"
 
 
 def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
@@ -31,7 +33,7 @@ def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
         Folder; it is created if necessary. Other files in it remain.
     kind : str, optional
         Name of a folder of `TEMPLATES`, whose simulated recording is written too; None writes only
-        the file, for a swinging body.
+        the file, for a swinging body, without the settings of a simulated recording.
 
     Returns
     -------
@@ -58,6 +60,8 @@ def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
         folder.resolve().name, ensure_ascii=False
     )  # quoted as TOML quotes
     text = (template / file.name).read_text(encoding="utf-8")
+    if kind is None:
+        text = _without_simulated_settings(text)
     text = with_schema_reference(text, url or SCHEMA_FILE)
     write_text_file(file, text.replace('title = ""', f"title = {title}", 1))
     for each in data:
@@ -66,3 +70,12 @@ def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
     for each in schema:
         write_text_file(each, schema_text())
     return [file, *(folder / each.name for each in data), *schema]
+
+
+def _without_simulated_settings(text: str) -> str:
+    """Return a template without the tables that hold only for its simulated recording: those with
+    `SIMULATED_MARK` in a comment.
+    """
+    paragraphs = text.split("\n\n")
+    measured = [each for each in paragraphs if SIMULATED_MARK not in each]
+    return "\n\n".join(measured).rstrip() + "\n"

@@ -96,7 +96,11 @@ def solution_concerns(
         # Zero is a plausible value of a lag or a tool's mass, although it is a bound.
         low = np.where(low == 0, -np.inf, low)
         yield from nuisance_concerns(
-            nuisance.names, part.phi, low=low, high=high
+            nuisance.names,
+            part.phi,
+            low=low,
+            high=high,
+            is_specimen=part.segment.experiment.specimen is not None,
         )
         for camera in range(len(part.segment.experiment.depths)):
             pose = nuisance.indices_of_rows(

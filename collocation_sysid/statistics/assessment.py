@@ -440,6 +440,8 @@ def nuisance_concerns(
     deviations: Iterable[float],
     low: Iterable[float],
     high: Iterable[float],
+    *,
+    is_specimen: bool = False,
 ) -> list[Concern]:
     """Return concerns about nuisance parameters far from their priors or at their limits.
 
@@ -451,6 +453,8 @@ def nuisance_concerns(
         Estimates φ in standard deviations of their priors.
     low, high : iterables of float
         Limits of the estimates, likewise.
+    is_specimen : bool
+        Whether they are those of a specimen, whose page explains them.
 
     Notes
     -----
@@ -468,11 +472,16 @@ def nuisance_concerns(
     for name, phi, lowest, highest in items:
         deviation = abs(float(phi))
         limited = not lowest + 1e-3 < phi < highest - 1e-3
-        concerns += concern_if(limited, True, code="nuisance/limit", name=name)
+        concerns += concern_if(
+            limited,
+            True,
+            code="specimen/limit" if is_specimen else "nuisance/limit",
+            name=name,
+        )
         concerns += concern_if(
             deviation > limit and not limited,
             deviation > ABSURD,
-            code="nuisance/far",
+            code="specimen/far" if is_specimen else "nuisance/far",
             name=name,
             deviations=deviation,
         )

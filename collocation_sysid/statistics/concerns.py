@@ -309,6 +309,18 @@ TOPICS: Mapping[str, Topic] = {
             "their times state: the estimates are corrected for this, but find the cause",
         },
     ),
+    "specimen": Topic(
+        "Unknowns of a material test",
+        "specimen",
+        remedy="Check the table: does the strain begin at zero in the unloaded specimen, are the area "
+        "and the units right, and are the first cycles left out? If the value is possible, widen its "
+        "prior in the [[experiment]], for example strain_zero = 0.02. A law that does not fit the "
+        "material has the same effect: compare-models --materials.",
+        messages={
+            "limit": "{name} ended at the largest value allowed",
+            "far": "{name} is {deviations:.1f} standard deviations of its prior away from zero",
+        },
+    ),
     "scheme": Topic(
         "Step and scheme",
         "scheme",

@@ -44,8 +44,9 @@ from collocation_sysid.cli import (
 from collocation_sysid.common.console import PlainConsole
 from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem.problem_reading import read_problem_file
-from collocation_sysid.problem.schema import ProblemFile
+from collocation_sysid.problem.schema import AssumptionsSection, ProblemFile
 from collocation_sysid.recording import read_markers, read_poses
+from collocation_sysid.recording.environment import usual_air_density
 from collocation_sysid.result import run_record
 from collocation_sysid.result import solve_progress as progress_shown
 from collocation_sysid.result.solve_progress import Heartbeat
@@ -789,6 +790,24 @@ def test_a_new_problem_file_is_valid(tmp_path, monkeypatch, name):
     file, _ = read_problem_file(written)
     assert file.title == Path(name).name
     assert file.experiment[0].grasp_list[0].poses == "poses.csv"
+
+
+def test_a_new_problem_without_a_recording_has_no_settings_of_a_simulated_one(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    run_command("new", "mine")
+    run_command("new", "example", "--kind", "swing")
+    mine, example = (
+        read_problem_file(Path(name) / "problem.toml")[0]
+        for name in ("mine", "example")
+    )
+    assert example.environment.air_density_kg_m3 == "none"
+    assert mine.environment.air_density_kg_m3 == usual_air_density()
+    assert example.uncertainty.assumptions.anisotropy == "none"
+    assert mine.uncertainty.assumptions == AssumptionsSection()
+    assert mine.transcription == example.transcription
+    assert "simulated" not in Path("mine/problem.toml").read_text()
 
 
 def test_a_new_problem_leaves_the_data_that_are_there(tmp_path, monkeypatch):

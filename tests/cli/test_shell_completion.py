@@ -78,7 +78,7 @@ COMPLETERS = {"bash": complete_in_bash, "fish": complete_in_fish}
         ("collocation-sysid solve --method redu", ["reduced-space"]),
         (
             "collocation-sysid new silicone --kind ",
-            ["compression", "swing", "tension"],
+            ["compression", "specimen", "swing", "tension"],
         ),
         ("collocation-sysid explain verd", ["verdict"]),
         ("collocation-sysid export runs/a --to usd", ["usd"]),

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kit.problem_files import run_command
-from make_templates import KINDS, SWUNG, YOUNG_PA
+from make_templates import KINDS, SHEAR_MODULUS_PA, SWUNG, YOUNG_PA
 
 from collocation_sysid import run
 from collocation_sysid.common.display import as_markdown, plain_text
@@ -478,6 +478,7 @@ def test_units_are_what_they_are_defined_as(
         ("compression", {"run_1.csv"}),
         ("tension", {"run_1.csv"}),
         ("swing", {"body.vtu", "poses.csv", "markers.csv"}),
+        ("specimen", {"pull.csv"}),
     ],
 )
 def test_a_new_problem_of_each_kind_runs_as_it_is(
@@ -493,18 +494,21 @@ def test_a_new_problem_of_each_kind_runs_as_it_is(
     }
     assert "collocation-sysid check mine/problem.toml" in begun.err
     assert "collocation-sysid solve mine/problem.toml" in begun.err
+    guess = {"specimen": "mu_pa", "swing": ""}.get(kind, "young_pa")
     guessed = (
         "--set",
-        "parameters.young_pa.guess=3e4"
-        if kind != "swing"
-        else "solver.huber=9.0",
+        f"parameters.{guess}.guess=3e4" if guess else "solver.huber=9.0",
     )
     assert run_command("check", "mine/problem.toml", *guessed).code == 0
     problem = Problem.read("mine/problem.toml", guessed[1:])
     found = run(problem, seek_causes=False)
     assert found.trust.verdict == "good"
-    low, high = found.interval("young_pa")
-    assert low < (SWUNG["young_pa"] if kind == "swing" else YOUNG_PA) < high
+    name, truth = {
+        "swing": ("young_pa", SWUNG["young_pa"]),
+        "specimen": ("mu_pa", SHEAR_MODULUS_PA),
+    }.get(kind, ("young_pa", YOUNG_PA))
+    low, high = found.interval(name)
+    assert low < truth < high
 
 
 @pytest.mark.long

@@ -15,12 +15,13 @@ from kit.problem_files import run_command, settings, write_problem
 from twins import BODIES, NOISE_M, SOFT, twin
 from wrong_twins import FAULTS
 
+import collocation_sysid as cs
 from collocation_sysid import Run, UncertaintyOptions, run
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.common.serialisation import as_json, content, read
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.problem import Problem
-from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.result.run_sections import remedy_command, run_summary
 from collocation_sysid.statistics.assessment import (
     GROSS_MISFIT,
     MISFIT,
@@ -33,7 +34,7 @@ from collocation_sysid.statistics.assessment import (
     scheme_concerns,
 )
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
-from collocation_sysid.statistics.concerns import TOPICS, Concern
+from collocation_sysid.statistics.concerns import TOPICS, Concern, topics_of
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
     Hypothesis,
 )
@@ -173,6 +174,33 @@ def test_gross_residuals_of_single_samples_are_doubtful():
         found = uncertainty_from_fit(fit, PARAMETERS, np.zeros(4))
         assert np.isfinite(found.dependence.lag1)
         assert Assessment.from_concerns(fit_concerns(found)).verdict == verdict
+
+
+def test_the_remedy_of_an_unknown_of_a_specimen_is_on_the_page_of_specimens():
+    (found,) = nuisance_concerns(
+        ["offset of the strain"], [4.0], [-9.0], [9.0], is_specimen=True
+    )
+    assert (found.code, found.grade) == ("specimen/far", "check")
+    (topic,) = topics_of([found]).values()
+    assert topic.page == "specimen"
+    assert "strain_zero" in topic.remedy
+
+
+def test_a_specimen_whose_strain_is_off_is_explained_on_its_page():
+    stretch = np.linspace(1.02, 1.5, 25)
+    stress_pa = 1e5 * (stretch - stretch**-2)
+    pull = cs.Specimen(
+        "uniaxial", stretch - 1 + 0.02, stress_pa, sigma_pa=200.0
+    ).experiment("neo-hookean", "pull")
+    known = {"kappa_pa": 1e9, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    found = cs.run(
+        cs.Problem([pull], {"mu_pa": cs.Unknown(1e5), **known}),
+        seek_causes=False,
+    )
+    assert found.trust.verdict != "good"
+    assert "explain specimen" in plain_text(
+        remedy_command(found.trust.concerns)
+    )
 
 
 def test_nuisance_parameters_far_from_their_prior():
