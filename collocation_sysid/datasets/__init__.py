@@ -13,6 +13,7 @@ problem file and tables, which ``collocation-sysid new NAME --dataset DATASET`` 
 
 from __future__ import annotations
 
+from ..errors import InputError
 from ..fem.laws.materials import Energy, Material
 from ..recording import Experiment, Specimen
 from ..recording.specimen_files import SpecimenLayout, read_specimen
@@ -244,7 +245,8 @@ def _rubber(
     Raises
     ------
     InputError
-        If there is no such table, or the material or test is unknown.
+        If there is no such table, the material or test is unknown, or no sample is within
+        `largest_stretch`.
     """
     file = dataset_file(dataset, f"{name}.csv")
     table = read_specimen(file, SpecimenLayout(test=test, columns={}))
@@ -254,6 +256,11 @@ def _rubber(
         if table.second_strain is None
         else table.strain.clip(min=table.second_strain)
     )
+    if not (1 + largest <= limit).any():
+        raise InputError(
+            f"largest_stretch = {limit:g}; expected at least {1 + largest.min():.4g}, the smallest "
+            f"stretch of '{name}' of {dataset}"
+        )
     exact = {"strain_zero": 0.0, "area_error": 0.0} if is_exact else {}
     specimen = Specimen(
         test,

@@ -571,6 +571,8 @@ class ExperimentSection(NamedSection):
     kind : {"dynamic", "static"}
         A motion ("dynamic"); or samples each of which is an equilibrium of its own ("static"), at
         any times (with memory, quasi-static in time).
+    start : {"equilibrium", "undeformed"}
+        State at the first time: at rest under its loads; or undeformed and at rest.
     start_rule : {"standard", "paper"}
         Inertia of the first step: from the starting velocity, or zero acceleration.
     loaded_since_s : float, optional

@@ -354,9 +354,7 @@ class FilmFigure:
             trajectories=shown,
             top_mm=total - 3 - (head - HEAD_HEIGHT_MM),
         )
-        self._draw_annotations(
-            axes, camera, mm_per_m=view.mm_per_m, height_mm=total
-        )
+        self._draw_annotations(axes, camera, mm_per_m=view.mm_per_m)
         self.cursor = (
             self._draw_errors(
                 compared, width, height_mm=height, figure_height_mm=total
@@ -482,7 +480,6 @@ class FilmFigure:
         axes: Axes,
         camera: ParallelCamera,
         mm_per_m: float,
-        height_mm: float,
     ) -> None:
         """Draw the axis directions, the scale bar and the legend below the body into `axes`.
 
@@ -494,8 +491,6 @@ class FilmFigure:
             View of the body, whose directions are drawn.
         mm_per_m : float
             Scale of the drawing: millimetres in the figure for each metre of the body.
-        height_mm : float
-            Not used.
         """
         draw_directions(axes, camera, origin_mm=(7.0, 4.0))
         draw_scale(axes, mm_per_m, corner_mm=(FILM_WIDTH_MM * 0.17, 4.0))

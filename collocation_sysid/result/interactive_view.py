@@ -298,8 +298,8 @@ class _FrameWindow:
         """Show the frame nearest to a time [s], with measured markers, grasped nodes and obstacles
         of the nearest sample, in place of the last one.
 
-        If no marker is measured, or no node grasped, at that sample, those of the last one stay in
-        the view. Grasped nodes are at their fitted positions, and are not drawn without a fit.
+        Markers without a measurement at that sample are not shown. Grasped nodes are at their
+        fitted positions, and are not drawn without a fit.
         """
         mesh = self.meshes[int(np.abs(self.times - time_s).argmin())]
         sample = int(np.abs(self.replay.t_s - time_s).argmin())
@@ -345,6 +345,8 @@ class _FrameWindow:
                 name="measured",
                 **balls,
             )
+        else:
+            self.plotter.remove_actor("measured", reset_camera=False)
         shapes = self.replay.shapes_m
         grasped = np.flatnonzero(self.replay.is_prescribed[sample])
         if shapes is not None and len(grasped):
@@ -354,3 +356,5 @@ class _FrameWindow:
             self.plotter.add_mesh(
                 nodes, color=BLACK, name="grasped", **{**balls, "point_size": 8}
             )
+        else:
+            self.plotter.remove_actor("grasped", reset_camera=False)

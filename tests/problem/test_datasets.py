@@ -54,6 +54,13 @@ def test_kawabatas_tables_are_those_of_the_publication():
     assert len(small.t_s) < 16
 
 
+def test_a_stretch_below_all_samples_is_refused_with_the_smallest_one():
+    with pytest.raises(
+        cs.InputError, match=r"largest_stretch = 1; expected at least 1\.0"
+    ):
+        cs.datasets.kawabata_1981(largest_stretch=1.0)
+
+
 def test_a_law_fits_kawabatas_small_stretches_well():
     tests = cs.datasets.kawabata_1981("mooney-rivlin", largest_stretch=1.3)
     constants = {

@@ -137,3 +137,8 @@ def test_the_documentation_publishes_the_schema(tmp_path, monkeypatch):
     ) == schema_text()
     configuration = (ROOT / "docs" / "conf.py").read_text()
     assert 'html_extra_path = [f"generated/{PUBLISHED}",' in configuration
+
+
+def test_the_start_of_an_experiment_is_described_for_editors():
+    keys = json.loads(schema_text())["$defs"]["ExperimentSection"]["properties"]
+    assert "at rest under its loads" in keys["start"]["description"]

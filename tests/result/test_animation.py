@@ -10,6 +10,7 @@ from base64 import b64decode
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.common.display import escape
 from collocation_sysid.errors import InputError
-from collocation_sysid.result import animation
+from collocation_sysid.result import animation, interactive_view
 from collocation_sysid.result.animation import (
     FILM_WIDTH_MM,
     FOOT_HEIGHT_MM,
@@ -399,6 +400,33 @@ def test_a_field_can_colour_the_simulated_body(run, tmp_path):
     colouring = Colouring.by_field("ones", values, trajectory="simulated")
     file = write_page(nod, tmp_path / "page.html", colouring=colouring)
     assert "1 ones" in file.read_text(encoding="utf-8")
+
+
+def test_the_view_shows_no_markers_of_an_earlier_sample():
+    """With a plotter that stores its actors by name, in place of VTK's."""
+    shown: dict[str, object] = {}
+    window = object.__new__(interactive_view._FrameWindow)
+    window.times = np.array([0.0, 1.0])
+    window.meshes = ["first", "second"]
+    window.field = "det_f"
+    window.range = (0.0, 1.0)
+    window.pv = SimpleNamespace(PolyData=lambda points: points)
+    window.plotter = SimpleNamespace(
+        add_mesh=lambda mesh, name, **_: shown.update({name: mesh}),
+        remove_actor=lambda name, **_: shown.pop(name, None),
+    )
+    nodes_m = np.zeros((2, 4, 3))
+    window.replay = SimpleNamespace(
+        t_s=window.times,
+        obstacles_m=None,
+        measured_m=np.array([[[0.0, 0.0, 1.0]], [[np.nan] * 3]]),
+        shapes_m=nodes_m,
+        is_prescribed=np.array([[True] * 4, [False] * 4]),
+    )
+    window.show_nearest_frame(0.0)
+    assert {*shown} == {"body", "measured", "grasped"}
+    window.show_nearest_frame(1.0)
+    assert shown == {"body": "second"}
 
 
 @pytest.mark.slow  # starting VTK takes longer than everything else here
