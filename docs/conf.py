@@ -9,6 +9,8 @@ from latex2mathml.converter import convert
 from sphinx.ext.napoleon import NumpyDocstring
 
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+from badges import badges, repository_url
 from reference import PUBLISHED, write_pages
 
 project = "collocation_sysid"
@@ -23,7 +25,12 @@ extensions = [
     "sphinx_gallery.gen_gallery",
 ]
 myst_enable_extensions = ["dollarmath", "amsmath", "substitution"]
-myst_substitutions = {"release": release}
+# Badges of the tutorial's notebooks, empty until pyproject.toml states the repository.
+_pyproject = Path(__file__).parents[1] / "pyproject.toml"
+myst_substitutions = {
+    "release": release,
+    "badges": badges(repository_url(_pyproject.read_text(encoding="utf-8"))),
+}
 myst_heading_anchors = 3
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_build", "gallery"]
