@@ -59,6 +59,7 @@ def key(
     *,
     converter: Callable[[S], T] | None = None,
     read: Callable[[Any], Any] | None = None,
+    metadata: Mapping[str, Any] | None = None,
     **field_options: Any,
 ) -> Any:
     """Return a dataclass field with a converter, which a problem file may state.
@@ -72,13 +73,13 @@ def key(
         if there is one, and otherwise kept as it is.
     read : callable, optional
         Conversion from the value in the file to the field; a `Key` as `form` has its own instead.
+    metadata : mapping, optional
+        Further metadata of the field, such as `time_dependence.over_time()`.
     **field_options
         See `dataclasses.field`.
     """
-    return field(
-        metadata={"converter": converter, "form": form, "read": read},
-        **field_options,
-    )
+    own = {"converter": converter, "form": form, "read": read}
+    return field(metadata={**own, **(metadata or {})}, **field_options)
 
 
 @dataclass_transform(
