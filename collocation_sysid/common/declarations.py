@@ -17,7 +17,7 @@ from typing import Any, TypeVar, dataclass_transform, get_args
 from pydantic import TypeAdapter, ValidationError
 
 from ..errors import InputError, located
-from .validated_types import expected
+from .validated_types import expected, faulty_entry
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -136,12 +136,8 @@ def _converted(field: Field[Any], instance: Any, value: Any) -> Any:
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         called = re.sub("(?<!^)(?=[A-Z])", " ", type(instance).__name__).lower()
-        what = field.name
         word = getattr(instance, "description_name", called)
-        for part in fault["loc"]:
-            if isinstance(value, Mapping) and part in value:
-                what = f"{what}.{part}"
-                value = value[part]
+        what, value = faulty_entry(field.name, value, fault=fault)
         whose = (
             f"the {word} {instance.name!r}"
             if hasattr(instance, "name")
