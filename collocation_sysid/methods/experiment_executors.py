@@ -74,7 +74,7 @@ class ExperimentExecutor(Protocol):
 
 
 class LocalExecutor:
-    """Executor with threads of this process, see `map_experiments`.
+    """Executor with threads of this process, see `ExperimentExecutor`.
 
     Parameters
     ----------
@@ -92,8 +92,15 @@ class LocalExecutor:
     def map_experiments(
         self, run: Callable[..., Any], *columns: Sequence[Any]
     ) -> list[Any]:
-        """Apply a function to every experiment, in parallel threads, and return the results
-        themselves; an exception of the function is raised.
+        """Apply a function to every experiment, in parallel threads, and return its results
+        themselves, in the order of the experiments; an exception of the function is raised.
+
+        Parameters
+        ----------
+        run : callable
+            Function of one entry of each column.
+        columns : sequence
+            Arguments, one entry per experiment each; all must have the same length.
         """
         return map_experiments(
             lambda row: run(*row),
@@ -156,7 +163,15 @@ class DaskExecutor:
         self, run: Callable[..., Any], *columns: Sequence[Any]
     ) -> list[Any]:
         """Apply a function to every experiment on its worker, and return futures of the results at
-        once, see `ExperimentExecutor`; `store_segments` must have been called.
+        once; `store_segments` must have been called. Exceptions of the function are raised by
+        `fetch`.
+
+        Parameters
+        ----------
+        run : callable
+            Function of one entry of each column.
+        columns : sequence
+            Arguments, one entry per experiment each; entries may be futures.
 
         Raises
         ------

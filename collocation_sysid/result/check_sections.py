@@ -226,8 +226,9 @@ def _air_description(density_kg_m3: float) -> str:
 
 
 def _marker_summary(recording: RecordingCheck) -> str:
-    """Return how many markers a recording has, how many samples are missing, the farthest marker,
-    and the other instruments, in words; without markers the instruments alone.
+    """Return how many markers a recording has, how many samples are missing, the marker farthest
+    from the body with its distance [mm], and the other instruments, in words; without markers the
+    instruments alone.
     """
     if not recording.markers:
         besides = "" if recording.test else ", no markers"

@@ -348,13 +348,15 @@ def _write_specimen(
 
 
 def _wrench_layouts(section: ExperimentSection | None) -> list[WrenchSection]:
-    """Return the table layout of each force sensor in order; empty without a problem file."""
+    """Return the table layout of each force sensor, those of grasps before those of obstacles;
+    empty if `section` is None, for a problem without a file.
+    """
     moved = section.moved_sections if section is not None else []
     return [each.wrench for each in moved if each.wrench is not None]
 
 
 def _require_guesses(problem: Problem) -> None:
-    """Raise an InputError if a parameter has no guess."""
+    """Raise an `InputError`, naming the parameter and the remedy, if a parameter has no guess."""
     if names := problem.parameters.names_without_guess:
         key = f"parameters.{names[0]}"
         raise InputError(

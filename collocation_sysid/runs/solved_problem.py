@@ -450,8 +450,8 @@ def _or_nan(value: float | None) -> float:
 
 
 def _estimate_text(estimate: ReportedEstimate) -> str:
-    """Return an estimate as text: the value, " ± " and the standard uncertainty, and the combined
-    interval in brackets, each only if it is known.
+    """Return an estimate as text without its unit: the value, then " ± " and the combined standard
+    uncertainty, and the combined interval in brackets, these two only if they are known.
     """
     error = (
         ""

@@ -248,16 +248,18 @@ class _Recording:
         stress: Array | None,
         limits: tuple[float, float],
     ) -> None:
-        """Write an experiment.
+        """Write the motion of an experiment into the recording: the deforming surface, grasped
+        nodes, markers (measured, fitted, simulated), points of depth cameras, obstacles, residuals
+        and wrenches, each if it exists.
 
         Parameters
         ----------
         replay : MotionRecord
-            It has shapes.
+            Experiment with a fitted or simulated trajectory.
         stress : (T, F) array or None
-            Von Mises stress on the surface [Pa].
+            Von Mises stress on the surface [Pa], which colours it; None for a grey surface.
         limits : (low, high)
-            Ends of the colour scale [Pa].
+            Ends of the colour scale [Pa]; not used without stress.
         """
         name = replay.name
         self.stream.log(self._path(name), self._up_axis(replay.up), static=True)

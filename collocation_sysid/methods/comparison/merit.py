@@ -120,8 +120,8 @@ class PenaltyProblem:
         return convert_variables(z, self.original, target=self.nlp)
 
     def to_original(self, z: Array) -> Array:
-        """Return variables of the given problem from z, with grasped nodes at their prescribed
-        positions.
+        """Return variables of the given problem from the variables z (variables,) of `nlp`, with
+        grasped nodes at their prescribed positions.
 
         Grasped nodes stay where they are if that would invert elements.
         """
@@ -138,8 +138,9 @@ class PenaltyProblem:
         )
 
     def to_original_multipliers(self, multipliers: Array) -> Array:
-        """Return multipliers of the given problem from those of all constraints (constraints,);
-        those of prescribed displacements are left out if the given problem has no such constraints.
+        """Return the multipliers of the given problem from those of all constraints of `nlp`
+        (constraints,); those of prescribed displacements are left out if the given problem has no
+        such constraints.
         """
         pairs = zip(
             self.original.transcriptions, self.nlp.transcriptions, strict=True

@@ -324,7 +324,12 @@ def _first_mode_data(motion: ModesCheck, mode: ModeCheck) -> dict[str, Any]:
 
 
 def mode_notes(motion: ModesCheck) -> list[str]:
-    """Return notes on rigid modes, overdamped modes and the lengthening of the first period."""
+    """Return notes on the modes of a recording; empty if there is nothing to note.
+
+    There may be one on rigid modes, one if the first mode is overdamped at the guess, and one if
+    the scheme lengthens the first period by more than `PERIOD_ERROR`, unless a concern about the
+    grid says more.
+    """
     notes = []
     mode = motion.first_mode
     name = motion.experiment
