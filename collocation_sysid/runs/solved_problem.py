@@ -129,7 +129,7 @@ class SolvedProblem:
 
     @cached_property
     def derived(self) -> dict[str, float]:
-        """Moduli that follow from the parameters at the optimum, by name."""
+        """Moduli that follow from the parameters at the optimum, by name, in SI units."""
         constants = (
             segment.constants
             for segment in self.solution.collocation.transcriptions

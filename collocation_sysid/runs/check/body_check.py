@@ -82,7 +82,9 @@ class Slenderness:
 
 
 def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
-    """Return the `count` elements of lowest quality, worst first; all of them if there are fewer."""
+    """Return the shapes of the `count` elements of lowest quality, worst first; all of them if
+    there are fewer.
+    """
     corners = mesh.points_m[mesh.tetrahedra]
     areas = [_areas(corners[:, face]) for face in _FACES]
     heights = 3 * mesh.volumes_m3 / np.max(areas, axis=0)
@@ -481,7 +483,9 @@ def _check_grasp(
 
 
 def grasp_sentence(grasp_check: GraspCheck) -> str:
-    """Return number, share, bounding box [mm] and axes of the grasped nodes as text."""
+    """Return number and share of the grasped nodes, size and lower corner of their bounding box
+    [mm], and the axes along which they are held unless these are all, as text.
+    """
     size = " × ".join(
         f"{1e3 * (b - a):.4g}"
         for a, b in zip(grasp_check.low_m, grasp_check.high_m, strict=True)

@@ -102,14 +102,14 @@ def derivative_errors(
     """Return the largest relative errors of the first and the second derivatives.
 
     Exact derivatives along a random direction are compared with fourth-order central differences at
-    a disturbed start.
+    a disturbed start; the random numbers are the same in every call.
 
     Parameters
     ----------
     collocation : Collocation
         Program without lifted variables.
     z : (variables,) array
-        Start.
+        Start; not modified.
 
     Returns
     -------
