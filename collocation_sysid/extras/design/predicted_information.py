@@ -638,15 +638,19 @@ class LinearRecording:
 
     def information(self, motion: HandMotion) -> Array:
         """Return the information (nq, nq) of a motion about the shared parameters, to first order
-        in the motion, see `shared_information`. s         course =
-        motion.derivatives(recording.since_start_s)[0] ==>         course =
-        motion.derivatives(recording.since_start_s).value s         # What was simulated is highest
-        at a sample before which a motion from rest is nothing yet. ==>         # The pulses are
-        highest at sample CENTRE; before it a motion from rest is negligible.
+        in the motion, see `shared_information`.
+
+        The coordinates at the first `CENTRE` samples are neglected: a motion from rest is small
+        there.
+
+        Parameters
+        ----------
+        motion : HandMotion
+            Motion with the duration of the recording.
         """
         recording = self.recording
         course = motion.derivatives(recording.since_start_s)[0]
-        # What was simulated is highest at a sample before which a motion from rest is nothing yet.
+        # The pulses are highest at sample CENTRE; before it a motion from rest is negligible.
         of_course = np.fft.rfft(course[CENTRE:], self.length, axis=0)
         transform = np.einsum("fk,kfcp->fcp", of_course, self.responses)
         (rest,) = self.rest.blocks

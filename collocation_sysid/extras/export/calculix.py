@@ -163,8 +163,8 @@ def _step_card(
     t_s: float,
     is_linear: bool,
 ) -> str:
-    """Return one step: prescribed nodes and obstacles at their places at `t_s`, gravity, and node
-    loads.
+    """Return one step: prescribed nodes and obstacles at their places at `t_s`, gravity, and the
+    node loads of the first sample.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def _step_card(
     obstacles : sequence of FacetedObstacle
         The obstacles.
     t_s : float
-        Time of the sample.
+        Time of the sample [s].
     is_linear : bool
         Whether the analysis is geometrically linear.
     """

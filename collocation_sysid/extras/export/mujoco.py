@@ -220,7 +220,7 @@ def _flex_xml(body: IdentifiedBody) -> str:
 
 
 def _mean_edge_m(body: IdentifiedBody) -> float:
-    """Return the mean edge length of the undeformed mesh [m]."""
+    """Return the mean length of the edges between corners of the undeformed tetrahedra [m]."""
     ends = body.body.nodes_m[body.body.mesh.edges]
     return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
 

@@ -280,7 +280,9 @@ def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
 
 
 def method_rows(rows: Sequence[Row]) -> list[Row]:
-    """Return a summary of each method, in the order of their first runs."""
+    """Return a summary of each method, in the order of their first runs, see `_method_summary`;
+    `rows` are those of `run_row`.
+    """
     methods = dict.fromkeys(row["method"] for row in rows)
     return [
         _method_summary(
