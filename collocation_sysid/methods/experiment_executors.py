@@ -377,7 +377,7 @@ def _require_package(client: Any) -> set[str]:
 
 
 def _refusal(message: str) -> InputError:
-    """Return an error that refers to the option --scheduler."""
+    """Return an error with this message that refers to the option --scheduler."""
     return InputError(message, None, where="--scheduler")
 
 
@@ -388,7 +388,9 @@ def _require_workers(threads: dict[str, int]) -> None:
 
 
 def _disconnection(reason: str) -> SearchEnded:
-    """Return the exception that ends the search because the cluster is lost."""
+    """Return the exception that ends the search because the cluster is lost; its message ends with
+    the sentence `reason`.
+    """
     return SearchEnded(
         Status.CLUSTER_DISCONNECTED,
         f"{Status.CLUSTER_DISCONNECTED.sentence} {reason}",

@@ -219,7 +219,9 @@ def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
 
 
 def _air_description(density_kg_m3: float) -> str:
-    """Return how the model contains the surrounding air, of a density of zero in a vacuum."""
+    """Return how the model contains the surrounding air of a density [kg/m³], in words; zero stands
+    for a vacuum.
+    """
     if not density_kg_m3:
         return "none (as in a vacuum)"
     return f"{density_kg_m3:.4g} kg/m³ (buoyancy, added mass and drag)"

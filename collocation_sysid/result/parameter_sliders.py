@@ -364,8 +364,16 @@ class ParameterSliders:
 
 
 def _slider(widgets: Any, name: str, values: SliderRange) -> Any:
-    """Return the slider of a parameter for a range, which reports its value when it is released;
-    `widgets` is the module ipywidgets.
+    """Return the slider of a parameter, which reports its value when it is released.
+
+    Parameters
+    ----------
+    widgets : module
+        The module ipywidgets.
+    name : str
+        Name of the parameter, for the label.
+    values : SliderRange
+        First value, ends and scale.
     """
     common = {
         "description": symbol_with_unit(name),

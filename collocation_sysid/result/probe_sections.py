@@ -131,8 +131,8 @@ def _shown_estimates(result: Result) -> list[str]:
 
 
 def _change_with_ratios(move: EstimateChange | None, value: float) -> str:
-    """Return the change of an estimate with its ratios to the half widths of both intervals; "–"
-    for None.
+    """Return the change of an estimate with its ratios to the half widths of the statistical and of
+    the combined interval, of which unknown ones are left out; "–" for None.
 
     Parameters
     ----------

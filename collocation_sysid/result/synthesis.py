@@ -475,7 +475,9 @@ def _table_names(
 
 
 def _numbered_key(kind: str, index: int) -> str:
-    """Return the key of a file of the grasp with this index, counted from 0: poses, poses_2, …"""
+    """Return the key of a file of a kind, such as "poses", for the grasp with this index from 0:
+    poses, poses_2, …
+    """
     return f"{kind}_{index + 1}" if index else kind
 
 

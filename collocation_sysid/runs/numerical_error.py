@@ -69,15 +69,22 @@ def refine(
     levels: int = 2,
     report_progress: Callable[[str], None] | None = None,
 ) -> A:
-    """Return a converged run with its numerical error; nothing else of the run is changed or
-    computed again.
+    """Return a copy of a converged run with its numerical error; nothing else of the run is changed
+    or computed again.
 
     Parameters
     ----------
     run : SolvedProblem
-        Run that has converged.
-    levels, report_progress
-        See `solve_refined`, which also lists the errors that are raised.
+        Run that has converged; not modified.
+    levels : int
+        Number of discretisations of each kind, see `solve_refined`.
+    report_progress : callable, optional
+        Called with a progress message before each solve.
+
+    Raises
+    ------
+    InputError, KeyboardInterrupt
+        As in `solve_refined`.
     """
     answer = WarmStart.of(run.solution)
     problem = replace(run.problem, substeps=run.solution.collocation.substeps)

@@ -301,7 +301,8 @@ def _depth_notes(solution: Solution) -> Iterator[str]:
 
 def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:
     """Return the reduced-space method with workers that solve its experiments, as a
-    `functools.partial` of it; any other method, and any without workers, is returned unchanged.
+    `functools.partial` of it; any other method, and any method if `workers` is None, is returned
+    unchanged.
     """
     if workers is None or not isinstance(solver, ReducedSpace):
         return solver

@@ -548,8 +548,8 @@ class FutureRecording:
 
 
 def _resampled(wrench: Wrench | None, t_s: Array) -> Wrench | None:
-    """Return the sensor with its own rate over the duration of t_s, with zeros as values, NaN for
-    components that it does not measure; None for None.
+    """Return a copy of a sensor with its own rate over the duration of the times `t_s` (T,) [s],
+    with zeros as values and NaN for components that it does not measure; None if `wrench` is None.
     """
     if wrench is None:
         return None

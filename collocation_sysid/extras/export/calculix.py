@@ -54,7 +54,9 @@ FOAM_LIMITATION = (
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the input deck with what CalculiX cannot express; damping is not exported."""
+    """Return the input deck, with one step for each sample of a static recording and else for the
+    first sample alone, and what CalculiX cannot express; damping is not exported.
+    """
     static = body.experiment.is_static
     limits = replace(
         CAPABILITIES, has_moving_grasps=static, has_moving_obstacles=static

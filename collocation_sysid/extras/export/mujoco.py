@@ -160,7 +160,9 @@ def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
 
 
 def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
-    """Return position (3,) [m] and quaternion (w, x, y, z) of a grasp or obstacle at a time."""
+    """Return position (3,) [m] and quaternion (w, x, y, z) of a grasp or obstacle at a time `t_s`
+    [s].
+    """
     rotations, positions = grasp.poses.at([t_s])
     return positions[0], np.roll(
         Rotation.from_matrix(rotations[0]).as_quat(), 1

@@ -690,8 +690,8 @@ def _column_cell(name: str) -> Cell:
 
 
 def _estimate_cell(name: str) -> Cell:
-    """Return the cell of an estimate, with its combined standard error if that is known; "–"
-    without an estimate.
+    """Return the cell of the estimate of the parameter `name`, with its combined standard error if
+    that is known; "–" without an estimate.
     """
 
     def cell(row: Row) -> str:

@@ -173,8 +173,8 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
 
 
 def _infinities_as_nan(markers_m: Array | None) -> Array | None:
-    """Return markers with NaN in place of infinities, where a method or simulation diverged; None
-    for None.
+    """Return a copy of markers (T, M, 3) with NaN in place of infinities, where a method or
+    simulation diverged; None for None.
     """
     return (
         None

@@ -331,7 +331,7 @@ def _rest_shape(body: Body) -> str | None:
 
 def _rest_shape_change_m(body: Body, theta: Array) -> float:
     """Return the largest distance of the mesh of a body from its stress-free shape [m]: 0 if the
-    mesh is that shape, NaN if none can be computed at the constants θ (k,).
+    mesh is that shape, NaN if none can be computed at the constants `theta` (k,).
     """
     if body.inverse_equilibrium is None:
         return 0.0
@@ -353,8 +353,9 @@ def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
 
 
 def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
-    """Return E and ν at small strain of each part, then the constants θ of the body without
-    coefficients of fields, by name with the region; stated moduli replace computed ones.
+    """Return E [Pa] and ν at small strain of each part, then the constants of the body without
+    coefficients of fields, by name with the region; stated moduli replace computed ones. `theta`
+    (k,) are the constants.
     """
     moduli = {}
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):

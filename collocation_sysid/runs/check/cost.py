@@ -80,7 +80,9 @@ def require_memory(
 
 
 def interior_point_mb(entries: int) -> float:
-    """Return the memory of IPOPT [MB] for so many nonzeros of Jacobian and Hessian."""
+    """Return the memory of IPOPT [MB] for a number `entries` of nonzeros of Jacobian and Hessian
+    together.
+    """
     return BYTES_PER_NONZERO * entries / 1e6
 
 

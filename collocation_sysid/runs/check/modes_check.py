@@ -259,8 +259,10 @@ def _damping_limit(mode: ModeCheck) -> float:
 
 
 def mode_concerns(motion: ModesCheck) -> list[Concern]:
-    """Return concerns about too few steps or samples per period of the first mode, or a recording
-    shorter than its period; none without a mode.
+    """Return concerns about the time grid and the recording at the first mode; none without a mode.
+
+    There is at most one about the grid (numerical damping, or too few steps per period), one if the
+    period has too few samples, and one if the recording is shorter than the period.
     """
     mode = motion.first_mode
     if mode is None:
