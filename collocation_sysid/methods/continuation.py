@@ -172,13 +172,20 @@ def first_share(collocation: Collocation, share: float) -> Collocation:
 class _ContinuationState:
     """State between the parts: known positions, the last solution, and counts.
 
+    Parameters
+    ----------
+    method : Method
+        Method that solves each part.
+    recorder : Recorder
+        Record of the whole solve, with the complete problem.
+
     Attributes
     ----------
     known : tuple or None
-        Parameters p and positions of each experiment as far as they were solved; None before the
-        first part.
+        Parameters p and positions of each experiment [m] as far as they were solved; None before
+        the first part.
     last : Solution or None
-        Solution of the last part.
+        Solution of the last part; None before the first part.
     iterations, evaluations : int
         Sums over all parts.
     """

@@ -462,7 +462,7 @@ class _PenaltySolve:
 
         def report(z: Array, value: float, projected: Array) -> None:
             """Store an iterate z with its projected gradient, add it to the history now and then,
-            and check the limits; its merit `value` is not used.
+            and raise `SearchEnded` if a limit is reached; its merit `value` is not used.
             """
             nonlocal done
             self.variables = z
