@@ -50,7 +50,9 @@ from .verdict import depth_errors
 
 
 def build_result(answer: SolvedProblem) -> Result:
-    """Return the content of ``result.json`` for an answer."""
+    """Return the content of ``result.json`` for an answer, which is not modified; properties of the
+    answer that are not known yet, such as the natural modes, are computed.
+    """
     solution = answer.solution
     problem = answer.problem
     collocation = solution.collocation
@@ -224,7 +226,8 @@ def _recordings_agreement(
     answer: SolvedProblem,
 ) -> dict[str, RecordingsAgreement] | None:
     """Return the estimates from single recordings, to first order, and their agreement, by
-    scalar parameter; None if this was not evaluated.
+    scalar parameter; None if this was not evaluated. Values are NaN for recordings that do not
+    determine the parameter.
     """
     if (
         answer.uncertainty is None
@@ -356,7 +359,9 @@ def _sensor_units(experiment: Experiment) -> dict[str, str] | None:
 def _forward_result(
     answer: SolvedProblem, experiment: Experiment
 ) -> SimulatedExperiment:
-    """Return the errors of the forward simulation of an experiment, or the reason why it failed."""
+    """Return the errors of the forward simulation of an experiment; if it failed, only the reason
+    and whether the experiment was fitted.
+    """
     fitted = experiment.name in answer.solution.rms_by_experiment_m
     simulated = answer.rollouts[experiment.name]
     if not isinstance(simulated, ForwardSimulation):
