@@ -107,8 +107,8 @@ class EliminatedDofs:
         return cls(
             transcription,
             transcription.offsets.position + dofs,
-            transcription.offsets.row + rows,
-            phi,
+            rows=transcription.offsets.row + rows,
+            phi=phi,
         )
 
     def evaluate(self, phi: Array) -> tuple[Array, Array]:
@@ -243,7 +243,10 @@ class CondensedPattern:
         )
         places = [np.searchsorted(unique_codes, each) for each in codes]
         return cls(
-            (indptr, unique_codes % shape[0]), remaining, places, eliminated
+            (indptr, unique_codes % shape[0]),
+            remaining,
+            targets=places,
+            eliminated=eliminated,
         )
 
 

@@ -250,7 +250,7 @@ class _ContinuationState:
         self.evaluations += solution.evaluations
         spent = solution.timing
         self.recorder.stopwatch.add(
-            spent.build, spent.evaluations, spent.linear_algebra
+            spent.build, spent.evaluations, linear_algebra=spent.linear_algebra
         )
         values = ", ".join(
             f"{name} = {value:.4g}"

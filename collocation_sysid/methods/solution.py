@@ -150,7 +150,12 @@ class Timing:
             `time.perf_counter()` at the start of the solve [s], for the total.
         """
         total = time.perf_counter() - start_s
-        return cls(watch.build, watch.evaluations, watch.linear_algebra, total)
+        return cls(
+            watch.build,
+            watch.evaluations,
+            linear_algebra=watch.linear_algebra,
+            total=total,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,7 +66,12 @@ class FitSummary:
             Largest residual of the equations of motion [N], as the caller knows it.
         """
         squares = iterate.segment.markers.squared_distances_m2(x, iterate.phi)
-        return cls(len(x), violation_n, float(squares.sum()), len(squares))
+        return cls(
+            len(x),
+            violation_n,
+            squares_m2=float(squares.sum()),
+            samples=len(squares),
+        )
 
 
 @dataclass(frozen=True, eq=False)

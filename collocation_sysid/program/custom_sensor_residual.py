@@ -209,7 +209,7 @@ class CustomSensorResidual(MeasurementResidual):
         unknowns = ca.vertsplit(
             phi * self.nuisance.scales[self.own_parameters[0]][:, None]
         )
-        predicted = self.sensor.read(t_s, at, unknowns)
+        predicted = self.sensor.read(t_s, at, unknowns=unknowns)
         return ca.vertcat(
             predicted, ca.SX.zeros(self.measured.shape[2] - predicted.numel())
         )
@@ -290,7 +290,7 @@ def custom_sensor_residuals(
     models = []
     for number, gauge in enumerate(experiment.readings):
         if gauge.grasp is None:
-            channel = observed_points(experiment, gauge, len(t_s))
+            channel = observed_points(experiment, gauge, rows=len(t_s))
             at_s = t_s
         else:
             grasp = experiment.grasps[gauge.grasp - 1]

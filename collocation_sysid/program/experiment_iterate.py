@@ -193,11 +193,15 @@ class ExperimentIterate:
         `linearisation_buffer`, hence valid until the segment linearises again.
         """
         rows = self.segment.linearisation_buffer
-        return self.equations.dynamics.linearise(self.x, rows, self.histories)
+        return self.equations.dynamics.linearise(
+            self.x, rows, histories=self.histories
+        )
 
     @property
     def residual_n(self) -> Array:
         """Residuals of the equations of motion (N, free dofs) [N],
         see `Transcription.residual_n`.
         """
-        return self.segment.residual_n(self.x, self.equations, self.histories)
+        return self.segment.residual_n(
+            self.x, self.equations, histories=self.histories
+        )

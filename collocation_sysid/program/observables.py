@@ -224,7 +224,7 @@ class PointPositions:
                 (len(self.rows), 0, 3, self.coordinate_parameters.shape[1])
             )
         return self._interpolate(
-            x, nodes[estimated], functions.gradients[estimated]
+            x, nodes[estimated], weights=functions.gradients[estimated]
         )
 
     def evaluate(self, motion: ObservedMotion, phi: Array) -> Array:
@@ -238,7 +238,7 @@ class PointPositions:
         rows that x (rows, 3n) [m] contains.
         """
         nodes, shape = self.shape_functions(phi)
-        return self._interpolate(x, nodes, shape.weights)
+        return self._interpolate(x, nodes, weights=shape.weights)
 
     def linearise(
         self, motion: ObservedMotion, phi: Array, columns: Index, size: int
@@ -467,7 +467,7 @@ class PointPositions:
         value = np.einsum("tmi,mak->tmaik", weights, shape.gradients[estimated])
         rows, columns = np.broadcast_arrays(row, column[:, None, None])
         by_coordinates = self._interpolate(
-            x, nodes[estimated], shape.hessians[estimated]
+            x, nodes[estimated], weights=shape.hessians[estimated]
         )
         by_coordinates = np.einsum("tmi,tmikl->mkl", weights, by_coordinates)
         upper = np.nonzero(

@@ -285,7 +285,7 @@ class Observation:
         motions = self.linearised_motions(x, response, step=step)
         for reading, motion in zip(segment.residuals, motions, strict=True):
             values_and_slopes = reading.observable.linearise(
-                motion, self.phi, segment.dynamic_parameters, size
+                motion, self.phi, columns=segment.dynamic_parameters, size=size
             )
             linearisations.append(
                 reading.linearise(*values_and_slopes, self.phi, size)
@@ -320,7 +320,7 @@ class Observation:
             motion = ObservedMotion(x, reactions)
             count = len(self.phi)
             values_and_slopes = reading.observable.linearise(
-                motion, self.phi, none, count
+                motion, self.phi, columns=none, size=count
             )
             linearised.append(
                 reading.linearise(*values_and_slopes, self.phi, count)

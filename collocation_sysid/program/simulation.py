@@ -315,7 +315,7 @@ def _with_steps(
         )
     else:
         dynamics = Dynamics.from_experiment(
-            experiment, integrator, steps
+            experiment, integrator, substeps=steps
         ).with_theta(theta)
         grid = simulate_scheme(
             experiment, dynamics, options=options, progress=progress

@@ -215,7 +215,7 @@ class PrescribedColumns:
         p = step.row.p[0]
         q = step.row.q[0]
         force = np.zeros((len(sweep.free), self.column_count))
-        skew = step.row.skew(0, step.skew, step.rate_skew)
+        skew = step.row.skew(0, step.skew, by_velocity_skew=step.rate_skew)
         matrix = sweep.prescribed_block.extract(
             p * step.by_position + q * step.by_velocity, skew
         )
@@ -380,7 +380,7 @@ class Sweep:
         self.free = transcription.free_dofs
         self.sensed = transcription.sensed_dofs
         self.factoriser = Factoriser.cached(
-            self.pattern, self.free, factorisation
+            self.pattern, self.free, choice=factorisation
         )
         self.matrix = Submatrix(self.pattern, self.free)
         self.prescribed_block = Submatrix(
@@ -430,7 +430,7 @@ class Sweep:
         sweep_columns = SweepColumns.by_parameters(self, equations, x=x)
         columns = np.zeros((*x.shape, sweep_columns.count))
         grasp_forces = GraspForces.zeros(
-            len(x), len(self.sensed), sweep_columns.count
+            len(x), len(self.sensed), columns=sweep_columns.count
         )
         march = ForwardSubstitution(
             self,
@@ -1028,7 +1028,10 @@ class ForwardSubstitution:
             block = row.p[i] * step.by_position
             block += row.q[i] * step.by_velocity
             return (
-                matrix.extract(block, row.skew(i, step.skew, step.rate_skew))
+                matrix.extract(
+                    block,
+                    row.skew(i, step.skew, by_velocity_skew=step.rate_skew),
+                )
                 @ self.past[i - 1]
             )
         past = weighted_sum_of_past(row.q, self.past, shape=self.shape)

@@ -151,7 +151,7 @@ class DepthProjection:
         distances_m : (P,)
             Distance behind the surface; NaN for points that do not count.
         """
-        world = self.view.to_world(self.phi, points_m, rays, sample)
+        world = self.view.to_world(self.phi, points_m, rays=rays, image=sample)
         t_s = np.full(len(points_m), self.view.depth.sample_times_s[sample])
         return np.column_stack(
             [t_s, self.image_points(points_m, world), distances_m, world]

@@ -167,7 +167,7 @@ def write_data(
         simulate(
             experiment,
             problem.parameters,
-            recipe.integrator,
+            integrator=recipe.integrator,
             timestep_s=recipe.timestep_s,
             # The grid of the problem is that of schemes; Newmark's step is stated in the recipe.
             substeps="auto"

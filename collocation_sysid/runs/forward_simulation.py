@@ -278,7 +278,7 @@ def _simulate(
     return simulate(
         with_contact_energy(segment.corrected_experiment(phi)),
         segment.body.theta_from_values(parameters),
-        integrator,
+        integrator=integrator,
         timestep_s=_step_s(problem, segment),
         substeps=segment.substeps,
         progress=report,

@@ -76,7 +76,7 @@ class BenchmarkContent:
             for body in bodies
             for recording in _read_recordings(folder, body)
         )
-        return cls(folder, bodies, recordings)
+        return cls(folder, bodies, recordings=recordings)
 
 
 def _unchanged(folder: Path, name: str) -> Path:
@@ -124,13 +124,13 @@ def _read_signals(
     measured = Signal(
         recording["quantity"],
         recording["key"],
-        tables["measured"][:, 0],
-        tuple(recording["columns"]),
-        tables["measured"][:, 1:],
+        keys=tables["measured"][:, 0],
+        columns=tuple(recording["columns"]),
+        values=tables["measured"][:, 1:],
     )
     return RecordingSignals(
         measured,
         np.array(recording["sigma"], dtype=np.float64),
-        measured.with_values(tables["simulated"][:, 1:]),
-        measured.with_values(tables["undeformed"][:, 1:]),
+        simulated=measured.with_values(tables["simulated"][:, 1:]),
+        undeformed=measured.with_values(tables["undeformed"][:, 1:]),
     )

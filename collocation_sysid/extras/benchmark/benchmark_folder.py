@@ -85,7 +85,7 @@ class BodyTask:
             signals[experiment.name] = RecordingSignals.from_trajectory(
                 experiment, trajectory
             )
-        return cls(body, entry, problem, values, signals)
+        return cls(body, entry, problem=problem, values=values, signals=signals)
 
     @property
     def experiments(self) -> list[Experiment]:
@@ -217,7 +217,9 @@ def _mesh(experiment: Experiment) -> TetMesh:
     """Return the mesh of a body; a cube for a material test without a mesh."""
     if experiment.specimen is None:
         return experiment.body.mesh
-    return box_mesh((CELL_SIZE_M,) * 3, CUBE_DIVISIONS, (0.0, 0.0, 0.0))
+    return box_mesh(
+        (CELL_SIZE_M,) * 3, CUBE_DIVISIONS, origin_m=(0.0, 0.0, 0.0)
+    )
 
 
 def _body_content(task: BodyTask) -> dict[str, Any]:

@@ -95,7 +95,7 @@ def score_benchmark(folder: str | Path, body: str | None = None) -> list[Score]:
     content = BenchmarkContent.read(Path(folder))
     names = content.bodies
     if body is not None:
-        require_among(body, names, content.folder, where="--body")
+        require_among(body, names, source=content.folder, where="--body")
         names = (body,)
     recordings = [each for each in content.recordings if each.body in names]
     files = _prediction_files(content.folder, recordings)

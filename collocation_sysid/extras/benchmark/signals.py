@@ -113,9 +113,11 @@ def _marker_signals(
     measured = Signal(
         "markers",
         TIME_KEY,
-        experiment.t_s,
-        tuple(f"{name}_{axis}" for name in markers.names for axis in AXES),
-        present_m.reshape(count, -1),
+        keys=experiment.t_s,
+        columns=tuple(
+            f"{name}_{axis}" for name in markers.names for axis in AXES
+        ),
+        values=present_m.reshape(count, -1),
     )
     rigid_m = markers.predict_positions(
         experiment.rigid_positions(experiment.t_s)
@@ -123,8 +125,8 @@ def _marker_signals(
     return RecordingSignals(
         measured,
         np.repeat(markers.sigma_m, len(AXES)),
-        measured.with_values(trajectory.markers_m.reshape(count, -1)),
-        measured.with_values(rigid_m.reshape(count, -1)),
+        simulated=measured.with_values(trajectory.markers_m.reshape(count, -1)),
+        undeformed=measured.with_values(rigid_m.reshape(count, -1)),
     )
 
 
@@ -140,15 +142,19 @@ def _stress_signals(
     measured = Signal(
         "stresses",
         SAMPLE_KEY,
-        np.arange(1.0, len(experiment.t_s) + 1),
-        names[: len(sensors)],
-        np.column_stack([sensor.measured_values[:, 0] for sensor in sensors]),
+        keys=np.arange(1.0, len(experiment.t_s) + 1),
+        columns=names[: len(sensors)],
+        values=np.column_stack(
+            [sensor.measured_values[:, 0] for sensor in sensors]
+        ),
     )
     return RecordingSignals(
         measured,
         np.array([np.ravel(sensor.sigma)[0] for sensor in sensors]),
-        measured.with_values(np.column_stack([v[:, 0] for v in simulated])),
-        measured.with_values(np.zeros(measured.values.shape)),
+        simulated=measured.with_values(
+            np.column_stack([v[:, 0] for v in simulated])
+        ),
+        undeformed=measured.with_values(np.zeros(measured.values.shape)),
     )
 
 

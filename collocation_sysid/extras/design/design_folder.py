@@ -211,7 +211,7 @@ def _gripper_poses(design: Design) -> PoseSequence:
     """
     recording = design.recording
     (body_in_gripper,) = gripper_transforms(
-        recording.problem, recording.template.name, [0]
+        recording.problem, recording.template.name, grasps=[0]
     )
     if body_in_gripper is None:
         return design.poses

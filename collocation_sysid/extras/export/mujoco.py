@@ -254,7 +254,7 @@ def _stable_step_s(body: IdentifiedBody) -> float:
     the undeformed body without grasps, with the largest γ_r of all regions.
     """
     state = body.body.nodes_m.reshape(1, -1)
-    at = body.body.linearise(state, np.zeros_like(state), body.theta)
+    at = body.body.linearise(state, np.zeros_like(state), theta=body.theta)
     stiffness = body.body.pattern.matrix(-at.by_position[0])
     root = 1 / np.sqrt(np.repeat(body.node_mass_kg, 3))
     scaled = sp.diags_array(root) @ stiffness @ sp.diags_array(root)

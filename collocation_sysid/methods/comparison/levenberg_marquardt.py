@@ -174,10 +174,10 @@ class _MeritPoint:
         return cls(
             z,
             merit.value_from_constraints(z, rows),
-            rows,
-            jacobian,
-            gradient,
-            projected,
+            rows=rows,
+            jacobian=jacobian,
+            gradient=gradient,
+            projected=projected,
         )
 
     @property

@@ -151,7 +151,10 @@ class LiftedReactions(LiftedVariables):
         first = setting.dynamics.first_row
         by_x = np.empty(motion.structure.nnz)
         motion.fill(
-            by_x, iterate.forces, dynamics, setting.mass_depends_on_parameters
+            by_x,
+            iterate.forces,
+            dynamics=dynamics,
+            has_variable_mass=setting.mass_depends_on_parameters,
         )
         by_p = np.zeros(
             (

@@ -266,7 +266,11 @@ def wrench_residuals(
             nuisance=nuisance,
             number=number,
         )
-        models.append(WrenchResidual.from_sensor(channel, wrench, label, huber))
+        models.append(
+            WrenchResidual.from_sensor(
+                channel, wrench, label=label, huber=huber
+            )
+        )
     return tuple(models)
 
 

@@ -150,7 +150,7 @@ def derivative_errors(
             collocation.gradient(at) + collocation.jacobian(at).T @ multipliers
         )
 
-    hessian = collocation.hessian(point, 1.0, multipliers)
+    hessian = collocation.hessian(point, 1.0, multipliers=multipliers)
     slope = collocation.jacobian(point) @ direction
     first = _deviation(
         collocation.constraint_values,

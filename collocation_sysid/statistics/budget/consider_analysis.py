@@ -383,7 +383,7 @@ def propagate_columns(
     for reading, motion in zip(segment.residuals, motions, strict=True):
         motion = _without_row_changes(motion, inertia_n)
         values, slopes = reading.observable.linearise(
-            motion, phi, columns_numbered, size
+            motion, phi, columns=columns_numbered, size=size
         )
         yield ColumnResponse(
             reading,

@@ -192,7 +192,7 @@ class ExperimentAtAnswer:
             evaluated.force(
                 xi / length_factor,
                 nu / (length_factor * time_factor),
-                undamped,
+                theta=undamped,
                 memory_input=histories,
             )
         )
@@ -793,7 +793,7 @@ def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
         at.dynamics.histories(at.iterate.x)
     ).memory_state
     forces_n = (
-        each.force(xi, nu, at.theta, memory_input=histories)
+        each.force(xi, nu, theta=at.theta, memory_input=histories)
         for each in (body.with_parts(parts), body)
     )
     return Effect(at.pad_rows(next(forces_n) - next(forces_n)))

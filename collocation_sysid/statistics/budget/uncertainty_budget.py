@@ -380,8 +380,8 @@ def _line(
     combined = combine(
         name,
         estimate,
-        error,
-        systematic,
+        error=error,
+        systematic=systematic,
         known_effect=known_effect,
         linear=linear,
         bounds=bounds,
