@@ -20,8 +20,8 @@ import numpy as np
 from collocation_sysid import pipeline
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.pipeline import Run
 from collocation_sysid.problem import Problem
-from collocation_sysid.runs.solved_problem import Run
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
 # Problems whose data are in the repository and that interior point solves within minutes.
