@@ -577,7 +577,7 @@ class ReducedSearch:
         trajectories, and replace the collocation of the search and the horizon, in place.
 
         Nothing happens after the first time, unless the trajectories were then too short for the
-        cameras; nor if all positions are known.
+        cameras; nor if all positions are known or there are no trajectories.
 
         Parameters
         ----------

@@ -129,7 +129,7 @@ class SolvedProblem:
 
     @cached_property
     def derived(self) -> dict[str, float]:
-        """Moduli that follow from the parameters at the optimum, by name."""
+        """Moduli that follow from the parameters at the optimum, by name, in SI units."""
         constants = (
             segment.constants
             for segment in self.solution.collocation.transcriptions
@@ -453,8 +453,8 @@ def _or_nan(value: float | None) -> float:
 
 
 def _estimate_text(estimate: ReportedEstimate) -> str:
-    """Return an estimate as text: the value, " ± " and the standard uncertainty, and the combined
-    interval in brackets, each only if it is known.
+    """Return an estimate as text without its unit: the value, then " ± " and the combined standard
+    uncertainty, and the combined interval in brackets, these two only if they are known.
     """
     error = (
         ""

@@ -545,8 +545,8 @@ class FutureRecording:
 
 
 def _resampled(wrench: Wrench | None, t_s: Array) -> Wrench | None:
-    """Return the sensor with its own rate over the duration of t_s, with zeros as values, NaN for
-    components that it does not measure; None for None.
+    """Return a copy of a sensor with its own rate over the duration of the times `t_s` (T,) [s],
+    with zeros as values and NaN for components that it does not measure; None if `wrench` is None.
     """
     if wrench is None:
         return None
@@ -635,15 +635,19 @@ class LinearRecording:
 
     def information(self, motion: HandMotion) -> Array:
         """Return the information (nq, nq) of a motion about the shared parameters, to first order
-        in the motion, see `shared_information`. s         course =
-        motion.derivatives(recording.since_start_s)[0] ==>         course =
-        motion.derivatives(recording.since_start_s).value s         # What was simulated is highest
-        at a sample before which a motion from rest is nothing yet. ==>         # The pulses are
-        highest at sample CENTRE; before it a motion from rest is negligible.
+        in the motion, see `shared_information`.
+
+        The coordinates at the first `CENTRE` samples are neglected: a motion from rest is small
+        there.
+
+        Parameters
+        ----------
+        motion : HandMotion
+            Motion with the duration of the recording.
         """
         recording = self.recording
         course = motion.derivatives(recording.since_start_s)[0]
-        # What was simulated is highest at a sample before which a motion from rest is nothing yet.
+        # The pulses are highest at sample CENTRE; before it a motion from rest is negligible.
         of_course = np.fft.rfft(course[CENTRE:], self.length, axis=0)
         transform = np.einsum("fk,kfcp->fcp", of_course, self.responses)
         (rest,) = self.rest.blocks

@@ -38,8 +38,8 @@ def slip_displacements_m(
     """Return the displacements (N, g) [m] of the g prescribed dofs if faces that stick to platens
     slide freely; zero for dofs that remain held.
 
-    Material memory is neglected: the displacements are those of the relaxed material. Contact with
-    obstacles and other loads are neglected, too.
+    Material memory is neglected: the displacements are those of the relaxed material, and so are
+    other loads than the grasps.
 
     Parameters
     ----------
@@ -53,12 +53,13 @@ def slip_displacements_m(
     Returns
     -------
     (N, g) array or None
-        None if no face may slide (see `sliding_faces`), or the linearised equations are singular.
+        None if no face may slide (see `sliding_faces`), if obstacles touch the body, whose contact
+        stiffness these equations lack, or if the linearised equations are singular.
     """
     experiment = iterate.segment.experiment
     prescribed = iterate.equations.prescribed
     axis = pressed_axis(prescribed.dofs, prescribed.positions_m)
-    if axis is None or not is_load_only(experiment):
+    if axis is None or experiment.obstacles or not is_load_only(experiment):
         return None
     faces = sliding_faces(
         experiment, prescribed.dofs, reactions_n=reactions_n, axis=axis
