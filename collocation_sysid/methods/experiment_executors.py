@@ -261,8 +261,10 @@ class DaskExecutor:
         )
 
     def _send_segment(self, transcription: Transcription, home: str) -> Any:
-        """Return the future of a transcription on a worker, at the address `home`; its experiment
-        and body are sent before it, unless they have been.
+        """Return the future of a transcription on a worker, at the address `home`.
+
+        Its experiment and body are sent before it. Each object is sent only once: a further call
+        with the same transcription returns the same future. Dask's exceptions pass.
         """
 
         def send_once(value: T, make: Callable[[T], Any]) -> Any:

@@ -41,7 +41,9 @@ from .solve_recorder import Recorder
 
 
 def _require_ipopt_value(value: Any) -> Any:
-    """Return an IPOPT option if it is text or a number; raise `ValueError` otherwise."""
+    """Return an IPOPT option if it is text or a number; raise `ValueError` otherwise, also for a
+    boolean, since IPOPT's switches are "yes" and "no".
+    """
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise ValueError(
             f"found {str(value).lower()}; expected text or a number as in IPOPT's manual; its "

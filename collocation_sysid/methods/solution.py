@@ -307,7 +307,8 @@ class Solution:
         Raises
         ------
         InputError
-            If none, or several with different values, are called so.
+            If none or several are called so, even if their values are equal, as "time shift" if two
+            recordings have one: then add the experiment.
         """
         estimates: dict[str, float] = {}
         known: list[str] = []

@@ -56,7 +56,8 @@ class FitSummary:
     def from_iterate(
         cls, iterate: ExperimentIterate, x: Array, violation_n: float
     ) -> FitSummary:
-        """Return the fit of positions x (rows, 3n) [m] at the parameters of an experiment.
+        """Return the fit of positions x (rows, 3n) [m] to the markers at the parameters of an
+        experiment; other measurements do not count.
 
         Parameters
         ----------

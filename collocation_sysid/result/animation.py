@@ -221,7 +221,8 @@ def experiment_named(
 def film_samples(t_s: Array, fps: float, slowdown: float) -> NDArray[np.int64]:
     """Return the indices (k,) of the samples to show in a film's frames.
 
-    The samples are taken as evenly spaced; the last frame shows the last sample or one before it.
+    The samples are taken as evenly spaced, and may be skipped or repeated. The last frame shows the
+    last sample, or an earlier one by at most half the time between frames.
 
     Parameters
     ----------

@@ -190,7 +190,7 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
             is_own(run, file) for _, file in (*frames, (0.0, listing))
         ):
             raise ValueError(
-                "it lists no frames, or frames that are not in the folder"
+                "it lists no frames, or frames that are missing or outside the run folder"
             )
         return frames
 

@@ -216,8 +216,9 @@ def _most_important_assumption(result: Result) -> Iterator[str]:
     """Yield a sentence on the most important assumption that the data do not determine, if there is
     one.
 
-    The most important assumption contributes most to the variance of the first stiffness that has a
-    budget.
+    The data do not determine an assumption if a probe estimated it without a significant result.
+    Of these assumptions the sentence names the one with the largest share in the budget of the
+    first parameter whose budget contains any, stiffnesses before other parameters.
     """
     significant = {
         name.partition(" ")[0] for p in result.probes for name in p.sentences

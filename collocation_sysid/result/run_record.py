@@ -315,7 +315,9 @@ def _surface_contact(
     """Return gap [m] and contact pressure [Pa] on the boundary triangles at the estimates, (T, F)
     each; None without obstacles.
 
-    Poses are corrected by the nuisance parameters if the experiment was fitted.
+    With several obstacles the gap is the smallest, and pressures are added. Where no obstacle may
+    touch a triangle the gap is NaN and the pressure zero. Poses are corrected by the nuisance
+    parameters if the experiment was fitted.
 
     Parameters
     ----------

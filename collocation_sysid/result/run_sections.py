@@ -218,7 +218,8 @@ def _outcome_section(result: Result) -> TitledParts:
 def verdict_section(
     trust: Assessment, linked: bool = False, max_reasons: int | None = None
 ) -> TitledParts:
-    """Return the verdict in one word, with its reasons.
+    """Return the verdict in one word as the first line, with a line for each reason; the title is
+    empty.
 
     Parameters
     ----------
@@ -227,7 +228,8 @@ def verdict_section(
     linked : bool
         Whether each reason links to its remedy on the same page.
     max_reasons : int, optional
-        The largest number of reasons to list, gravest first; all by default.
+        The largest number of reasons to list, gravest first; all by default. Further reasons are
+        left out without a remark.
     """
     verdict = trust.verdict
     lines = [Line(f"Verdict: {verdict}", f"strong {verdict}")]

@@ -92,7 +92,8 @@ def write_vtu(
 def _checked_arrays(
     kind: str, data: Mapping[str, ArrayLike], count: int, path: str | Path
 ) -> dict[str, NDArray]:
-    """Return data as arrays of types that VTK has, with names escaped for XML.
+    """Return data as arrays with names escaped for XML; booleans, which VTK does not have, become
+    8-bit integers, and other types are neither converted nor checked.
 
     Parameters
     ----------
@@ -324,10 +325,10 @@ def _resolved_parent(path: Path) -> Path:
 
 
 def _remove_stale(target: Path) -> None:
-    """Remove temporary folders beside `target` that a killed process of this machine left behind.
+    """Remove the temporary folders in which killed processes of this machine prepared `target`.
 
-    On Windows nothing is removed, because it cannot be known whether a process with that number
-    runs.
+    They are beside `target`, with its name in theirs; those of other targets remain. On Windows
+    nothing is removed, because it cannot be known whether a process with that number runs.
     """
     if os.name != "posix":
         return

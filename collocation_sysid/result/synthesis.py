@@ -445,11 +445,13 @@ def _experiment_sections(
 def _table_names(
     experiment: Experiment, section: ExperimentSection | SpecimenSection | None
 ) -> dict[str, str]:
-    """Return the names of the files of an experiment, by their content: "markers", "poses",
-    "poses_2", …
+    """Return the names of the files of an experiment, by their content.
 
-    Poses are listed for grasps that read them from a file. On a test bench and of specimens the
-    names are those of the problem file, and on a test bench also the keys.
+    Contents are "markers", "poses", "poses_2", …, "wrench", "wrench_2", … and "reading_NAME" for
+    each custom sensor; the names are EXPERIMENT_CONTENT.csv. Poses are listed for grasps that read
+    them or their markers from a file, without `section` for all grasps. The tables of a test bench
+    (displacement and force) have the names in the problem file, also as keys. A specimen has one
+    file, with the name in the problem file, or EXPERIMENT.csv without `section`.
 
     Parameters
     ----------

@@ -115,7 +115,11 @@ def build_result(answer: SolvedProblem) -> Result:
 
 
 def _provenance(problem: Problem) -> Provenance:
-    """Return versions, platform and hashes of the problem's files."""
+    """Return versions, platform, and the SHA-256 hashes of the problem file and of each mesh.
+
+    Recordings are not hashed. Path and hash of the problem file are None for a problem that was
+    made in Python; no file is read.
+    """
     origin = problem.origin
     text = None if origin is None else origin.text.encode()
     return Provenance(

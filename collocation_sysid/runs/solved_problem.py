@@ -238,8 +238,10 @@ class SolvedProblem:
 
     @cached_property
     def places(self) -> dict[str, dict[str, MarkerPlace]]:
-        """Estimated places of the markers on the undeformed body, by name of the fitted experiment
-        and of the marker; see `marker_places`.
+        """Places of all markers on the undeformed body at the solution, by name of the fitted
+        experiment and of the marker, also those that were exactly known (prior of zero).
+
+        An experiment without markers has an empty entry; see `marker_places`.
         """
         named = (
             (part.segment.experiment.name, part) for part in self.solution.parts

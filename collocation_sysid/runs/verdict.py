@@ -72,7 +72,8 @@ def solution_concerns(
     motions : iterable of ModesCheck
         Natural modes at the estimates.
     uncertainty : Uncertainty or None
-        Statistical uncertainty; None without error bars.
+        Statistical uncertainty; None without error bars, which is a concern of its own if there
+        are parameters.
     diagnoses : sequence of MarkerDiagnosis
         Findings in the residuals.
     """

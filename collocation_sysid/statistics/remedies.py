@@ -34,7 +34,8 @@ REMEDIES: Mapping[str, str] = {
     "the body",
     "grip_layer_m": "glue the body to a stiff plate, or attach markers to the body beside the grip",
     "machine_compliance_m_n": "press the platens against each other without a specimen and state "
-    "the slope of displacement over force",
+    "the slope of displacement over force as machine_compliance_m_n = { mean = …, deviation = … } "
+    "in [uncertainty.assumptions]",
     "platen_friction": "lubricate the platens, or glue the specimen to them",
     "platen_slip": "measure the bulge, by markers on the side or depth images; or state "
     'platen_slip = "none" in [uncertainty.assumptions] if the faces are glued, or axes = "z" if '

@@ -318,5 +318,5 @@ def test_frames_outside_the_folder_are_refused(run: Path, elsewhere: Path):
     (run / "trajectory.pvd").write_text(
         frames.replace("frames/frame_0000.vtu", "../secret")
     )
-    with pytest.raises(InputError, match="not in the folder"):
+    with pytest.raises(InputError, match="outside the run folder"):
         frame_files(run, "swing")

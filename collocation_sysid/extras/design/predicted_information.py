@@ -346,7 +346,12 @@ class FutureRecording:
             ) from error
 
     def _validate(self) -> None:
-        """Raise `InputError` if a motion cannot be designed for the experiment."""
+        """Raise an `InputError` if a motion cannot be designed for the experiment.
+
+        The template must move and have exactly one grasp, which holds along all axes and all the
+        time; there must be 3 to `MOST_SAMPLES` samples (the error names --duration). Nothing else
+        is checked, such as markers or obstacles.
+        """
         template = self.template
         if template.is_static:
             raise InputError(

@@ -160,8 +160,14 @@ def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
 
 
 def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
-    """Return position (3,) [m] and quaternion (w, x, y, z) of a grasp or obstacle at a time `t_s`
-    [s].
+    """Return position (3,) [m] and unit quaternion (w, x, y, z) of a grasp or obstacle at a time
+    `t_s` [s].
+
+    Raises
+    ------
+    InputError
+        If the time is more than half a sample before or after its poses, except a single pose,
+        which holds at all times.
     """
     rotations, positions = grasp.poses.at([t_s])
     return positions[0], np.roll(
@@ -170,8 +176,8 @@ def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
 
 
 def _node_xml(body: IdentifiedBody) -> str:
-    """Return the XML of the free nodes (not held along all axes), each a body on three slides named
-    "node" and its index.
+    """Return the XML of the free nodes (not held along all axes), each a body on three slides; the
+    name of the body contains the index of the node from 0: "node0", "node1", …
     """
     lines = ""
     mass = body.total_node_mass_kg

@@ -232,8 +232,8 @@ class Facets:
 
 
 def _unit_normals(corners: Array) -> Array:
-    """Return the unit normals (f, 3) of triangles with corners (f, 3, 3); NaN for a triangle
-    without area.
+    """Return the unit normals (f, 3) of triangles with corners (f, 3, 3); for a triangle without
+    area NaN, with a RuntimeWarning of NumPy.
     """
     normals = np.cross(
         corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]

@@ -496,9 +496,11 @@ class LiveEstimator:
 
     def _repeat_until_settled(self, began: float, notes: list[str]) -> int:
         """Compute the rows in the window again, without a time limit, until no further pass is
-        needed or `FINAL_PASSES` passes are done; return the number of rows.
+        needed or `FINAL_PASSES` passes are done.
 
-        `began` is the time at which the work began, by `clock`; `notes` are extended in place.
+        The number of rows that were computed is returned; rows computed in several passes count
+        in each. The state of the estimator is changed as by `_repeat_rows`, its option `rows` is
+        not. `began` is the time at which the work began, by `clock`; `notes` are extended in place.
         """
         rows_per_frame, self.rows = self.rows, FINAL_PASSES * len(self.log)
         try:

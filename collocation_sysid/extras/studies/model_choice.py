@@ -312,10 +312,13 @@ def advice(rows: Sequence[Row]) -> str:
 
 
 def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
-    """Return the estimates in which the models that predict as well as the best disagree.
+    """Return the moduli and damping coefficients in which the models that predict as well as the
+    best disagree.
 
-    Models predict as well as the best within `SURE` standard errors. Empty if no row is chosen, or
-    if the chosen one has no prediction error ("log_ratio" is None).
+    Models predict as well as the best within `SURE` standard errors. They disagree if the largest
+    estimate is more than `LEAST_DISAGREEMENT_RATIO` times the smallest, whatever the intervals; see
+    `find_disagreements`. Empty if no row is chosen, or if the chosen one has no prediction error
+    ("log_ratio" is None).
     """
     chosen = next((row for row in rows if row["chosen"]), None)
     if chosen is None or chosen["log_ratio"] is None:

@@ -144,7 +144,11 @@ def _draw_parameters(
     truth: Mapping[str, float] | None,
 ) -> None:
     """Draw the named parameters over the iterations into `axes`, relative to `truth` or, if that is
-    None, to their final values; a reference of zero counts as 1.
+    None, to their final values.
+
+    A reference of zero counts as 1, ratios that are not positive are left out, and nothing but the
+    axes is drawn without iterations. Each named parameter must be in `truth`, if given, and in
+    every iteration (otherwise KeyError).
     """
     axes.axhline(1.0, color=BLACK, lw=0.6)
     numbers = [iteration.number for iteration in history]

@@ -167,7 +167,11 @@ def method_costs(
     nonzeros: int,
     factorisation: Choice,
 ) -> tuple[MethodCost, ...]:
-    """Return the estimated memory and time of reduced space and of interior point.
+    """Return the estimated memory [MB] and time [s] of reduced space and of interior point, in this
+    order.
+
+    One sweep is computed to measure its time. The time of reduced space is None if the equations at
+    the start cannot be solved.
 
     Parameters
     ----------
