@@ -25,11 +25,12 @@ Use it by default: it needs the least memory and time. Its search is in `reduced
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.validated_types import AtLeastOne
 from ..errors import InputError
 from ..fem.kernels import concurrent_count
 from ..program.collocation import Collocation
@@ -49,9 +50,22 @@ MISFIT = 3.0
 
 @dataclass(frozen=True)
 class ReducedSpace(SearchOptions):
-    """Gauss–Newton method for the parameters; the equations of motion give the trajectories."""
+    """Gauss–Newton method for the parameters; the equations of motion give the trajectories.
+
+    Attributes
+    ----------
+    coarse_start : {"auto", false}
+        "auto": solve a problem with a large body on a coarser mesh first, and start from there,
+        unless a start is given. The answer is the same. A call of the method with a `Collocation`
+        has no coarse start.
+    coarse_start_nodes : int
+        Number of nodes above which a body is large.
+    """
 
     name: ClassVar[str] = "reduced-space"
+
+    coarse_start: Literal["auto", False] = "auto"
+    coarse_start_nodes: AtLeastOne = 1500
 
     @one_blas_thread()
     def __call__(
