@@ -49,6 +49,8 @@ FAILED_STATUSES = (
 )
 # Least decrease of χ² for which the solution from a second start is preferred.
 LEAST_GAIN = 1e-3
+# Least tolerance of a solve on a coarser mesh: below the difference between both meshes.
+COARSE_TOLERANCE = 1e-4
 # Most repetitions of a solve whose estimates change the correspondences of the measurements.
 MOST_REREADINGS = 5
 
@@ -202,7 +204,9 @@ def _solve_once(
             coarse = _solve_once(
                 coarse_start.problem,
                 None,
-                solver=solver,
+                solver=replace(
+                    solver, tolerance=max(solver.tolerance, COARSE_TOLERANCE)
+                ),
                 watch=watch,
                 workers=workers,
             )
