@@ -77,9 +77,7 @@ def coarse_experiment(
             _coarse_pressure(each, relation) for each in experiment.pressures
         ),
         markers=replace(markers, placement=placement, places_m=None),
-        start_positions_m=_coarse_state(
-            experiment.start_positions_m, relation
-        ),
+        start_positions_m=_coarse_state(experiment.start_positions_m, relation),
         start_velocities_m_s=_coarse_state(
             experiment.start_velocities_m_s, relation
         ),

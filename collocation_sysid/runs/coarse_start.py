@@ -85,9 +85,7 @@ class CoarseStart:
         parameters = solution.collocation.parameters
         values = {
             item.name: float(
-                np.clip(
-                    solution.parameters[item.name], item.lower, item.upper
-                )
+                np.clip(solution.parameters[item.name], item.lower, item.upper)
             )
             for item in parameters.free
         }

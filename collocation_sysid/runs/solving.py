@@ -200,16 +200,9 @@ def _solve_once(
         coarse_start = plan_coarse_start(problem, solver)
         if coarse_start is None:
             return solve_directly(problem)
-        with search_activity(f"coarse start on {coarse_start.size}"):
-            coarse = _solve_once(
-                coarse_start.problem,
-                None,
-                solver=replace(
-                    solver, tolerance=max(solver.tolerance, COARSE_TOLERANCE)
-                ),
-                watch=watch,
-                workers=workers,
-            )
+        coarse = _solve_on_coarse_mesh(
+            coarse_start, solver=solver, watch=watch, workers=workers
+        )
         if coarse.status is Status.INTERRUPTED:
             return interrupted_solution(coarse_start, problem, coarse)
         if not coarse.status.converged:
@@ -228,6 +221,35 @@ def _solve_once(
         solution = solve_directly(problem)
         note = f"no coarse start: {reason}"
         return replace(solution, notes=(note, *solution.notes))
+
+
+def _solve_on_coarse_mesh(
+    coarse_start: CoarseStart,
+    *,
+    solver: ReducedSpace,
+    watch: Watch | None,
+    workers: ExperimentExecutor | None,
+) -> Solution:
+    """Return the solution on a coarser mesh, with a tolerance of at least `COARSE_TOLERANCE`; also
+    if it did not converge. The arguments are those of `_solve_directly`.
+
+    Raises
+    ------
+    NoCoarseStartError
+        If no start is found on the coarser mesh, or the method refuses the problem there.
+    """
+    tolerance = max(solver.tolerance, COARSE_TOLERANCE)
+    with search_activity(f"coarse start on {coarse_start.size}"):
+        try:
+            return _solve_once(
+                coarse_start.problem,
+                None,
+                solver=replace(solver, tolerance=tolerance),
+                watch=watch,
+                workers=workers,
+            )
+        except InputError as error:
+            raise NoCoarseStartError(error.message) from error
 
 
 def _solve_from_coarse(
