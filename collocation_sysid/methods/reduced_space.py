@@ -56,8 +56,8 @@ class ReducedSpace(SearchOptions):
     ----------
     coarse_start : {"auto", false}
         "auto": solve a problem with a large body on a coarser mesh first, and start from there,
-        unless a start is given. The answer is the same. A call of the method with a `Collocation`
-        has no coarse start.
+        unless a start is given. The result satisfies the same criterion of convergence on the given
+        mesh.
     coarse_start_nodes : int
         Number of nodes above which a body is large.
     """
@@ -81,7 +81,7 @@ class ReducedSpace(SearchOptions):
         horizons. A search that fails, is interrupted or loses its workers gives the best point so
         far, and `status` says why it ended. Rows that were not simulated are then those of a rigid
         motion with the grasp, and the solution's `initial_multipliers` are zeros; else they are
-        None. Exceptions of `watch` are not caught.
+        None. Exceptions of `watch` are not caught. There is no coarse start, which `solve` adds.
 
         Parameters
         ----------
