@@ -9,16 +9,17 @@ error that the given mesh leaves, see `mesh_error_note`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..common.array_types import Array
-from ..errors import InputError
+from ..errors import InputError, SimulationError
 from ..fem.body import Body
 from ..fem.coarse_body import CoarseBody, coarsen_body
-from ..fem.laws.constants import symbol_of
+from ..fem.laws.constants import is_modulus, symbol_of
+from ..methods.horizon import Horizon
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
 from ..methods.solve_recorder import Recorder
@@ -37,6 +38,11 @@ NODE_RATIO = 8
 LEAST_NODE_RATIO = 2.0
 # Largest relative change of the volume: a coarser surface encloses less.
 LARGEST_VOLUME_CHANGE = 0.2
+# Largest standard error of a parameter's coordinate, a logarithm as a rule, with which the coarse
+# mesh determines it.
+LARGEST_STANDARD_ERROR = 1.0
+# Distance of a coordinate from a bound below which the parameter is at the bound.
+BOUND_DISTANCE = 1e-6
 
 
 class NoCoarseStartError(Exception):
@@ -80,14 +86,18 @@ class CoarseStart:
         self, problem: Problem, solution: Solution
     ) -> Collocation:
         """Return the program of the given problem with the parameters of a coarse solution as
-        guesses, within their bounds.
+        guesses, within their bounds; of those that the coarse mesh does not determine, see
+        `undetermined_names`, the guess of the coarse solve.
         """
         parameters = solution.collocation.parameters
+        excluded = undetermined_names(solution)
+        estimates = solution.parameters
         values = {
             item.name: float(
-                np.clip(solution.parameters[item.name], item.lower, item.upper)
+                np.clip(estimates[item.name], item.lower, item.upper)
             )
             for item in parameters.free
+            if item.name not in excluded
         }
         return replace(
             problem.collocation(), parameters=parameters.with_guess(values)
@@ -107,13 +117,17 @@ class CoarseStart:
         p, _ = WarmStart.of(solution).apply_to_nuisance(collocation)
         p = np.clip(p, *collocation.parameter_bounds)
         _, coarse_positions = solution.collocation.unpack(solution.z)
-        positions = [
-            self._interpolated(segment.experiment.name, x)
-            for segment, x in zip(
-                collocation.transcriptions, coarse_positions, strict=True
-            )
+        return collocation.pack(p, self.interpolated(coarse_positions))
+
+    def interpolated(self, coarse_positions: Sequence[Array]) -> list[Array]:
+        """Return positions (N, 3n) [m] of each fitted experiment on the given bodies from those
+        on the coarse ones, (N, 3m).
+        """
+        names = [each.name for each in self.problem.experiments]
+        return [
+            self._interpolated(name, x)
+            for name, x in zip(names, coarse_positions, strict=True)
         ]
-        return collocation.pack(p, positions)
 
     def _interpolated(self, experiment: str, x: Array) -> Array:
         """Return positions (N, 3n) of the given body from those of the coarse one (N, 3m); nodes of
@@ -243,6 +257,41 @@ def interrupted_solution(
         scan=coarse.scan,
         timing=solution.timing + coarse.timing,
     )
+
+
+def undetermined_names(solution: Solution) -> tuple[str, ...]:
+    """Return the names of the estimated parameters that a coarse solution does not determine: those
+    at a bound, and those with a standard error above `LARGEST_STANDARD_ERROR`.
+
+    On a mesh that is too coarse, weakly determined parameters compensate its error: a search from
+    such values would take many steps. One sweep is needed; where it fails, only bounds count.
+    """
+    collocation = solution.collocation
+    q = solution.q
+    lower, upper = collocation.parameters.bounds_q
+    is_excluded = (q - lower < BOUND_DISTANCE) | (upper - q < BOUND_DISTANCE)
+    p, positions = collocation.unpack(solution.z)
+    rows = [segment.grid_times for segment in collocation.transcriptions]
+    try:
+        fit = Horizon(collocation, rows).evaluate(p, positions).fit
+    except SimulationError:
+        pass
+    else:
+        errors = fit.standard_errors[: len(q)]
+        is_excluded |= ~(errors <= LARGEST_STANDARD_ERROR)
+    names = zip(collocation.parameters.free, is_excluded, strict=True)
+    return tuple(item.name for item, excluded in names if excluded)
+
+
+def require_plausible(solution: Solution) -> None:
+    """Raise `NoCoarseStartError` if a modulus of a coarse solution is not determined, see
+    `undetermined_names`: the coarse mesh then does not describe the motion.
+    """
+    for name in undetermined_names(solution):
+        if is_modulus(name):
+            raise NoCoarseStartError(
+                f"the coarse mesh does not determine {symbol_of(name)}"
+            )
 
 
 def start_note(start: CoarseStart, coarse: Solution, given: Solution) -> str:

@@ -33,6 +33,7 @@ from .coarse_start import (
     interrupted_solution,
     mesh_error_note,
     plan_coarse_start,
+    require_plausible,
     start_note,
 )
 from .several_starts import follow_starts
@@ -209,6 +210,7 @@ def _solve_once(
             raise NoCoarseStartError(
                 f"the solve on {coarse_start.size} ended with: {coarse.message}"
             )
+        require_plausible(coarse)
         return _solve_from_coarse(
             problem,
             coarse_start,

@@ -46,6 +46,24 @@ def problem_of(experiment: Experiment) -> Problem:
     return Problem([experiment], {name: Unknown() for name in TRUTH})
 
 
+def pressed_box() -> Experiment:
+    """A cube of 125 nodes that a ball and a plate press."""
+    pressed = pressed_cube()
+    body = box(divisions=(4, 4, 4))
+    held = replace(
+        pressed.grasps[0], nodes=nodes_where(body, 2, 0.0), selection=None
+    )
+    top = nodes_where(body, 2, 0.1)
+    return measured(
+        replace(
+            pressed,
+            body=body,
+            grasps=[held, *pressed.obstacles],
+            markers=vertex_markers(body, top, pressed.t_s),
+        )
+    )
+
+
 def coarse_note(solution: Solution) -> str:
     """The note on the coarse start; "" if there is none."""
     notes = [n for n in solution.notes if n.startswith("coarse start: ")]
@@ -120,8 +138,8 @@ def test_an_unsuccessful_coarse_start_is_noted_and_solved_directly():
 
 
 def test_a_mesh_that_cannot_be_coarser_is_noted():
-    problem = problem_of(measured(hung_cube(10)))
-    solution = solve(problem, ReducedSpace(coarse_start_nodes=20))
+    problem = problem_of(measured(hung_cube(10, divisions=(1, 1, 2))))
+    solution = solve(problem, ReducedSpace(coarse_start_nodes=10))
     assert solution.status is Status.CONVERGED
     assert solution.notes[0].startswith("no coarse start: only ")
 
@@ -208,26 +226,30 @@ def test_cavities_and_tendons_are_transferred():
 
 
 def test_frames_of_obstacles_are_copied():
-    pressed = pressed_cube()
-    body = box(divisions=(4, 4, 4))
-    held = replace(
-        pressed.grasps[0], nodes=nodes_where(body, 2, 0.0), selection=None
-    )
-    top = nodes_where(body, 2, 0.1)
-    experiment = measured(
-        replace(
-            pressed,
-            body=body,
-            grasps=[held, *pressed.obstacles],
-            markers=vertex_markers(body, top, pressed.t_s),
-        )
-    )
+    experiment = pressed_box()
     problem = Problem([experiment], TRUTH | {"mu_pa": Unknown(250.0)})
     start = plan_coarse_start(problem, ReducedSpace(coarse_start_nodes=60))
     assert start is not None
     (coarse,) = start.problem.experiments
     assert len(coarse.body.frames) == len(experiment.body.frames) == 2
-    direct = solve(problem, DIRECT)
+    undeformed = [
+        np.tile(e.body.nodes_m.ravel(), (len(segment.dynamics.t_s), 1))
+        for e, segment in zip(
+            start.problem.experiments,
+            start.problem.collocation().transcriptions,
+            strict=True,
+        )
+    ]
+    (positions,) = start.interpolated(undeformed)
+    given_m = experiment.body.nodes_m
+    assert len(coarse.body.nodes_m) < len(given_m)
+    assert positions[0] == pytest.approx(given_m.ravel(), abs=1e-12)
+
+
+def test_a_coarse_mesh_that_determines_no_modulus_is_no_start():
+    """Fifteen nodes cannot be pressed by a ball as the given mesh is."""
+    problem = Problem([pressed_box()], TRUTH | {"mu_pa": Unknown(250.0)})
     solution = solve(problem, ReducedSpace(coarse_start_nodes=60))
-    assert coarse_note(solution)
-    assert solution.q == pytest.approx(direct.q, abs=1e-6)
+    direct = solve(problem, DIRECT)
+    assert "does not determine μ" in solution.notes[0]
+    assert solution.q == pytest.approx(direct.q, abs=1e-8)
