@@ -140,7 +140,7 @@ class CoarseStart:
         points = x.reshape(len(x), -1, 3)
         own = matrix.shape[1]
         by_node = points[:, :own].transpose(1, 0, 2).reshape(own, -1)
-        interpolated = (matrix @ by_node).reshape(-1, len(x), 3)
+        interpolated = np.asarray(matrix @ by_node).reshape(-1, len(x), 3)
         return np.concatenate(
             [interpolated.transpose(1, 0, 2), points[:, own:]], axis=1
         ).reshape(len(x), -1)

@@ -382,6 +382,6 @@ def _is_smooth(edges: Index, faces: Index, n: int) -> NDArray[np.bool_]:
     first, second = np.divmod(codes, n)
     pairs = (np.append(first, second), np.append(second, first))
     adjacency = sp.csr_array((np.ones(2 * len(codes)), pairs), shape=(n, n))
-    common = (adjacency @ adjacency).tocsr()
+    common = sp.csr_array(adjacency @ adjacency)
     shared = np.asarray(common[edges[:, 0], edges[:, 1]]).ravel()
     return is_side & (shared <= triangles[place])
