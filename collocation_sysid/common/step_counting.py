@@ -16,6 +16,10 @@ from enum import StrEnum, auto
 
 # Called with the completed share of a phase: 0 when it begins, at most 1, and None when it ended.
 ShareListener = Callable[[float | None], None]
+# Called with the name of what a search does now.
+ActivityListener = Callable[[str], None]
+# Name of a search that is no part of another activity.
+SEARCH = "solving"
 # Called with a function that describes the state of an iteration in words.
 StateListener = Callable[[Callable[[], str]], None]
 
@@ -54,6 +58,10 @@ _listener: ContextVar[ShareListener | None] = ContextVar(
 _state_listener: ContextVar[StateListener | None] = ContextVar(
     "state_listener", default=None
 )
+_activity_listener: ContextVar[ActivityListener | None] = ContextVar(
+    "activity_listener", default=None
+)
+_activity: ContextVar[str] = ContextVar("activity", default=SEARCH)
 _phase: ContextVar[_Phase | None] = ContextVar("phase", default=None)
 
 
@@ -83,6 +91,37 @@ def listen_to_states(listener: StateListener) -> Iterator[None]:
         yield
     finally:
         _state_listener.reset(token)
+
+
+@contextmanager
+def listen_to_activities(listener: ActivityListener) -> Iterator[None]:
+    """Call `listener` with the name of each search activity that begins or resumes in the block."""
+    token = _activity_listener.set(listener)
+    try:
+        yield
+    finally:
+        _activity_listener.reset(token)
+
+
+@contextmanager
+def search_activity(name: str) -> Iterator[None]:
+    """Name the searches in the block, such as "coarse start", for displays of progress; afterwards
+    the name is the previous one, `SEARCH` at the outermost.
+    """
+    token = _activity.set(name)
+    _report_activity()
+    try:
+        yield
+    finally:
+        _activity.reset(token)
+        _report_activity()
+
+
+def _report_activity() -> None:
+    """Call the listener, if there is one, with the name of the present search."""
+    listener = _activity_listener.get()
+    if listener is not None:
+        listener(_activity.get())
 
 
 def report_state(describe: Callable[[], str]) -> None:

@@ -86,7 +86,9 @@ def expected(fault: Mapping[str, Any]) -> str:
         return str(fault["ctx"]["error"]).partition("expected ")[2]
     if fault["type"] in _EXPECTED:
         return _EXPECTED[fault["type"]].format(**fault.get("ctx", {}))
-    return fault["msg"].removeprefix("Input should be ")
+    message = fault["msg"].removeprefix("Input should be ")
+    # As in problem files.
+    return message.replace("False", "false").replace("True", "true")
 
 
 def faulty_entry(

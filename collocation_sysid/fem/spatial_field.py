@@ -388,6 +388,21 @@ class FieldModes:
         laplacian = replace(self.laplacian, vectors=vectors)
         return replace(self, laplacian=laplacian, volumes_m3=volumes_m3)
 
+    def on_cells(self, sources: Index, volumes_m3: Array) -> FieldModes:
+        """Return this field on other cells, whose shapes have the values of given cells; nothing is
+        computed again.
+
+        Parameters
+        ----------
+        sources : (k,) int
+            For each new cell the present one, counted from 0, whose value it has.
+        volumes_m3 : (k,)
+            Volumes of the new cells.
+        """
+        vectors = self.laplacian.vectors[:, sources]
+        laplacian = replace(self.laplacian, vectors=vectors)
+        return replace(self, laplacian=laplacian, volumes_m3=volumes_m3)
+
     def with_length(self, length_m: float) -> FieldModes:
         """Return this field with another correlation length [m] and the same eigenvectors; it need
         not be one of `Field.lengths_m`.

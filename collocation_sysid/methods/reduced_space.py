@@ -25,11 +25,12 @@ Use it by default: it needs the least memory and time. Its search is in `reduced
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.validated_types import AtLeastOne
 from ..errors import InputError
 from ..fem.kernels import concurrent_count
 from ..program.collocation import Collocation
@@ -49,9 +50,22 @@ MISFIT = 3.0
 
 @dataclass(frozen=True)
 class ReducedSpace(SearchOptions):
-    """Gauss–Newton method for the parameters; the equations of motion give the trajectories."""
+    """Gauss–Newton method for the parameters; the equations of motion give the trajectories.
+
+    Attributes
+    ----------
+    coarse_start : {"auto", false}
+        "auto": solve a problem with a large body on a coarser mesh first, and start from there,
+        unless a start is given. The result satisfies the same criterion of convergence on the given
+        mesh.
+    coarse_start_nodes : int
+        Number of nodes above which a body is large.
+    """
 
     name: ClassVar[str] = "reduced-space"
+
+    coarse_start: Literal["auto", False] = "auto"
+    coarse_start_nodes: AtLeastOne = 1500
 
     @one_blas_thread()
     def __call__(
@@ -67,7 +81,7 @@ class ReducedSpace(SearchOptions):
         horizons. A search that fails, is interrupted or loses its workers gives the best point so
         far, and `status` says why it ended. Rows that were not simulated are then those of a rigid
         motion with the grasp, and the solution's `initial_multipliers` are zeros; else they are
-        None. Exceptions of `watch` are not caught.
+        None. Exceptions of `watch` are not caught. There is no coarse start, which `solve` adds.
 
         Parameters
         ----------

@@ -18,7 +18,12 @@ from rich.text import Text
 
 from ..common.console import Watched
 from ..common.display import Shown, Table, on_terminal
-from ..common.step_counting import listen_to_shares, listen_to_states
+from ..common.step_counting import (
+    SEARCH,
+    listen_to_activities,
+    listen_to_shares,
+    listen_to_states,
+)
 from ..fem.laws.constants import symbol_of
 from ..methods.solution import Iteration
 from ..problem import Problem
@@ -122,6 +127,7 @@ class SolveProgress(Watched):
         self._notes = problem.notes if problem else ()
         self._lines: list[Iteration] = []
         self._doing = activity
+        self._search = SEARCH
         self._remaining = ""
         self._state: Callable[[], str] | None = None
         self._activity_began_s = time.monotonic()
@@ -142,6 +148,7 @@ class SolveProgress(Watched):
         super().__enter__()
         self._contexts.enter_context(listen_to_shares(self.share))
         self._contexts.enter_context(listen_to_states(self.state))
+        self._contexts.enter_context(listen_to_activities(self.activity))
         self._activity_began_s = time.monotonic()
         self._phase_began_s = self._activity_began_s
         if self._heartbeat is not None:
@@ -157,7 +164,14 @@ class SolveProgress(Watched):
     def iteration(self, line: Iteration) -> None:
         """Show an iteration; the callback of a method."""
         self._lines.append(line)
-        self._update_activity("solving", "  ".join(_iteration_row(line)))
+        self._update_activity(self._search, "  ".join(_iteration_row(line)))
+
+    def activity(self, name: str) -> None:
+        """Show the name of the search that begins or resumes, such as that of a coarse start; its
+        iterations are shown under this name.
+        """
+        self._search = name
+        self._update_activity(name, name)
 
     def say(self, what: str) -> None:
         """Show what is being done now, as a sentence."""

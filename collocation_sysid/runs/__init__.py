@@ -2,7 +2,7 @@
 
 - `check`: examine a problem before it is solved.
 - `solving`: solve it, with `two_phases` for two-phase fields, `several_starts` for local minima,
-and `warm_start` for a start from an earlier run.
+`warm_start` for a start from an earlier run, and `coarse_start` for a start on a coarser mesh.
 - `forward_simulation`, `prediction`: simulate recordings with the estimates, and compare with the
 measurements.
 - `verdict`: concerns about a solution.

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.step_counting import search_activity
 from ..errors import InputError
 from ..fem.laws.constants import usual_value, without_region
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
@@ -26,6 +27,15 @@ from ..statistics.misspecification.camera_misspecifications import (
     require_depth_units,
 )
 from .check.cost import require_memory
+from .coarse_start import (
+    CoarseStart,
+    NoCoarseStartError,
+    interrupted_solution,
+    mesh_error_note,
+    plan_coarse_start,
+    require_plausible,
+    start_note,
+)
 from .several_starts import follow_starts
 from .two_phases import solve_two_phases
 from .warm_start import WarmStart
@@ -40,6 +50,8 @@ FAILED_STATUSES = (
 )
 # Least decrease of χ² for which the solution from a second start is preferred.
 LEAST_GAIN = 1e-3
+# Least tolerance of a solve on a coarser mesh: below the difference between both meshes.
+COARSE_TOLERANCE = 1e-4
 # Most repetitions of a solve whose estimates change the correspondences of the measurements.
 MOST_REREADINGS = 5
 
@@ -55,8 +67,9 @@ def solve(
 
     There may be several searches, one after another: from the results of a scan, if guesses are
     missing or a search from guesses fails; a second one in reduced space, if the first converges
-    near ν = ½; with correspondences of measurements that the estimates change; and with other
-    correlation lengths or phases of fields. `watch` receives the iterations of all of them, and one
+    near ν = ½; with correspondences of measurements that the estimates change; with other
+    correlation lengths or phases of fields; and, of a large body, one on a coarser mesh first, see
+    `coarse_start`. `watch` receives the iterations of all of them, and one
     of them gives the solution. Nothing is written.
 
     Parameters
@@ -163,6 +176,150 @@ def _solve_with_likeliest_lengths(
 
 
 def _solve_once(
+    problem: Problem,
+    start: str | Path | WarmStart | None,
+    solver: Method,
+    watch: Watch | None,
+    workers: ExperimentExecutor | None,
+) -> Solution:
+    """Solve a problem with fixed correlation lengths, with a coarse start if the method asks for
+    one and no earlier solution is given, else as `_solve_directly`, which describes the arguments
+    and errors.
+
+    If the coarse start is not possible or fails, the problem is solved directly, with a note.
+    """
+
+    def solve_directly(from_problem: Problem) -> Solution:
+        """Solve a problem without a coarse start on its own mesh."""
+        return _solve_directly(
+            from_problem, start, solver=solver, watch=watch, workers=workers
+        )
+
+    if start is not None or not isinstance(solver, ReducedSpace):
+        return solve_directly(problem)
+    try:
+        coarse_start = plan_coarse_start(problem, solver)
+        if coarse_start is None:
+            return solve_directly(problem)
+        coarse = _solve_on_coarse_mesh(
+            coarse_start, solver=solver, watch=watch, workers=workers
+        )
+        if coarse.status is Status.INTERRUPTED:
+            return interrupted_solution(coarse_start, problem, coarse)
+        if not coarse.status.converged:
+            raise NoCoarseStartError(
+                f"the solve on {coarse_start.size} ended with: {coarse.message}"
+            )
+        require_plausible(coarse)
+        return _solve_from_coarse(
+            problem,
+            coarse_start,
+            coarse=coarse,
+            solver=solver,
+            watch=watch,
+            workers=workers,
+        )
+    except NoCoarseStartError as reason:
+        solution = solve_directly(problem)
+        note = f"no coarse start: {reason}"
+        return replace(solution, notes=(note, *solution.notes))
+
+
+def _solve_on_coarse_mesh(
+    coarse_start: CoarseStart,
+    *,
+    solver: ReducedSpace,
+    watch: Watch | None,
+    workers: ExperimentExecutor | None,
+) -> Solution:
+    """Return the solution on a coarser mesh, with a tolerance of at least `COARSE_TOLERANCE`; also
+    if it did not converge. The arguments are those of `_solve_directly`.
+
+    Raises
+    ------
+    NoCoarseStartError
+        If no start is found on the coarser mesh, or the method refuses the problem there.
+    """
+    tolerance = max(solver.tolerance, COARSE_TOLERANCE)
+    with search_activity(f"coarse start on {coarse_start.size}"):
+        try:
+            return _solve_once(
+                coarse_start.problem,
+                None,
+                solver=replace(solver, tolerance=tolerance),
+                watch=watch,
+                workers=workers,
+            )
+        except InputError as error:
+            raise NoCoarseStartError(error.message) from error
+
+
+def _solve_from_coarse(
+    problem: Problem,
+    coarse_start: CoarseStart,
+    *,
+    coarse: Solution,
+    solver: ReducedSpace,
+    watch: Watch | None,
+    workers: ExperimentExecutor | None,
+) -> Solution:
+    """Solve a problem from the solution on a coarser mesh.
+
+    The result counts the iterations and evaluations on the given mesh only, but the times of both
+    solves; the scan and its notes are those of the coarse solve.
+
+    Parameters
+    ----------
+    problem : Problem
+    coarse_start : CoarseStart
+    coarse : Solution
+        Converged solution of `coarse_start.problem`.
+    solver, watch, workers
+        See `_solve_directly`.
+
+    Raises
+    ------
+    NoCoarseStartError
+        If the search from there does not converge for another reason than a limit.
+    InputError
+        If the machine lacks memory.
+    """
+    collocation = coarse_start.given_collocation(problem, coarse)
+    try:
+        require_memory(problem, collocation, method=solver)
+    except InputError as error:
+        raise error.located(problem.path) from error
+    collocation = associated_at_guess(collocation)
+    collocation = WarmStart.of(coarse).apply_to_places(collocation)
+    method = with_workers(solver, workers)
+    solution = solve_with_renewed_correspondences(
+        method,
+        collocation,
+        watch=watch,
+        start=coarse_start.variables(collocation, coarse),
+    )
+    if solution.status in FAILED_STATUSES:
+        raise NoCoarseStartError(
+            f"the search from the solution on {coarse_start.size} ended with: "
+            f"{solution.message}"
+        )
+    notes = [
+        start_note(coarse_start, coarse, solution),
+        *(f"on the coarse mesh: {note}" for note in coarse.notes),
+    ]
+    if solution.status.converged:
+        error_note = mesh_error_note(coarse_start, coarse, solution)
+        notes += [error_note] if error_note else []
+        solution = best_of_second_start(method, solution, watch=watch)
+    return replace(
+        solution,
+        scan=coarse.scan,
+        timing=solution.timing + coarse.timing,
+        notes=(*notes, *solution.notes, *_depth_notes(solution)),
+    )
+
+
+def _solve_directly(
     problem: Problem,
     start: str | Path | WarmStart | None,
     solver: Method,

@@ -1,0 +1,340 @@
+"""Start of a search on a large body: the same problem is solved on a coarser mesh first.
+
+The parameters, the nuisance parameters and the interpolated motion of the coarse body are the start
+on the given mesh, which replaces the scan of the stiffness, the simulations and the horizons of
+increasing length there. The criterion of convergence on the given mesh is the same, and so is the
+answer. As both meshes see the same recordings, the difference of both answers also estimates the
+error that the given mesh leaves, see `mesh_error_note`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..common.array_types import Array
+from ..errors import InputError, SimulationError
+from ..fem.body import Body
+from ..fem.coarse_body import CoarseBody, coarsen_body
+from ..fem.laws.constants import is_modulus, symbol_of
+from ..methods.horizon import Horizon
+from ..methods.reduced_space import ReducedSpace
+from ..methods.solution import Solution, Status
+from ..methods.solve_recorder import Recorder
+from ..problem import Problem
+from ..program.collocation import Collocation
+from ..recording.experiment_coarsening import coarse_experiment, node_sets
+from ..statistics.budget.discretisation_error import MESH_ORDER
+from ..statistics.estimates import IntervalCoordinate
+from ..statistics.linearised import parameter_values
+from .warm_start import WarmStart
+
+# Nodes of the given mesh over those of the coarse one: edges are then about twice as long, and a
+# coarse sweep costs a tenth to a thirtieth.
+NODE_RATIO = 8
+# Smallest reduction of the number of nodes for which a coarse start is worth its time.
+LEAST_NODE_RATIO = 2.0
+# Largest relative change of the volume: a coarser surface encloses less.
+LARGEST_VOLUME_CHANGE = 0.2
+# Largest standard error of a parameter's coordinate, a logarithm as a rule, with which the coarse
+# mesh determines it.
+LARGEST_STANDARD_ERROR = 1.0
+# Distance of a coordinate from a bound below which the parameter is at the bound.
+BOUND_DISTANCE = 1e-6
+
+
+class NoCoarseStartError(Exception):
+    """Reason why a problem has no coarse start, as a part of a sentence."""
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseStart:
+    """Problem on coarser meshes.
+
+    Attributes
+    ----------
+    problem : Problem
+        Fitted experiments on coarse bodies, with the parameters of the given problem.
+    relations : mapping of str to CoarseBody
+        Relation of coarse and given body, by experiment name; experiments whose body is small are
+        left out.
+    """
+
+    problem: Problem
+    relations: Mapping[str, CoarseBody]
+
+    @property
+    def size(self) -> str:
+        """Numbers of nodes of the coarse and the given bodies, in words."""
+        distinct = {id(r.coarse): r for r in self.relations.values()}.values()
+        coarse = sum(len(each.coarse.nodes.points_m) for each in distinct)
+        given = sum(len(each.body.nodes.points_m) for each in distinct)
+        return f"{coarse:,} of {given:,} nodes"
+
+    @property
+    def edge_ratio(self) -> float:
+        """Smallest ratio of the mean edge lengths of coarse and given mesh."""
+        return min(
+            each.coarse.mesh.quality().edge_mean_m
+            / each.body.mesh.quality().edge_mean_m
+            for each in self.relations.values()
+        )
+
+    def given_collocation(
+        self, problem: Problem, solution: Solution
+    ) -> Collocation:
+        """Return the program of the given problem with the parameters of a coarse solution as
+        guesses, within their bounds; of those that the coarse mesh does not determine, see
+        `undetermined_names`, the guess of the coarse solve.
+        """
+        parameters = solution.collocation.parameters
+        excluded = undetermined_names(solution)
+        estimates = solution.parameters
+        values = {
+            item.name: float(
+                np.clip(estimates[item.name], item.lower, item.upper)
+            )
+            for item in parameters.free
+            if item.name not in excluded
+        }
+        return replace(
+            problem.collocation(), parameters=parameters.with_guess(values)
+        )
+
+    def variables(self, collocation: Collocation, solution: Solution) -> Array:
+        """Return variables z (variables,) of the given problem from a coarse solution.
+
+        Parameters
+        ----------
+        collocation : Collocation
+            Program of the given problem, see `given_collocation`, with the places of markers of
+            the coarse solution.
+        solution : Solution
+            Solution on the coarse meshes.
+        """
+        p, _ = WarmStart.of(solution).apply_to_nuisance(collocation)
+        p = np.clip(p, *collocation.parameter_bounds)
+        _, coarse_positions = solution.collocation.unpack(solution.z)
+        return collocation.pack(p, self.interpolated(coarse_positions))
+
+    def interpolated(self, coarse_positions: Sequence[Array]) -> list[Array]:
+        """Return positions (N, 3n) [m] of each fitted experiment on the given bodies from those
+        on the coarse ones, (N, 3m).
+        """
+        names = [each.name for each in self.problem.experiments]
+        return [
+            self._interpolated(name, x)
+            for name, x in zip(names, coarse_positions, strict=True)
+        ]
+
+    def _interpolated(self, experiment: str, x: Array) -> Array:
+        """Return positions (N, 3n) of the given body from those of the coarse one (N, 3m); nodes of
+        obstacle frames, which come last, are copied.
+        """
+        relation = self.relations.get(experiment)
+        if relation is None:
+            return x
+        matrix = relation.interpolation
+        points = x.reshape(len(x), -1, 3)
+        own = matrix.shape[1]
+        by_node = points[:, :own].transpose(1, 0, 2).reshape(own, -1)
+        interpolated = np.asarray(matrix @ by_node).reshape(-1, len(x), 3)
+        return np.concatenate(
+            [interpolated.transpose(1, 0, 2), points[:, own:]], axis=1
+        ).reshape(len(x), -1)
+
+
+def plan_coarse_start(
+    problem: Problem, method: ReducedSpace
+) -> CoarseStart | None:
+    """Return the problem on coarser meshes, or None if the method's options or the sizes of the
+    bodies do not call for a coarse start.
+
+    Raises
+    ------
+    NoCoarseStartError
+        If a body is large enough, but the problem cannot be transferred to a coarser mesh.
+    """
+    fitted = [each for each in problem.experiments if not each.validation]
+    if method.coarse_start != "auto":
+        return None
+    large = {
+        id(each.body): each.body
+        for each in fitted
+        if each.specimen is None
+        and len(each.body.nodes.points_m) > method.coarse_start_nodes
+    }
+    if not large:
+        return None
+    if problem.two_phase_fields:
+        raise NoCoarseStartError(
+            "the phases of a two-phase field belong to the elements"
+        )
+    try:
+        coarse = {
+            key: _coarse_body(body, problem) for key, body in large.items()
+        }
+        relations = {
+            each.name: coarse[id(each.body)]
+            for each in fitted
+            if id(each.body) in coarse
+        }
+        experiments = [
+            coarse_experiment(each, relations[each.name])
+            if each.name in relations
+            else each
+            for each in fitted
+        ]
+        moved = replace(problem, experiments=experiments, notes=())
+    except InputError as error:
+        raise NoCoarseStartError(error.message) from error
+    return CoarseStart(moved, relations)
+
+
+def _coarse_body(body: Body, problem: Problem) -> CoarseBody:
+    """Return a body of the problem on a coarser mesh, with the node sets of all experiments on the
+    same mesh.
+
+    Raises
+    ------
+    NoCoarseStartError
+        If the mesh cannot be made much coarser.
+    InputError
+        If the body cannot be transferred.
+    """
+    sets = [
+        nodes
+        for experiment in problem.experiments
+        if experiment.body.mesh is body.mesh
+        for nodes in node_sets(experiment)
+    ]
+    count = len(body.nodes.points_m)
+    relation = coarsen_body(body, count // NODE_RATIO, sets)
+    coarse = relation.coarse
+    if len(coarse.nodes.points_m) * LEAST_NODE_RATIO > count:
+        raise NoCoarseStartError(
+            f"only {count - len(coarse.nodes.points_m):,} of {count:,} nodes could be removed"
+        )
+    change = coarse.mesh.volume_m3 / body.mesh.volume_m3 - 1
+    if abs(change) > LARGEST_VOLUME_CHANGE:
+        raise NoCoarseStartError(
+            f"the volume of the coarser mesh differs by {change:+.0%}"
+        )
+    return relation
+
+
+def interrupted_solution(
+    start: CoarseStart, problem: Problem, coarse: Solution
+) -> Solution:
+    """Return the present point of an interrupted coarse solve as an interrupted solution of the
+    given problem: parameters of the coarse solution and interpolated positions.
+
+    Its history has one entry, the evaluation at that point; no iteration was done on the given
+    mesh.
+    """
+    collocation = start.given_collocation(problem, coarse)
+    collocation = WarmStart.of(coarse).apply_to_places(collocation)
+    z = start.variables(collocation, coarse)
+    recorder = Recorder(ReducedSpace.name, collocation)
+    recorder.add_variables(0, z, collocation.objective(z))
+    solution = recorder.solution(
+        Status.INTERRUPTED,
+        Status.INTERRUPTED.sentence,
+        z=z,
+        multipliers=np.zeros(collocation.constraint_count),
+        iterations=0,
+        evaluations=0,
+    )
+    note = (
+        f"interrupted during the coarse start ({start.size}): the motion is interpolated and does "
+        "not satisfy the equations of motion of the given mesh"
+    )
+    return replace(
+        solution,
+        notes=(note,),
+        scan=coarse.scan,
+        timing=solution.timing + coarse.timing,
+    )
+
+
+def undetermined_names(solution: Solution) -> tuple[str, ...]:
+    """Return the names of the estimated parameters that a coarse solution does not determine: those
+    at a bound, and those with a standard error above `LARGEST_STANDARD_ERROR`.
+
+    On a mesh that is too coarse, weakly determined parameters compensate its error: a search from
+    such values would take many steps. One sweep is needed; where it fails, only bounds count.
+    """
+    collocation = solution.collocation
+    q = solution.q
+    lower, upper = collocation.parameters.bounds_q
+    is_excluded = (q - lower < BOUND_DISTANCE) | (upper - q < BOUND_DISTANCE)
+    p, positions = collocation.unpack(solution.z)
+    rows = [segment.grid_times for segment in collocation.transcriptions]
+    try:
+        fit = Horizon(collocation, rows).evaluate(p, positions).fit
+    except SimulationError:
+        pass
+    else:
+        errors = fit.standard_errors[: len(q)]
+        is_excluded |= ~(errors <= LARGEST_STANDARD_ERROR)
+    names = zip(collocation.parameters.free, is_excluded, strict=True)
+    return tuple(item.name for item, excluded in names if excluded)
+
+
+def require_plausible(solution: Solution) -> None:
+    """Raise `NoCoarseStartError` if a modulus of a coarse solution is not determined, see
+    `undetermined_names`: the coarse mesh then does not describe the motion.
+    """
+    for name in undetermined_names(solution):
+        if is_modulus(name):
+            raise NoCoarseStartError(
+                f"the coarse mesh does not determine {symbol_of(name)}"
+            )
+
+
+def start_note(start: CoarseStart, coarse: Solution, given: Solution) -> str:
+    """Return a note on a coarse start: size, sweeps and time of both solves."""
+    return (
+        f"coarse start: solved on {start.size} first, with {coarse.iterations} sweeps in "
+        f"{coarse.timing.total:.2g} s, then on the given mesh with {given.iterations} sweeps in "
+        f"{given.timing.total:.2g} s"
+    )
+
+
+def mesh_error_note(
+    start: CoarseStart, coarse: Solution, given: Solution
+) -> str | None:
+    """Return a note with the estimated error of the given mesh in each estimated parameter; None
+    if no parameter is estimated.
+
+    With edge lengths in the ratio r, elements of order 2 leave the r² − 1-th part of the difference
+    of both solutions (Richardson's extrapolation, as in `discretisation_error`), in the coordinate
+    in which the interval of the parameter is symmetric. The difference includes that of the
+    surfaces.
+    """
+    before = parameter_values(coarse.collocation, coarse.q)
+    after = parameter_values(given.collocation, given.q)
+    share = 1.0 / (start.edge_ratio**MESH_ORDER - 1.0)
+    linear = given.collocation.parameters.linear_names
+    errors = []
+    for item in given.collocation.parameters.free_scalars:
+        name = item.name
+        if after[name] == 0:
+            continue
+        at = IntervalCoordinate.for_estimate(
+            name, (before[name], after[name]), linear=name in linear
+        )
+        x = at.from_value(after[name])
+        limit = at.to_value(x + share * (x - at.from_value(before[name])))
+        error = (after[name] - limit) / abs(after[name])
+        if np.isfinite(error):
+            errors.append(f"{symbol_of(name)} {100 * error:+.2g} %")
+    if not errors:
+        return None
+    return (
+        "estimated error of the mesh, from the difference of both meshes: "
+        f"{', '.join(errors)}; it is not part of the intervals: `refine` measures it and corrects "
+        "the values"
+    )
