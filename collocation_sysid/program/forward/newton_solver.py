@@ -251,7 +251,7 @@ class NewtonSolver:
             if done and not self.options.checks_stability:
                 return x
         at = self.timed(linearise, x)
-        factor = self.factorise(at, x, keep_definite)
+        factor = self.factorise(at, x, keep_definite=keep_definite)
         iterate = _Iterate(x, factor, step=self.step(factor, at.residual))
         for _ in range(self.options.max_iterations):
             if self._is_last(iterate.step):
@@ -377,7 +377,7 @@ class NewtonSolver:
             )
             if done:
                 return improved
-        return self.solve(x, equations.residual, equations.linearise)
+        return self.solve(x, equations.residual, linearise=equations.linearise)
 
     def _simplified_newton(
         self, x: Array, iteration: ChordIteration
@@ -514,7 +514,9 @@ class NewtonSolver:
                     if at is None:
                         at = self.timed(linearise, trial)
                     try:
-                        own = self.factorise(at, trial, keep_definite)
+                        own = self.factorise(
+                            at, trial, keep_definite=keep_definite
+                        )
                         return _Iterate(
                             trial, own, step=self.step(own, at.residual)
                         )
