@@ -34,14 +34,14 @@ TRUTH = {
 }
 SIZE_M = (0.12, 0.03, 0.02)
 CELLS = (24, 4, 6)
-# Pixels: with them some 17,600 points are on the bar.
+# Pixels and focal length: with them some 17,600 points are on the bar.
 SHAPE = (480, 640)
-FOCAL_PX = 724.0
+FOCAL_PX = 750.0
 # Noise of the image and of the markers [m].
 NOISE_M = 1e-4
 MARKERS = 10
-# Below the distance of the pixels on the bar [m]: no point is left out.
-SPACING_M = 1e-5
+# About the distance of the pixels on the bar [m]: few points are left out.
+SPACING_M = 4e-4
 KINDS = ("markers", "depth")
 
 
