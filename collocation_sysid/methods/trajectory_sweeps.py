@@ -8,7 +8,7 @@ experiment alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -28,7 +28,8 @@ from .initial_trajectories import continue_trajectory
 # part of the first sweep.
 MARCHED = NewtonOptions(tolerance=1e-6)
 # Of equilibria near known ones. Those that are not found at once are too far for it.
-SETTLED = NewtonOptions(tolerance=1e-9, max_halvings=0)
+# Their stability is decided by the sweep along them, which factorises the same matrices.
+SETTLED = NewtonOptions(tolerance=1e-9, max_halvings=0, checks_stability=False)
 
 
 @dataclass(frozen=True)
@@ -248,17 +249,35 @@ def sweep_after_step(
         transcription, p, x=extrapolate(transcription, previous, step=step)
     )
     dynamics = part.equations.dynamics
-    x = part.x
-    if dynamics.is_static:
-        equilibria, failure = continue_simulation(
-            transcription.experiment,
-            dynamics.truncated_to(len(x)),
-            options=SETTLED,
-            stopwatch=solver.stopwatch,
-            approximate_solution=x,
+
+    def sweep_at(x: Array) -> LinearisedTrajectory:
+        """Return the sweep at positions x (rows, 3n) [m]."""
+        return sweep(
+            solver, transcription, p=p, trajectory=x, previous=previous
         )
-        x = equilibria if failure is None else x
-    return sweep(solver, transcription, p=p, trajectory=x, previous=previous)
+
+    def equilibria(options: NewtonOptions) -> Array | None:
+        """Return the equilibria near the extrapolated positions; None if one is not found."""
+        x, failure = continue_simulation(
+            transcription.experiment,
+            dynamics.truncated_to(len(part.x)),
+            options=options,
+            stopwatch=solver.stopwatch,
+            approximate_solution=part.x,
+        )
+        return x if failure is None else None
+
+    if not dynamics.is_static:
+        return sweep_at(part.x)
+    x = equilibria(SETTLED)
+    if x is None:
+        return sweep_at(part.x)
+    result = sweep_at(x)
+    if not result.report.indefinite_steps:
+        return result
+    # Only now is it known that the path left the stable equilibria.
+    x = equilibria(replace(SETTLED, checks_stability=True))
+    return sweep_at(part.x if x is None else x)
 
 
 def reassociate(

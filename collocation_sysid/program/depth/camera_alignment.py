@@ -8,9 +8,11 @@ Medioni 1992).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -125,32 +127,29 @@ def align_camera(
         for shift in shifts
     ]
     for half in np.array_split(gates, 2):
-        candidates = [
-            iterate_alignment(
-                camera,
-                tree,
-                places=places,
-                normals=normals,
-                gates=half,
-                start=start,
-            )
-            for start in candidates
-        ]
+        candidates = iterate_alignments(
+            camera,
+            tree,
+            places=places,
+            normals=normals,
+            gates=half,
+            starts=candidates,
+        )
         candidates.sort(key=lambda each: each.mismatch)
         candidates = candidates[:CONTINUED_STARTS]
     best = candidates[0]
     return best.rotation.as_rotvec(), best.translation_m
 
 
-def iterate_alignment(
+def iterate_alignments(
     camera: DepthCameraModel,
     tree: KDTree,
     places: Array,
     normals: Array,
     gates: Array,
-    start: AlignedPose,
-) -> AlignedPose:
-    """Iterate the alignment from one start.
+    starts: Sequence[AlignedPose],
+) -> list[AlignedPose]:
+    """Iterate the alignment from several starts, independently of each other.
 
     Parameters
     ----------
@@ -162,77 +161,149 @@ def iterate_alignment(
         Points of the surface with their normals, in the camera's stated frame.
     gates : array
         Gate of each iteration [m].
-    start : AlignedPose
-        Initial rotation and translation.
+    starts : sequence of AlignedPose
+        Initial rotations and translations.
 
     Returns
     -------
-    AlignedPose
-        Pose after the last step, with the mismatch before it.
+    list of AlignedPose
+        Poses after the last step, in the order of the starts, with the mismatch before it.
     """
-    rotation = start.rotation
-    translation_m = start.translation_m
-    pivot = camera.pivot_m
+    rotations = Rotation.concatenate([each.rotation for each in starts])
+    translations_m = np.array([each.translation_m for each in starts])
     prior = np.concatenate(
         [camera.prior_weights(row) for row in (DEPTH_TURN, DEPTH_SHIFT)]
     )
-    mismatch = 1.0
+    mismatches = np.ones(len(starts))
     for gate in gates:
-        # Cloud points p are at R (p − c) + c + d: the surface looks for them in their own frame.
-        _, nearest = tree.query(
-            rotation.inv().apply(places - pivot - translation_m) + pivot
+        matched = _match_surface(
+            camera,
+            tree,
+            places=places,
+            normals=normals,
+            rotations=rotations,
+            translations_m=translations_m,
         )
-        aligned = (
-            rotation.apply(np.asarray(tree.data)[nearest] - pivot)
-            + pivot
-            + translation_m
+        squares = np.sum(matched.distances_m**2, axis=2)
+        counts = matched.is_facing.sum(axis=1)
+        limited = np.minimum(squares / gate**2, 1.0) * matched.is_facing
+        mismatches = np.where(
+            counts > 0, limited.sum(axis=1) / np.maximum(counts, 1), 1.0
         )
-        distances = aligned - places
-        is_facing = np.ones(len(places), dtype=bool)
-        if camera.depth.camera.matrix is not None:
-            ways = rotation.apply(-pivot) + pivot + translation_m - places
-            is_facing = np.sum(
-                normals * ways, axis=1
-            ) > GRAZING * np.linalg.norm(ways, axis=1)
-        squares = np.sum(distances**2, axis=1)
-        mismatch = (
-            float(np.minimum(squares / gate**2, 1.0)[is_facing].mean())
-            if is_facing.any()
-            else 1.0
+        weights = np.sqrt(INDEPENDENT / np.maximum(counts, 1))[:, None]
+        weights = weights * matched.is_facing / gate
+        weights /= 1 + squares / (gate / 2) ** 2
+        errors = np.hstack([rotations.as_rotvec(), translations_m])
+        steps = _alignment_steps(
+            matched, normals, weights=weights, prior=prior, errors=errors
         )
-        weight = (
-            np.sqrt(INDEPENDENT / max(is_facing.sum(), 1)) * is_facing / gate
-        )
-        weight /= 1 + squares / (gate / 2) ** 2
-        by = np.concatenate(
-            [
-                -_cross_product_matrices(aligned - pivot - translation_m),
-                np.tile(np.eye(3), (len(places), 1, 1)),
-            ],
-            axis=2,
-        )
-        projected = (
-            np.einsum("pi,pij->pj", normals, by),
-            np.sum(normals * distances, axis=1),
-        )
-        rows = [
-            projected[0] * weight[:, None],
-            *(SLIDING * by * weight[:, None, None]).swapaxes(0, 1),
-        ]
-        right = [
-            projected[1] * weight,
-            *(SLIDING * distances * weight[:, None]).T,
-        ]
-        prior_residual = prior * np.concatenate(
-            [rotation.as_rotvec(), translation_m]
-        )
-        step = np.linalg.lstsq(
-            np.concatenate([*rows, np.diag(prior)]),
-            -np.concatenate([*right, prior_residual]),
-        )[0]
-        rotation = Rotation.from_rotvec(step[:3]) * rotation
-        translation_m = translation_m + step[3:]
-    return AlignedPose(rotation, translation_m, mismatch=mismatch)
+        rotations = Rotation.from_rotvec(steps[:, :3]) * rotations
+        translations_m = translations_m + steps[:, 3:]
+    return [
+        AlignedPose(rotations[k], translations_m[k], mismatch=float(mismatch))
+        for k, mismatch in enumerate(mismatches)
+    ]
+
+
+class _MatchedSurface(NamedTuple):
+    """Points of a surface with the nearest points of a cloud, for B camera errors.
+
+    Attributes
+    ----------
+    arms_m : (B, P, 3) array
+        Rotated cloud points relative to the camera's pivot [m].
+    distances_m : (B, P, 3) array
+        From the surface's points to the moved cloud points [m].
+    is_facing : (B, P) array of bool
+        Whether the surface faces the camera, not at a grazing angle; true without a camera.
+    """
+
+    arms_m: Array
+    distances_m: Array
+    is_facing: NDArray[np.bool_]
+
+
+def _match_surface(
+    camera: DepthCameraModel,
+    tree: KDTree,
+    places: Array,
+    normals: Array,
+    rotations: Rotation,
+    translations_m: Array,
+) -> _MatchedSurface:
+    """Return the nearest cloud points of surface points `places` (P, 3) [m] with `normals` (P, 3),
+    for camera errors of B rotations and translations (B, 3) [m].
+    """
+    pivot = camera.pivot_m
+    turns = rotations.as_matrix()
+    moved = translations_m[:, None] + pivot
+    # Cloud points p are at R (p − c) + c + d: the surface looks for them in their own frame.
+    _, nearest = tree.query((places - moved) @ turns + pivot)
+    arms_m = (np.asarray(tree.data)[nearest] - pivot) @ turns.swapaxes(1, 2)
+    is_facing = np.ones(nearest.shape, dtype=bool)
+    if camera.depth.camera.matrix is not None:
+        ways = (moved - (turns @ pivot)[:, None]) - places
+        cosines = np.sum(normals * ways, axis=2)
+        is_facing = cosines > GRAZING * np.linalg.norm(ways, axis=2)
+    return _MatchedSurface(arms_m, arms_m + moved - places, is_facing=is_facing)
+
+
+def _alignment_steps(
+    matched: _MatchedSurface,
+    normals: Array,
+    weights: Array,
+    prior: Array,
+    errors: Array,
+) -> Array:
+    """Return the Gauss–Newton steps (B, 6) of rotation vectors [rad] and translations [m].
+
+    They minimise Σ w² ((n · e)² + `SLIDING`² |e|²) over the distances e after the step, and the
+    squares of the errors over the prior. The 6 × 6 normal equations are solved for all B at once,
+    scaled by their diagonals.
+
+    Parameters
+    ----------
+    matched : _MatchedSurface
+        Distances before the step.
+    normals : (P, 3) array
+        Normals n.
+    weights : (B, P) array
+        Weights w [1/m].
+    prior : (6,) array
+        One over the prior standard deviations.
+    errors : (B, 6) array
+        Rotation vectors and translations before the step.
+    """
+    arms_m = matched.arms_m
+    distances_m = matched.distances_m
+    along = np.concatenate(
+        [np.cross(arms_m, normals), np.broadcast_to(normals, arms_m.shape)],
+        axis=2,
+    )
+    along *= weights[..., None]
+    offsets = weights * np.sum(normals * distances_m, axis=2)
+    matrices = along.swapaxes(1, 2) @ along
+    slopes = np.einsum("bpk,bp->bk", along, offsets)
+    # By a rotation vector ω a point moves by ω × r: the same sums of all three components.
+    factors = (SLIDING * weights) ** 2
+    total = factors.sum(axis=1)
+    weighted = factors[..., None] * arms_m
+    products = weighted.swapaxes(1, 2) @ arms_m
+    traces = np.trace(products, axis1=1, axis2=2)
+    matrices[:, :3, :3] += traces[:, None, None] * np.eye(3) - products
+    crossed = _cross_product_matrices(weighted.sum(axis=1))
+    matrices[:, :3, 3:] += crossed
+    matrices[:, 3:, :3] += crossed.swapaxes(1, 2)
+    matrices[:, 3:, 3:] += total[:, None, None] * np.eye(3)
+    slopes[:, :3] += np.cross(weighted, distances_m).sum(axis=1)
+    slopes[:, 3:] += np.einsum("bp,bpi->bi", factors, distances_m)
+    matrices += np.diag(prior**2)
+    slopes += prior**2 * errors
+    scales = np.sqrt(np.einsum("bii->bi", matrices))
+    scaled = matrices / (scales[:, :, None] * scales[:, None])
+    return (
+        -np.linalg.solve(scaled, (slopes / scales)[..., None])[..., 0] / scales
+    )
 
 
 def _cross_product_matrices(vectors: Array) -> Array:

@@ -322,11 +322,12 @@ def _outline_points(
     inwards = np.sum(normals * (places_px - centres), axis=1) < 0
     outwards = np.where(inwards[:, None], -normals, normals)
     separate = _first_of_each_cube(points_m, camera_in.depth.spacing_m)
-    alone = ~_covered(
-        places_px + OUTSIDE_PX * outwards,
+    separate = separate[length_px[separate] > 1e-6]
+    is_covered = _covered(
+        places_px[separate] + OUTSIDE_PX * outwards[separate],
         pixels[surface.plane_triangles[facing]],
     )
-    selected = separate[(alone & (length_px > 1e-6))[separate]]
+    selected = separate[~is_covered]
     if not len(selected):
         return None
     return _OutlinePoints(

@@ -37,6 +37,15 @@ FAST = 0.1
 LARGEST_CHORD_STEP_COUNT = 8
 # Chord steps end when the expected remaining error is this share of the tolerance.
 LEAST_RESIDUAL_SHARE = 1e-5
+# Largest ratio of successive chord steps towards an equilibrium: a factorisation costs as much as
+# about ten of them, which reduce the error a thousandfold at this ratio.
+SLOWEST_CHORD_RATE = 0.5
+# Largest number of chord steps towards an equilibrium with one factor.
+LARGEST_STATIC_CHORD_STEP_COUNT = 20
+# Chord steps towards an equilibrium end at this expected error, over the tolerance.
+STATIC_CHORD_SHARE = 1e-4
+# The same over the body's size, where rounding limits it.
+STATIC_CHORD_ROUNDING = 1e-13
 
 
 # Residual (3n,) of a state (3n,).
@@ -77,12 +86,32 @@ class NewtonOptions:
     max_halvings : int
         Largest number of halvings of a time step (Newmark) or of the increment of the grasps in it
         (schemes).
+    checks_stability : bool
+        Whether the stiffness of an equilibrium is factorised at the equilibrium itself. If false,
+        it may be known to be positive definite only at a near state, from which chord steps led
+        there, and the caller checks it.
     """
 
     tolerance: float = 1e-10
     max_iterations: int = 30
     max_backtracks: int = 25
     max_halvings: int = 8
+    checks_stability: bool = True
+
+
+class _Chords(NamedTuple):
+    """Result of chord steps towards an equilibrium.
+
+    Attributes
+    ----------
+    x : (3n,) array
+        Last state [m].
+    converged : bool
+        Whether the expected error of x is negligible.
+    """
+
+    x: Array
+    converged: bool
 
 
 class NewtonFailure(Exception):
@@ -120,6 +149,9 @@ class NewtonSolver:
         Factor of the last solution of complete equations, with which the next one begins.
     compliance : Compliance or None
         Inverse of the matrix of the body without contact, of the last step with contact.
+    definite_factor : Factor or None
+        Last positive definite factor on the way to an equilibrium, with which the next search for
+        one begins.
 
     Parameters
     ----------
@@ -154,6 +186,7 @@ class NewtonSolver:
         self.size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
         self.last_factor: Factor | None = None
         self.compliance: Compliance | None = None
+        self.definite_factor: Factor | None = None
 
     def solve(
         self,
@@ -168,7 +201,9 @@ class NewtonSolver:
         A step is accepted when the next one, computed with the same factor, is shorter (Deuflhard's
         natural monotonicity test), and no element is inverted. Equilibria may be far from x:
         without obstacles their steps are applied as rotations and strains, see `Retraction`. Time
-        steps first reuse the factor of the previous solution as long as steps shrink fast.
+        steps first reuse the factor of the previous solution as long as steps shrink fast, and
+        equilibria that of the previous equilibrium. Chord steps replace those of Newton where they
+        shrink fast.
 
         Parameters
         ----------
@@ -181,7 +216,8 @@ class NewtonSolver:
             `NewtonLinearisation` at x.
         keep_definite : bool
             If true, solve for a stable equilibrium: accept states only while −∂residual/∂x is
-            positive definite, and factorise at every iterate.
+            positive definite wherever it is factorised, which includes the solution unless
+            `checks_stability` of the options is false.
         prescribed_m : (prescribed,) array, optional
             Positions of the prescribed dofs [m]. The free dofs first follow to first order, because
             moving prescribed dofs alone would crush adjacent elements.
@@ -210,6 +246,10 @@ class NewtonSolver:
             )
             if done:
                 return improved
+        else:
+            x, done = self._with_known_factor(x, residual)
+            if done and not self.options.checks_stability:
+                return x
         at = self.timed(linearise, x)
         factor = self.factorise(at, x, keep_definite=keep_definite)
         iterate = _Iterate(x, factor, step=self.step(factor, at.residual))
@@ -218,6 +258,16 @@ class NewtonSolver:
                 self.last_factor = iterate.factor
                 iterate.x[self.free] += iterate.step
                 return iterate.x
+            if keep_definite:
+                self.definite_factor = iterate.factor
+                chords = self._static_chords(iterate, residual)
+                if chords is not None:
+                    if chords.converged and not self.options.checks_stability:
+                        return chords.x
+                    following = self._definite_iterate(chords.x, linearise)
+                    if following is not None:
+                        iterate = following
+                        continue
             iterate = self._backtrack(
                 iterate,
                 residual,
@@ -228,6 +278,75 @@ class NewtonSolver:
             iterate.x,
             f"Newton's method took more than {self.options.max_iterations} iterations",
         )
+
+    def _with_known_factor(
+        self, x: Array, residual: Residual
+    ) -> tuple[Array, bool]:
+        """Return a state nearer to an equilibrium by chord steps with `definite_factor`, and
+        whether it is the equilibrium; x (3n,) [m] itself and false where they do not shrink fast,
+        or without a factor.
+        """
+        factor = self.definite_factor
+        if factor is None:
+            return x, False
+        step = self.step(factor, self.timed(residual, x))
+        chords = self._static_chords(_Iterate(x, factor, step=step), residual)
+        return (x, False) if chords is None else (chords.x, chords.converged)
+
+    def _static_chords(
+        self, iterate: _Iterate, residual: Residual
+    ) -> _Chords | None:
+        """Return the state after chord steps from an iterate towards an equilibrium, as long as
+        they shrink by `SLOWEST_CHORD_RATE` each; None if the first one does not, or inverts an
+        element.
+
+        Parameters
+        ----------
+        iterate : _Iterate
+            State, factor and first step; not modified.
+        residual : callable
+            Residual (3n,) of a state (3n,).
+        """
+        goal_m = self.size_m * max(
+            STATIC_CHORD_SHARE * self.options.tolerance, STATIC_CHORD_ROUNDING
+        )
+        x = iterate.x
+        step = iterate.step
+        has_moved = False
+        for _ in range(LARGEST_STATIC_CHORD_STEP_COUNT):
+            trial = x.copy()
+            trial[self.free] += step
+            if not self.has_no_inverted_element(trial):
+                break
+            value = self.timed(residual, trial)
+            following = self.step(iterate.factor, value)
+            length = float(np.linalg.norm(step))
+            rate = float(np.linalg.norm(following)) / max(length, 1e-300)
+            # Rounding ends the contraction of the smallest steps.
+            is_rounding = self._is_last(following, OLD_FACTOR_SHARE)
+            if not (rate <= SLOWEST_CHORD_RATE or is_rounding):
+                break
+            has_moved = True
+            x = trial
+            step = following
+            error_m = rate / (1 - min(rate, 0.9)) * np.abs(step).max(initial=0)
+            if error_m <= goal_m or is_rounding:
+                x[self.free] += step
+                return _Chords(x, converged=True)
+        return _Chords(x, converged=False) if has_moved else None
+
+    def _definite_iterate(
+        self, x: Array, linearise: Linearise
+    ) -> _Iterate | None:
+        """Return the iterate at x (3n,) [m] with a factor of its own, or None if the matrix is
+        singular or not positive definite there.
+        """
+        at = self.timed(linearise, x)
+        try:
+            factor = self.factorise(at, x, keep_definite=True)
+        except NewtonFailure:
+            return None
+        return _Iterate(x, factor, step=self.step(factor, at.residual))
 
     def solve_in_contact(self, x: Array, equations: ContactEquations) -> Array:
         """Solve one time step, with contact or without, for the free dofs.

@@ -153,7 +153,9 @@ def continue_simulation(
         elif approximate_solution is None:
             guess = _extrapolate_static(x[:t], solver.is_prescribed, goal=goal)
         else:
-            guess = approximate_solution[t]
+            # What was missed at the row before is missed here too.
+            guess = approximate_solution[t] + x[t - 1]
+            guess -= approximate_solution[t - 1]
         try:
             x[t] = solve_row(
                 solver, row, guess=guess, previous=x[t - 1], prescribed_m=goal
@@ -287,15 +289,12 @@ class RowEquations:
                 previous,
                 interval_s=float(dynamics.interval_to_next_s[t - 1]),
             )
-        self.forces_before = (
-            at_times(dynamics.forces, slice(t - 1, t))
+        self.rest, contacts = self.forces.without_contact()
+        self.rest_before = (
+            at_times(dynamics.forces, slice(t - 1, t)).without_contact()[0]
             if dynamics.is_static
             else None
         )
-        self.rest = self.forces
-        contacts = []
-        if not dynamics.is_static:
-            self.rest, contacts = self.forces.without_contact()
         self.contact = StepContact(
             contacts, self.rest.theta, pattern=self.rest.pattern
         )
@@ -317,9 +316,9 @@ class RowEquations:
         its own (share 1); rows of a motion have their complete loads.
         """
         scaled = copy(self)
-        if self.forces_before is not None:
+        if self.rest_before is not None and share < 1:
             scaled.rest = interpolate_in_time(
-                self.forces_before, self.forces, share=share
+                self.rest_before, self.rest, share=share
             )
         return scaled
 

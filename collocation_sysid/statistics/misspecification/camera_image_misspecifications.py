@@ -22,7 +22,7 @@ from ...fem.laws.moduli import engineering_constants
 from ...model.nuisance_map import NuisanceMap
 from ...program.depth.camera_alignment import (
     AlignedPose,
-    iterate_alignment,
+    iterate_alignments,
     thinned,
 )
 from ...program.depth.depth_camera_model import DepthCameraModel
@@ -351,13 +351,13 @@ class _ImageComparison:
         places_m, normals = self.surfaces[index]
         gate_m = self.camera.depth.gate_m
         size_m = self.camera.size_m
-        aligned = iterate_alignment(
+        (aligned,) = iterate_alignments(
             self.camera,
             tree,
             places=places_m,
             normals=normals,
             gates=np.geomspace(INITIAL_GATE * size_m, gate_m, iterations),
-            start=AlignedPose(Rotation.identity(), np.zeros(3)),
+            starts=[AlignedPose(Rotation.identity(), np.zeros(3))],
         )
         rotation = aligned.rotation
         shift_m = aligned.translation_m

@@ -1,0 +1,182 @@
+"""Time the search with one depth image of 17,600 points against that with ten markers.
+
+A bar of 875 nodes hangs from one end; of its Young's modulus there is no guess, and the pose, bias
+and scale of the camera are estimated. An earlier revision and this one solve both in turn, in
+processes of their own and on one thread, so that other work on the machine slows all. Printed are
+the least processor times of `solve`, without imports and the reading of data, their ratio for
+either revision, and the relative difference of the estimates.
+
+    python scripts/benchmark_depth.py [--baseline bbaeea20] [--rounds 3]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from benchmark_static_friction import ROOT, checkout
+
+import collocation_sysid as cs
+
+TRUTH = {
+    "young_pa": 1.5e5,
+    "poisson": 0.45,
+    "gamma_r_s": 1e-3,
+    "gamma_m_1_s": 0.1,
+}
+SIZE_M = (0.12, 0.03, 0.02)
+CELLS = (24, 4, 6)
+# Pixels and focal length: with them some 17,600 points are on the bar.
+SHAPE = (480, 640)
+FOCAL_PX = 750.0
+# Noise of the image and of the markers [m].
+NOISE_M = 1e-4
+MARKERS = 10
+# About the distance of the pixels on the bar [m]: few points are left out.
+SPACING_M = 4e-4
+KINDS = ("markers", "depth")
+
+
+def main() -> None:
+    """Measure and print, or solve once with --solve."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--baseline", default="bbaeea20", metavar="REVISION")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--solve", choices=KINDS)
+    given = parser.parse_args()
+    if given.solve:
+        print(json.dumps(solved(given.solve)))
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        before = checkout(given.baseline, Path(folder) / "before")
+        trees = {given.baseline: before, "now": ROOT}
+        runs = {(name, kind): [] for name in trees for kind in KINDS}
+        for _ in range(given.rounds):
+            for (name, kind), results in runs.items():
+                results.append(in_process(trees[name], kind))
+    for name in trees:
+        spent_s = {
+            kind: min(each["spent_s"] for each in runs[name, kind])
+            for kind in KINDS
+        }
+        print(
+            f"{name}: markers {spent_s['markers']:.2f} s, "
+            f"{runs[name, 'depth'][0]['points']} points {spent_s['depth']:.2f} s, "
+            f"ratio {spent_s['depth'] / spent_s['markers']:.2f}"
+        )
+    for kind in KINDS:
+        first, second = (runs[name, kind][0]["young_pa"] for name in trees)
+        print(f"{kind}: E differs by {abs(second / first - 1):.1e}")
+
+
+def in_process(tree: Path, kind: str) -> dict:
+    """Return the result of `solved` in a process with the package of a tree."""
+    environment = os.environ | {
+        "PYTHONPATH": f"{tree}{os.pathsep}{Path(__file__).parent}",
+        "COLLOCATION_SYSID_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+    }
+    done = subprocess.run(
+        [sys.executable, __file__, "--solve", kind],
+        env=environment,
+        cwd=tree,
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    return json.loads(done.stdout)
+
+
+def solved(kind: str) -> dict:
+    """Return the processor time of a solve [s], the estimate and the number of points."""
+    experiment = observed(kind)
+    unknown = {**TRUTH, "young_pa": cs.Unknown()}
+    problem = cs.Problem([experiment], cs.Parameters.from_mapping(unknown))
+    began_s = time.process_time()
+    solution = cs.solve(problem)
+    spent_s = time.process_time() - began_s
+    points = sum(len(p) for d in experiment.depths for p in d.points_m)
+    young_pa = solution.parameters["young_pa"]
+    return {"spent_s": spent_s, "young_pa": young_pa, "points": points}
+
+
+def observed(kind: str) -> cs.Experiment:
+    """Return the hanging bar with its markers, or with one image of a camera."""
+    body = cs.Body(cs.box_mesh(SIZE_M, CELLS), density_kg_m3=1070.0)
+    held = cs.Grasp(
+        np.flatnonzero(body.nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed()
+    )
+    rng = np.random.default_rng(0)
+    places_m = body.nodes_m[
+        np.linspace(0, len(body.nodes_m) - 1, MARKERS + 1).astype(int)[1:]
+    ]
+    markers = cs.Markers(
+        np.zeros(1), np.zeros((1, MARKERS, 3)), NOISE_M, places_m=places_m
+    )
+    experiment = cs.Experiment(
+        body,
+        [0.0],
+        [held],
+        markers,
+        kind="static",
+        nuisance=cs.Nuisance.none(),
+    )
+    motion = cs.simulate(experiment, TRUTH)
+    if kind == "markers":
+        positions_m = motion.markers_m + NOISE_M * rng.normal(
+            size=motion.markers_m.shape
+        )
+        return replace(
+            experiment, markers=replace(markers, positions_m=positions_m)
+        )
+    x = motion.positions_m[0]
+    corners_m = x[body.mesh.surface]
+    camera = camera_at(x.mean(axis=0))
+    rotations, translations = camera.pose_at([0.0])
+    image_m = cs.depth_image(
+        camera, SHAPE, (corners_m - translations[0]) @ rotations[0]
+    )
+    image_m += NOISE_M * rng.normal(size=SHAPE)
+    unknown = cs.Nuisance.none(
+        depth_turn_rad=0.09,
+        depth_shift_m=0.02,
+        depth_bias_m=0.005,
+        depth_scale=0.005,
+    )
+    depth = cs.Depth.of_images(
+        "front", image_m, camera, NOISE_M, spacing_m=SPACING_M
+    )
+    return cs.Experiment(
+        body, [0.0], [held], kind="static", depths=[depth], nuisance=unknown
+    )
+
+
+def camera_at(middle_m: np.ndarray) -> cs.DepthCamera:
+    """Return a camera that looks at a place from the side and from above."""
+    ahead = np.array([0.0, 0.9, -0.44])
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.column_stack(
+        [right, np.cross(ahead, right), ahead, middle_m - 0.33 * ahead]
+    )
+    height, width = SHAPE
+    matrix = [
+        [FOCAL_PX, 0, width / 2],
+        [0, FOCAL_PX, height / 2],
+        [0, 0, 1],
+    ]
+    return cs.DepthCamera(matrix, pose=pose)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""Alignment of a depth camera: steps of several starts at once."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from collocation_sysid.program.depth import camera_alignment
+from collocation_sysid.program.depth.camera_alignment import (
+    SLIDING,
+    _alignment_steps,
+    _MatchedSurface,
+)
+
+
+def test_steps_are_those_of_linear_least_squares():
+    rng = np.random.default_rng(1)
+    starts, points = 3, 40
+    arms_m = rng.normal(size=(starts, points, 3))
+    distances_m = 0.1 * rng.normal(size=(starts, points, 3))
+    normals = rng.normal(size=(points, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    weights = rng.uniform(size=(starts, points))
+    prior = np.array([11.0, 11.0, 1e6, 50.0, 50.0, 50.0])
+    errors = 0.01 * rng.normal(size=(starts, 6))
+    matched = _MatchedSurface(
+        arms_m, distances_m, is_facing=np.ones((starts, points), dtype=bool)
+    )
+    steps = _alignment_steps(
+        matched, normals, weights=weights, prior=prior, errors=errors
+    )
+    for k in range(starts):
+        rows = []
+        right = []
+        for arm, away, normal, weight in zip(
+            arms_m[k], distances_m[k], normals, weights[k], strict=True
+        ):
+            by = np.hstack([np.cross(np.eye(3), arm).T, np.eye(3)])
+            # A column of `by` is the motion of the point by a unit of one parameter.
+            assert np.allclose(by[:, 1], np.cross([0, 1, 0], arm))
+            rows += [weight * normal @ by, *(SLIDING * weight * by)]
+            right += [weight * normal @ away, *(SLIDING * weight * away)]
+        expected = np.linalg.lstsq(
+            np.vstack([rows, np.diag(prior)]),
+            -np.concatenate([right, prior * errors[k]]),
+        )[0]
+        np.testing.assert_allclose(steps[k], expected, rtol=1e-9, atol=1e-12)
+
+
+class _Camera:
+    """Camera of a cloud without matrix, with a wide prior."""
+
+    class depth:
+        class camera:
+            matrix = None
+
+    pivot_m = np.array([0.1, 0.0, 0.0])
+
+    def prior_weights(self, row):
+        return np.full(3, 1.0)
+
+
+def test_starts_do_not_influence_each_other():
+    rng = np.random.default_rng(2)
+    places = rng.uniform(size=(60, 3))
+    normals = rng.normal(size=(60, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    moved = Rotation.from_rotvec([0.05, -0.02, 0.03]).apply(places) + 0.02
+    tree = camera_alignment.KDTree(moved)
+    starts = [
+        camera_alignment.AlignedPose(Rotation.from_rotvec(turn), np.zeros(3))
+        for turn in ([0, 0, 0], [0.1, 0, 0], [0, -0.1, 0])
+    ]
+
+    def aligned(some):
+        return camera_alignment.iterate_alignments(
+            _Camera(),
+            tree,
+            places=places,
+            normals=normals,
+            gates=np.geomspace(0.5, 0.02, 12),
+            starts=some,
+        )
+
+    together = aligned(starts)
+    for start, each in zip(starts, together, strict=True):
+        (alone,) = aligned([start])
+        np.testing.assert_allclose(
+            each.rotation.as_rotvec(), alone.rotation.as_rotvec(), atol=1e-12
+        )
+        np.testing.assert_allclose(
+            each.translation_m, alone.translation_m, atol=1e-12
+        )
+        assert abs(each.mismatch - alone.mismatch) < 1e-12
+    # The cloud is the surface, moved: the alignment undoes that.
+    np.testing.assert_allclose(
+        together[0].rotation.as_rotvec(), [-0.05, 0.02, -0.03], atol=2e-3
+    )
