@@ -25,8 +25,8 @@ from ..recording.sample_times import TIME_TOLERANCE_S
 from .markers.marker_association import MarkerAssociation
 from .measurement_residual import (
     GROUP,
-    Channel,
     MeasurementResidual,
+    Observable,
     RowStencil,
     lagrange_weights,
     neighbouring_times,
@@ -67,7 +67,7 @@ class CustomSensorResidual(MeasurementResidual):
         cls,
         sensor: Gauge,
         number: int,
-        observable: Channel,
+        observable: Observable,
         at_s: Array,
         nuisance: NuisanceMap,
         huber: float | None,
@@ -83,7 +83,7 @@ class CustomSensorResidual(MeasurementResidual):
             The user's sensor with its samples.
         number : int
             Index of the sensor in the experiment, from 0.
-        observable : Channel
+        observable : Observable
             Observable.
         at_s : (n,) array
             Times of the observable [s]; samples outside are not compared.

@@ -32,7 +32,7 @@ from .wrench.wrench_observable import GraspWrench, ReactionGrid
 GROUP = 3
 
 # Observables of measurements.
-Channel = PointPositions | GraspWrench
+Observable = PointPositions | GraspWrench
 
 T = TypeVar("T", float, ca.SX)
 Expression = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
@@ -252,7 +252,7 @@ class MeasurementResidual(ABC):
 
     Attributes
     ----------
-    observable : Channel
+    observable : Observable
         Observable; its values c are (n, e, 3), at the first n of its times.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment.
@@ -285,7 +285,7 @@ class MeasurementResidual(ABC):
         to be small.
     """
 
-    observable: Channel
+    observable: Observable
     nuisance: NuisanceMap
     huber: float | None
     names: tuple[str, ...]

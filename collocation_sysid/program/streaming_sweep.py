@@ -30,7 +30,6 @@ from .measurement_residual import huber_as_least_squares, lagrange_weights
 from .observables import (
     ObservableDerivatives,
     ObservedMotion,
-    ReactionForces,
 )
 from .streaming_model import ROW_TOLERANCE, ROWS_PER_CHUNK, StreamingModel
 from .sweep import (
@@ -683,11 +682,7 @@ class StreamingSweep:
             weights=(stencils.w, stencils.s),
             rows=rows,
         )
-
-        def known_reactions() -> ReactionForces:
-            return reactions
-
-        motion = ObservedMotion(x, known_reactions)
+        motion = ObservedMotion(x, reactions)
         for k, channel in enumerate(channels):
             value, slopes = channel.linearise(
                 motion, self.phi, columns=self.moving, size=size

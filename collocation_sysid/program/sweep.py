@@ -56,11 +56,13 @@ LARGEST_CHUNK_ROWS = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Tangent:
+class SweepResult:
     """Feasibility step and sensitivities of one experiment at given positions and parameters.
 
     Attributes
     ----------
+    x : (N, 3n) array
+        Positions [m], before the feasibility step.
     step : (N, 3n) array
         Feasibility step p = −c_x⁻¹ c [m].
     by_p : (N, 3n, m) array
@@ -76,6 +78,7 @@ class Tangent:
         by p.
     """
 
+    x: Array
     step: Array
     by_p: Array
     violation_n: float
@@ -408,8 +411,8 @@ class Sweep:
         self,
         x: Array,
         equations: EquationsAtParameters,
-        known: Tangent | None = None,
-    ) -> Tangent:
+        known: SweepResult | None = None,
+    ) -> SweepResult:
         """Compute the feasibility step p and the sensitivities Z at all grid times of this sweep.
 
         Parameters
@@ -418,7 +421,7 @@ class Sweep:
             Positions [m].
         equations : EquationsAtParameters
             Equations of motion at the parameters.
-        known : Tangent, optional
+        known : SweepResult, optional
             Result for the first rows at the same positions and parameters; it is continued, not
             modified.
 
@@ -449,7 +452,8 @@ class Sweep:
             x, 0 if known is None else len(known.step), out=columns
         ):
             pass
-        return Tangent(
+        return SweepResult(
+            x,
             step=columns[:, :, 0],
             by_p=columns[:, :, 1:],
             violation_n=march.violation_n,

@@ -109,10 +109,15 @@ def simulate_experiments(
     problem: Problem, solution: Solution
 ) -> dict[str, ForwardSimulation | str]:
     """Simulate all experiments of a problem, also those for validation, in parallel threads with
-    the estimates of a solution.
+    the estimates of a solution, and return the results by experiment name; text is the reason why a
+    simulation failed, see `simulate_experiment`.
 
-    Return the results by experiment name, see `simulate_experiment`. The progress is reported to
-    the counters of `counted_phase`.
+    The progress is reported to the counters of `counted_phase`.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If the fit of the nuisance parameters of a validation experiment is interrupted.
     """
     threads = solution.collocation.threads
 
@@ -487,7 +492,7 @@ def _sensor_differences(
         return []
     fitted = (
         part.x[segment.markers.sample_rows],
-        (ReactionGrid.from_dynamics(segment.dynamics), part.motion.reactions),
+        (ReactionGrid.from_dynamics(segment.dynamics), part.reactions),
     )
     rolled = (
         trajectory.positions_m.reshape(len(fitted[0]), -1),
@@ -553,11 +558,7 @@ def _predict_sensors(
         Nuisance parameters of the recording.
     """
     grid = reactions[0]
-
-    def forced() -> ReactionForces:
-        return reactions[1]
-
-    motion = ObservedMotion(x, forced)
+    motion = ObservedMotion(x, reactions[1])
     gauges = custom_sensor_residuals(
         segment.experiment,
         segment.experiment.t_s,

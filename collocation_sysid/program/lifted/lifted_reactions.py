@@ -98,7 +98,7 @@ class LiftedReactions(LiftedVariables):
         """Return the scaled reaction forces (count,) that follow from the positions and parameters
         of the iterate.
         """
-        return self._scaled(iterate.motion.reactions.reaction)
+        return self._scaled(iterate.reactions.reaction)
 
     def _scaled(self, newtons: Array) -> Array:
         """Return forces (N, …) [N] as scaled values, without the rows before the first

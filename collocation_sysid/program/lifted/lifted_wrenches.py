@@ -118,9 +118,7 @@ class LiftedWrench(LiftedVariables):
         motion.
         """
         own = [
-            self.observable.evaluate_unfiltered(
-                iterate.motion.reactions, iterate.phi
-            )
+            self.observable.evaluate_unfiltered(iterate.reactions, iterate.phi)
         ]
         if evolution := self.observable.filter_wrench(own[0], iterate.phi):
             own += [*evolution.states]
