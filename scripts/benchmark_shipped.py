@@ -21,7 +21,6 @@ from collocation_sysid import pipeline
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
-from collocation_sysid.runs.solved_problem import Run
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
 # Problems whose data are in the repository and that interior point solves within minutes.
@@ -66,7 +65,9 @@ def measure(name: str, cases: tuple[str, ...]) -> None:
             print_case(case, time.process_time() - began_s, solved, reference)
 
 
-def print_case(case: str, time_s: float, solved: Run, reference: Run) -> None:
+def print_case(
+    case: str, time_s: float, solved: pipeline.Run, reference: pipeline.Run
+) -> None:
     """Print status, iterations, time and distance from the reference of one run."""
     solution = solved.solution
     values = np.array(list(solution.parameters.values()))
