@@ -1,8 +1,8 @@
 """Interior point beside reduced space on shipped problems, from the default start and warm.
 
 For each problem: reduced space, interior point from the default start, and interior point from the
-run folder of reduced space (`--start`). Prints processor time of the complete runs, sweeps and
-iterations of IPOPT, and the largest difference of a parameter's logarithm from reduced space's.
+answer of reduced space, as with `--start`. Prints processor time of the solves, without error bars,
+sweeps and iterations of IPOPT, and the largest difference of a parameter (most are logarithms).
 
     python scripts/benchmark_shipped.py
     python scripts/benchmark_shipped.py poked_block laid_block/problem.toml --cases warm
@@ -11,17 +11,16 @@ iterations of IPOPT, and the largest difference of a parameter's logarithm from 
 from __future__ import annotations
 
 import argparse
-import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 
-from collocation_sysid import pipeline
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.pipeline import Run
+from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
+from collocation_sysid.runs.warm_start import WarmStart
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
 # Problems whose data are in the repository and that interior point solves within minutes.
@@ -33,7 +32,7 @@ DEFAULT = (
     "poked_block",
     "wrist_sensor",
 )
-# "default": from the start that interior point chooses; "warm": from the run of reduced space.
+# "default": from the start that interior point chooses; "warm": from the answer of reduced space.
 CASES = ("default", "warm")
 
 
@@ -47,39 +46,26 @@ def measure(name: str, cases: tuple[str, ...]) -> None:
     """Solve a shipped problem by reduced space and in each of the cases, and print the results."""
     problem = Problem.read(problem_file(name))
     began_s = time.process_time()
-    reference = pipeline.run(problem, ReducedSpace(), seek_causes=False)
+    reference = solve(problem, ReducedSpace())
     reference_s = time.process_time() - began_s
     print(
-        f"{name}: reduced space {reference.solution.iterations} sweeps, {reference_s:.1f} s",
+        f"{name}: reduced space {reference.status.value}, {reference.iterations} sweeps, "
+        f"{reference_s:.1f} s",
         flush=True,
     )
-    with tempfile.TemporaryDirectory() as folder:
-        start = reference.save(Path(folder) / "reduced-space", pictures=False)
-        for case in cases:
-            began_s = time.process_time()
-            solved = pipeline.run(
-                problem,
-                InteriorPoint(),
-                start=start if case == "warm" else None,
-                seek_causes=False,
-            )
-            print_case(case, time.process_time() - began_s, solved, reference)
-
-
-def print_case(case: str, time_s: float, solved: Run, reference: Run) -> None:
-    """Print status, iterations, time and distance from the reference of one run."""
-    solution = solved.solution
-    values = np.array(list(solution.parameters.values()))
-    expected = np.array(list(reference.solution.parameters.values()))
-    differ = values != expected
-    apart = np.abs(np.log(np.abs(values[differ] / expected[differ])))
-    print(
-        f"    {case}: {solution.status.value}, {solution.iterations} iterations, {time_s:.1f} s; "
-        f"log parameters differ by {apart.max(initial=0.0):.1e}",
-        flush=True,
-    )
-    for note in solution.notes:
-        print(f"        {note}", flush=True)
+    for case in cases:
+        start = WarmStart.of(reference) if case == "warm" else None
+        began_s = time.process_time()
+        solution = solve(problem, InteriorPoint(), start=start)
+        solution_s = time.process_time() - began_s
+        apart = np.abs(solution.q - reference.q).max(initial=0.0)
+        print(
+            f"    {case}: {solution.status.value}, {solution.iterations} iterations, "
+            f"{solution_s:.1f} s; parameters differ by {apart:.1e} of the solver's unit",
+            flush=True,
+        )
+        for note in solution.notes:
+            print(f"        {note}", flush=True)
 
 
 def main() -> None:

@@ -38,6 +38,8 @@ CONTACT_PA = YOUNG_PA / (1 - POISSON**2)
 # Lengths in half-widths of the contact: a fiftieth of the radius strains little.
 RADIUS_M, FINE_M = 50.0, 1.4
 UP = np.array([0.0, 0.0, 1.0])
+# Blocks from which the force on a half-space is extrapolated.
+SIZES_M = (30.0, 90.0)
 
 
 def ticks(
@@ -63,10 +65,13 @@ def pressed(
     shape: Solid,
     depth_m: float,
     edge_m: float,
-    kappa: float,
-    delta: float,
+    kappa: float | None,
+    delta: float | None,
 ) -> tuple[float, float]:
-    """The force [N], and the mean square of the distances from the middle of the contact [m²]."""
+    """The force [N], and the mean square of the distances from the middle of the contact [m²].
+
+    Where κ or δ is None, the obstacle has the default, and may touch all faces.
+    """
     low = body.nodes_m.min(axis=0)
     where = [
         np.flatnonzero(np.abs(body.nodes_m[:, k] - low[k]) < 1e-9)
@@ -91,9 +96,9 @@ def pressed(
     touched = cs.Obstacle(
         poses=down,
         shape=shape,
-        faces=top,
-        stiffness_pa_m=kappa * YOUNG_PA / edge_m,
-        width_m=delta * edge_m,
+        faces=None if kappa is None else top,
+        stiffness_pa_m=None if kappa is None else kappa * YOUNG_PA / edge_m,
+        width_m=None if delta is None else delta * edge_m,
         wrench=cs.Wrench(np.zeros(1), np.zeros((1, 6)), 1.0, sigma_nm=1.0),
     )
     experiment = cs.Experiment(
@@ -139,6 +144,38 @@ def sphere(
     return 4 * force_n / (4 / 3 * CONTACT_PA * radius_m**3 / RADIUS_M), len(
         body.nodes_m
     )
+
+
+def sphere_at_depth(cells: int, size_m: float) -> tuple[float, int]:
+    """Return the force of a sphere over that of Hertz for its depth, and the number of nodes.
+
+    Stiffness, width and faces of the contact are the defaults. A block of finite size is stiffer
+    than a half-space, by a share that is inversely proportional to its size.
+
+    Parameters
+    ----------
+    cells : int
+        Elements to the radius of the contact.
+    size_m : float
+        Edge of the block, in radii of the contact.
+    """
+    wide = ticks(round(FINE_M * cells), FINE_M, size_m, 2.0)
+    deep = ticks(max(1, round(FINE_M * cells / 2)), FINE_M / 2, size_m, 2.0)
+    body = block(wide, wide, -deep)
+    shape = cs.Sphere(RADIUS_M, RADIUS_M * UP)
+    depth_m = 1 / RADIUS_M
+    force_n, _ = pressed(body, shape, depth_m, 1 / cells, None, None)
+    hertz_n = 4 / 3 * CONTACT_PA * np.sqrt(RADIUS_M) * depth_m**1.5
+    return 4 * force_n / hertz_n, len(body.nodes_m)
+
+
+def sphere_on_half_space(cells: int) -> float:
+    """Return the force at a depth over that of Hertz, extrapolated from two blocks to a half-space,
+    with the default contact and so many elements to the radius of the contact.
+    """
+    small, large = (sphere_at_depth(cells, size_m)[0] for size_m in SIZES_M)
+    ratio = SIZES_M[1] / SIZES_M[0]
+    return (ratio * large - small) / (ratio - 1)
 
 
 def cylinder(

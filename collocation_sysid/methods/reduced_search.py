@@ -651,7 +651,8 @@ class ReducedSearch:
         """Return whether a trial is still acceptable with depth points associated at its estimates.
 
         A depth point may then belong to another part of the surface, or to none. The number of
-        measurements must be at least `LEAST_VISIBLE_SHARE` of the largest so far, and the loss per
+        measurements, with those left out because of a crease (`Collocation.associated_count`), must
+        be at least `LEAST_VISIBLE_SHARE` of the largest so far, and the loss per
         measurement at most `EQUAL_MISFIT_RATIO` times that of the point. True without depth
         cameras; false if the association may not be updated any more.
 
@@ -674,7 +675,7 @@ class ReducedSearch:
         if self.reassociations >= REREADINGS:
             return False
         self.most_measurements = max(
-            self.most_measurements, before.measurement_count
+            self.most_measurements, before.associated_count
         )
         after = self._reassociate(horizon, trial)
         if self.collocation is not before:
@@ -682,12 +683,12 @@ class ReducedSearch:
         self.camera_trial = _ReassociatedTrial(
             trial, self.collocation, reassociated=after
         )
-        measurements = self.collocation.measurement_count
-        each = after.loss / max(1, measurements)
+        associated = self.collocation.associated_count
+        each = after.loss / max(1, self.collocation.measurement_count)
         before_each = point.loss / max(1, before.measurement_count)
         self._set_collocation(horizon, before, p=point.p)
         return (
-            measurements >= LEAST_VISIBLE_SHARE * self.most_measurements
+            associated >= LEAST_VISIBLE_SHARE * self.most_measurements
             and each <= EQUAL_MISFIT_RATIO * before_each
         )
 

@@ -295,6 +295,17 @@ class Collocation:
         )
 
     @property
+    def associated_count(self) -> int:
+        """Number of scalar measurements that belong to the body at the present estimates: those
+        that are compared, and the points of depth cameras that are left out because of a crease.
+        """
+        return self.measurement_count + sum(
+            each.correspondences.excluded_counts["crease"]
+            for segment in self.transcriptions
+            for each in segment.depths
+        )
+
+    @property
     def loss_scale(self) -> float:
         """Factor of the loss in the objective: one over the number of measurements, or 1 without
         any.

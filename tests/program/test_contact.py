@@ -18,7 +18,7 @@ from kit.problems import (
     pressed_cube,
 )
 from scipy.optimize import brentq, minimize
-from study_contact import cylinder, sphere
+from study_contact import cylinder, sphere, sphere_on_half_space
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.mesh import TetMesh
@@ -769,6 +769,12 @@ def test_a_long_cylinder_presses_as_hertz_found():
     misses = [abs(cylinder(cells)[0] - 1) for cells in (1.0, 2.0, 4.0)]
     assert misses[-1] < 0.01
     assert misses[-1] < misses[0] / 2
+
+
+@pytest.mark.long
+def test_two_elements_to_the_radius_suffice_for_the_force_of_hertz_by_default():
+    """On a graded mesh, with stiffness, width and faces of the contact left open."""
+    assert 0.98 < sphere_on_half_space(2) < 1.03
 
 
 @pytest.mark.long
