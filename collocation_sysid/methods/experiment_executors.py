@@ -11,7 +11,7 @@ import ctypes
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cache
 from importlib.metadata import version
 from typing import Any, Protocol, TypeVar
@@ -22,8 +22,8 @@ from ..common.files import reason
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.kernels import map_experiments, run_single_threaded
+from ..program.association import Association
 from ..program.collocation import Collocation
-from ..program.markers.marker_association import MarkerAssociation
 from ..program.transcription import Transcription
 from ..recording.experiment import Experiment
 from .solution import Status
@@ -272,7 +272,10 @@ class DaskExecutor:
         def send_transcription(complete: Transcription) -> Any:
             """Return a new future of a transcription, which refers to that of its experiment."""
             sent_experiment = send_once(complete.experiment, send_experiment)
-            association = _with_fields(complete.association)
+            association = replace(
+                complete.association,
+                markers=_with_fields(complete.association.markers),
+            )
             rest = {
                 name: value
                 for name, value in complete.__getstate__().items()
@@ -412,7 +415,7 @@ def _identity(value: T) -> T:
 
 
 def _with_fields(instance: T, body: Body | None = None) -> T:
-    """Return a copy of an experiment or an association with another body; None removes it
+    """Return a copy of an experiment or a marker association with another body; None removes it
     for transfer.
     """
     names = [each.name for each in fields(instance)]  # pyright: ignore[reportArgumentType]
@@ -428,11 +431,12 @@ def _with_body(experiment: Experiment, body: Body) -> Experiment:
 
 
 def _restore_segment(
-    experiment: Experiment, chart: MarkerAssociation, rest: dict[str, Any]
+    experiment: Experiment, association: Association, rest: dict[str, Any]
 ) -> Transcription:
-    """Return a transcription from its experiment, its association `chart` without body, and its
-    other arguments by name; workers run this function.
+    """Return a transcription from its experiment, its association with markers without body, and
+    its other arguments by name; workers run this function.
     """
+    markers = _with_fields(association.markers, experiment.body)
     return Transcription(
-        experiment, association=_with_fields(chart, experiment.body), **rest
+        experiment, association=replace(association, markers=markers), **rest
     )

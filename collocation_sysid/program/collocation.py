@@ -45,12 +45,12 @@ from ..errors import InputError
 from ..model.parameters import Parameters
 from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
+from .association import Association
 from .experiment_iterate import ExperimentIterate
 from .lifted.lifted_variables import LiftedOffsets, LiftedVariables
 from .lifted.lifting import lift_variables
 from .linear_algebra.sparse_assembly import SparseAssembly
-from .markers.marker_association import MarkerAssociation
-from .shared_nuisances import nuisance_indices, shared_charts
+from .shared_nuisances import nuisance_indices, shared_associations
 from .transcription import RowWeights, SegmentOffsets, Transcription
 
 # Distance of a parameter from its bound, in units of z, at which it counts as at the bound: more
@@ -134,7 +134,7 @@ class Collocation:
     huber : float, optional
         Threshold of Huber's loss in standard deviations, see `measurement_residual`; None means a
         quadratic loss.
-    associations : mapping of experiment name to MarkerAssociation
+    associations : mapping of experiment name to Association
         Elements, clock samples and correspondences of the measurements. Experiments that are
         missing, or whose association belongs to another body or other priors, get that of the
         stated places.
@@ -156,7 +156,7 @@ class Collocation:
     substeps: int = 1
     has_grasp_constraints: bool = False
     huber: float | None = None
-    associations: Mapping[str, MarkerAssociation] = field(default_factory=dict)
+    associations: Mapping[str, Association] = field(default_factory=dict)
     has_lifted_variables: bool = False
 
     def __post_init__(self) -> None:
@@ -190,7 +190,7 @@ class Collocation:
         ):
             chart = self.associations.get(experiment.name)
             if chart is None or not chart.matches(experiment):
-                chart = MarkerAssociation.from_experiment(experiment)
+                chart = Association.from_experiment(experiment)
             segments.append(
                 Transcription(
                     experiment,
@@ -526,7 +526,7 @@ class Collocation:
 
     def _with_associations(
         self,
-        charts: Sequence[MarkerAssociation],
+        charts: Sequence[Association],
         p: Array,
         phis: Sequence[Array],
     ) -> tuple[Collocation, Array]:
@@ -1016,13 +1016,13 @@ class Collocation:
 
 
 def _with_shared_associations(
-    transcriptions: Sequence[Transcription], charts: Sequence[MarkerAssociation]
+    transcriptions: Sequence[Transcription], charts: Sequence[Association]
 ) -> tuple[Transcription, ...]:
     """Return the transcriptions with the given associations, in which places and clocks of shared
     nuisance parameters are those of the first experiment that shares them.
     """
     parts = zip(transcriptions, charts, strict=True)
-    same = shared_charts(
+    same = shared_associations(
         (s.nuisance_indices, s.nuisance, chart) for s, chart in parts
     )
     return tuple(

@@ -33,6 +33,7 @@ from ..model.parameters import Parameters, ThetaMap
 from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
 from ..recording.nuisance import TIME
+from .association import Association
 from .custom_sensor_residual import (
     CustomSensorResidual,
     custom_sensor_residuals,
@@ -48,7 +49,6 @@ from .linear_algebra.block_band import (
     skew_block_band,
 )
 from .local_loss import LocalLoss
-from .markers.marker_association import MarkerAssociation
 from .markers.marker_residual import MarkerResidual
 from .measurement_residual import MeasurementResidual
 from .motion_jacobian import MotionJacobian, shifted_back
@@ -135,7 +135,7 @@ class Transcription:
         Offsets of its variables and constraints.
     nuisance_indices : NuisanceIndices
         Indices of its φ in p = (q, φ_1, φ_2, …).
-    association : MarkerAssociation
+    association : Association
         Elements, clock samples and correspondences at which the measurements are evaluated.
     """
 
@@ -147,7 +147,7 @@ class Transcription:
     huber: float | None
     offsets: SegmentOffsets
     nuisance_indices: NuisanceIndices
-    association: MarkerAssociation
+    association: Association
 
     def __getstate__(self) -> dict[str, Any]:
         # Cached values are computed again where they are needed.
@@ -194,7 +194,8 @@ class Transcription:
             self.experiment.markers,
             np.arange(len(self.experiment.t_s)) * self.substeps,
             nuisance=self.nuisance,
-            association=self.association,
+            association=self.association.markers,
+            clock_samples=self.association.clock_samples,
             huber=self.huber,
             is_initially_at_rest=not self.dynamics.start_velocity_m_s.any(),
         )
@@ -299,7 +300,7 @@ class Transcription:
         """Dofs (g,) of the nodes of grasps whose reaction forces are measured, ascending."""
         return sensed_dofs(self.experiment)
 
-    def with_association(self, association: MarkerAssociation) -> Transcription:
+    def with_association(self, association: Association) -> Transcription:
         """Return a copy with another association: elements, clock samples and correspondences of
         its measurements.
 
@@ -313,7 +314,7 @@ class Transcription:
 
     def follow_estimates(
         self, phi: Array, x: Array
-    ) -> tuple[MarkerAssociation, Array]:
+    ) -> tuple[Association, Array]:
         """Return the association that belongs to the estimates, and φ relative to it.
 
         Markers get the elements that contain their estimated places, clocks the nearest samples,
@@ -329,7 +330,7 @@ class Transcription:
 
         Returns
         -------
-        (MarkerAssociation, (k,) array)
+        (Association, (k,) array)
             The association, which is the present object if nothing has changed, and a copy of φ in
             which the coordinates of estimated marker places refer to it.
         """
@@ -339,24 +340,23 @@ class Transcription:
             phi[nuisance.indices_of_rows(TIME)]
             * nuisance.scales[nuisance.indices_of_rows(TIME)]
         )
-        shift = float(shifts_s.sum()) / self.experiment.timestep_s
-        chart, place_coordinates = self.association.follow_estimates(
-            np.append(phi, 0.0)[places], shift
+        markers, place_coordinates = self.association.markers.follow_estimates(
+            np.append(phi, 0.0)[places]
         )
-        sightings = [
-            d.correspondences.updated(d.surface_shapes(x, phi), phi)
-            for d in self.depths
+        correspondences = [
+            depth.correspondences.updated(depth.surface_shapes(x, phi), phi)
+            for depth in self.depths
         ]
-        if any(
-            s is not d.correspondences
-            for s, d in zip(sightings, self.depths, strict=True)
-        ):
-            chart = replace(chart, correspondences=tuple(sightings))
-        return chart, self._with_marker_places(phi, place_coordinates)
+        association = self.association.updated(
+            markers,
+            float(shifts_s.sum()) / self.experiment.timestep_s,
+            correspondences,
+        )
+        return association, self._with_marker_places(phi, place_coordinates)
 
     def place_unknown_markers(
         self, phi: Array, x: Array
-    ) -> tuple[MarkerAssociation, Array]:
+    ) -> tuple[Association, Array]:
         """Return the association and φ with unknown marker places and depth cameras initialised
         from the first rows of a motion.
 
@@ -374,7 +374,7 @@ class Transcription:
 
         Returns
         -------
-        (MarkerAssociation, (k,) array)
+        (Association, (k,) array)
             The association, which is the present object if there is nothing to initialise, and φ in
             it.
         """
@@ -391,9 +391,7 @@ class Transcription:
             replace(chart, correspondences=sightings) if sightings else chart
         ), phi
 
-    def _place_markers(
-        self, phi: Array, x: Array
-    ) -> tuple[MarkerAssociation, Array]:
+    def _place_markers(self, phi: Array, x: Array) -> tuple[Association, Array]:
         """Return the association and φ (k,) with unknown marker places initialised from rows x
         (rows, 3n) [m].
 
@@ -412,13 +410,15 @@ class Transcription:
         )
         for row in np.unique(first[unknown]):
             starting = np.flatnonzero(unknown & (first == row))
-            places_m[starting] = self.association.places_of_points(
+            places_m[starting] = self.association.markers.places_of_points(
                 x[row].reshape(-1, 3), points_m[starting]
             )
         if not unknown.any():
             return self.association, phi
         chart = self.association.centred_at(places_m)
-        return chart, self._with_marker_places(phi, chart.centre_coordinates)
+        return chart, self._with_marker_places(
+            phi, chart.markers.centre_coordinates
+        )
 
     @property
     def rows_to_place(self) -> int:
@@ -444,7 +444,7 @@ class Transcription:
 
     def marker_places_m(self, phi: Array) -> Array:
         """Return the places (M, 3) of the markers on the undeformed body at φ (k,) [m]."""
-        return self.association.places_m(
+        return self.association.markers.places_m(
             np.append(phi, 0.0)[self.markers.coordinate_parameters]
         )
 
@@ -465,7 +465,7 @@ class Transcription:
                 depth.correspondences.start_values
             )
         return self._with_marker_places(
-            phi, self.association.centre_coordinates
+            phi, self.association.markers.centre_coordinates
         )
 
     def _with_marker_places(
@@ -475,7 +475,7 @@ class Transcription:
         `place_coordinates` (M, k') of all markers.
         """
         updated = phi.copy()
-        estimated = self.association.estimated
+        estimated = self.association.markers.estimated
         updated[self.markers.coordinate_parameters[estimated]] = (
             place_coordinates[estimated]
         )

@@ -197,7 +197,8 @@ def test_markers_glued_once_are_found_once(on_surface: bool):
     np.testing.assert_array_equal(*places)
     assert np.abs(places[0] - really).max() < 1e-3
     one, two = (
-        segment.association for segment in solution.collocation.transcriptions
+        segment.association.markers
+        for segment in solution.collocation.transcriptions
     )
     np.testing.assert_array_equal(one.cells, two.cells)
     np.testing.assert_array_equal(one.axes, two.axes)

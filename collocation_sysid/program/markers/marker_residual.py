@@ -48,12 +48,15 @@ class MarkerResidual(MeasurementResidual):
         time is predicted there, otherwise such samples are not compared.
     preceding_times : int
         Number of the observable's times before the first sample.
+    clock_samples : int
+        Whole samples of the clock's shift.
     """
 
     observable: PointPositions
     markers: Markers
     is_initially_at_rest: bool
     preceding_times: int
+    clock_samples: int
 
     @classmethod
     def from_markers(
@@ -62,6 +65,7 @@ class MarkerResidual(MeasurementResidual):
         rows: Index,
         nuisance: NuisanceMap,
         association: MarkerAssociation,
+        clock_samples: int = 0,
         huber: float | None = None,
         is_initially_at_rest: bool = True,
         preceding_times: int = 0,
@@ -78,6 +82,8 @@ class MarkerResidual(MeasurementResidual):
             Nuisance parameters of the experiment.
         association : MarkerAssociation
             Elements of the markers.
+        clock_samples : int
+            Whole samples of the clock's shift.
         huber : float or None
             Threshold of Huber's loss in standard deviations; None means a quadratic loss.
         is_initially_at_rest : bool
@@ -89,11 +95,7 @@ class MarkerResidual(MeasurementResidual):
         places[association.estimated] = nuisance.indices_of_rows(PLACE).reshape(
             -1, places.shape[1]
         )
-        shifted = (
-            preceding_times
-            + np.arange(len(markers.t_s))
-            + association.clock_samples
-        )
+        shifted = preceding_times + np.arange(len(markers.t_s)) + clock_samples
         covered = (shifted < len(rows)) & (
             (shifted >= 0) | is_initially_at_rest
         )
@@ -113,6 +115,7 @@ class MarkerResidual(MeasurementResidual):
             markers=markers,
             is_initially_at_rest=is_initially_at_rest,
             preceding_times=preceding_times,
+            clock_samples=clock_samples,
         )
 
     @property
@@ -155,7 +158,7 @@ class MarkerResidual(MeasurementResidual):
         """
         first = (
             self._sample_indices
-            + self.observable.association.clock_samples
+            + self.clock_samples
             - self._neighbour_count // 2
         )
         first = np.minimum(first, self.observable.count - self._neighbour_count)
