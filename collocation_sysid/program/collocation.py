@@ -33,7 +33,6 @@ c_{e,t,i} / f_e    equations of motion: experiment e, grid time t from 0 (start 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -50,8 +49,9 @@ from .experiment_iterate import ExperimentIterate
 from .lifted.lifted_variables import LiftedOffsets, LiftedVariables
 from .lifted.lifting import lift_variables
 from .linear_algebra.sparse_assembly import SparseAssembly
+from .motion_transcription import RowWeights, SegmentOffsets
 from .shared_nuisances import nuisance_indices, shared_associations
-from .transcription import RowWeights, SegmentOffsets, Transcription
+from .transcription import Transcription
 
 # Distance of a parameter from its bound, in units of z, at which it counts as at the bound: more
 # than the distance at which interior-point methods stop.
@@ -172,6 +172,7 @@ class Collocation:
                 None,
                 where="solver",
             )
+        # Building the transcriptions checks what experiments share.
         self.parameters.require_constants_of(
             {id(s.body): s.body for s in self.transcriptions}.values()
         )
@@ -534,15 +535,17 @@ class Collocation:
         with the φ of each experiment in `phis`, which refer to these associations.
 
         Of shared entries, the association and the φ of the first experiment are used. Values that
-        depend on associations are computed anew.
+        are cached here are computed anew, those of the motions are shared, see
+        `Transcription.with_association`.
         """
-        other = copy(self)
         updated = self._combine_parameters(p[: self.nq], phis)
         segments = _with_shared_associations(self.transcriptions, charts)
-        by_name = {s.experiment.name: s.association for s in segments}
-        vars(other).update(associations=by_name, transcriptions=segments)
-        for stale in ("_hessian", "hessian_diagonals", "lifted"):
-            vars(other).pop(stale, None)
+        other = replace(
+            self,
+            associations={s.experiment.name: s.association for s in segments},
+        )
+        # The same transcriptions, with the values that they have cached.
+        vars(other)["transcriptions"] = segments
         return other, updated
 
     @property

@@ -18,7 +18,8 @@ import numpy as np
 
 from ...common.array_types import Array, Index
 from ..experiment_iterate import ExperimentIterate
-from ..transcription import RowWeights, Transcription, WeightedHistory
+from ..motion_transcription import RowWeights, WeightedHistory
+from ..transcription import Transcription
 from .expression_patterns import ExpressionPattern
 
 

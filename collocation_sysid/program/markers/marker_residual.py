@@ -9,7 +9,6 @@ offset b; without φ it is h(x_t). See `observables` for h and `model.nuisance_m
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -50,6 +49,8 @@ class MarkerResidual(MeasurementResidual):
         Number of the observable's times before the first sample.
     clock_samples : int
         Whole samples of the clock's shift.
+    delay_s : float
+        Time by which samples are taken later than `t_s` [s].
     """
 
     observable: PointPositions
@@ -57,6 +58,7 @@ class MarkerResidual(MeasurementResidual):
     is_initially_at_rest: bool
     preceding_times: int
     clock_samples: int
+    delay_s: float = 0.0
 
     @classmethod
     def from_markers(
@@ -174,11 +176,14 @@ class MarkerResidual(MeasurementResidual):
     @cached_property
     def _stencil(self) -> RowStencil:
         """Stencil of all samples; its data are the position of the sample among its neighbours, in
-        samples, and the sample's time [s].
+        samples, and the sample's time [s], delay included.
         """
         count = len(self.markers.names)
         place = np.array(
-            [self._sample_indices - self._first_neighbour, self.t_s],
+            [
+                self._sample_indices - self._first_neighbour,
+                self.t_s + self.delay_s,
+            ],
             dtype=np.float64,
         )
         places = (
@@ -201,12 +206,9 @@ class MarkerResidual(MeasurementResidual):
         """
         if not self._full_expression.residual.depends_on_datum(1):
             return self
-        other = copy(self)
-        data = self._stencil.data.copy()
-        instruments = self._expressions
-        data[1] += by_s
-        shifted = self._stencil._replace(data=data)
-        vars(other).update(_stencil=shifted, _expressions=instruments)
+        other = replace(self, delay_s=self.delay_s + by_s)
+        # Derivatives of the same expression are generated once.
+        vars(other)["_expressions"] = self._expressions
         return other
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
