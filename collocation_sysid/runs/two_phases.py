@@ -472,7 +472,6 @@ def _fit_with_elements(
         experiments=problem.experiments,
         parameters=problem.parameters,
         associations=_associations(solved, problem.experiments),
-        has_lifted_variables=False,
     )
     p, positions = solved.unpack(solution.z)
     values = dict(
