@@ -95,11 +95,7 @@ class LocalExecutor:
         """Apply a function to every experiment, in parallel threads, and return the results
         themselves; an exception of the function is raised.
         """
-        return map_experiments(
-            lambda row: run(*row),
-            [*zip(*columns, strict=True)],
-            threads=self.threads,
-        )
+        return map_experiments(run, *columns, threads=self.threads)
 
     def fetch(self, stored: Sequence[Any]) -> list[Any]:
         """Return the stored values themselves, in a new list."""
