@@ -303,7 +303,7 @@ class Body(Discretisation):
         other = copy(self)
         other.geometry = self._geometry_at(positions_m)
         other.rest_shape = "stress_free"
-        for name in ("inverse_equilibrium", "stresses"):
+        for name in self._cached_names - {"pattern", "part_of_cells"}:
             vars(other).pop(name, None)
         other._evaluators = {}
         other._framed = {}

@@ -19,6 +19,7 @@ from ..fem.meshes.selection import Indices
 from ..model.contact import contact_terms
 from ..program.collocation import Collocation
 from ..program.contact.contact_summary import smallest_gaps
+from ..program.lifted.lifted_collocation import with_lifted_variables
 from ..recording.experiment import Experiment
 from ..recording.obstacle import Obstacle
 from .solution import Solution
@@ -73,7 +74,7 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
     relaxed = _relax(first.collocation, obstacles_by_experiment, share=0.0)
     for share in RELAXED:
         # The pressures are those of the previous solve, not those of the smaller product.
-        z = relaxed.with_lifted_variables().pack(
+        z = with_lifted_variables(relaxed).pack(
             *solution.collocation.unpack(solution.z)
         )
         relaxed = _relax(

@@ -48,6 +48,17 @@ def condense(complete: Collocation) -> Collocation:
     return program
 
 
+def complete_program(program: Collocation) -> Collocation:
+    """Return the program with all variables: that of which a condensed program is made, otherwise
+    the argument itself.
+    """
+    return (
+        program.complete
+        if isinstance(program, CondensedCollocation)
+        else program
+    )
+
+
 def complete_multipliers(
     program: Collocation, z: Array, multipliers: Array
 ) -> Array:

@@ -11,7 +11,7 @@ import ctypes
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cache
 from importlib.metadata import version
 from typing import Any, Protocol, TypeVar
@@ -22,8 +22,8 @@ from ..common.files import reason
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.kernels import map_experiments, run_single_threaded
+from ..program.association import Association
 from ..program.collocation import Collocation
-from ..program.markers.marker_association import MarkerAssociation
 from ..program.transcription import Transcription
 from ..recording.experiment import Experiment
 from .solution import Status
@@ -102,11 +102,7 @@ class LocalExecutor:
         columns : sequence
             Arguments, one entry per experiment each; all must have the same length.
         """
-        return map_experiments(
-            lambda row: run(*row),
-            [*zip(*columns, strict=True)],
-            threads=self.threads,
-        )
+        return map_experiments(run, *columns, threads=self.threads)
 
     def fetch(self, stored: Sequence[Any]) -> list[Any]:
         """Return the stored values themselves, in a new list."""
@@ -289,7 +285,10 @@ class DaskExecutor:
         def send_transcription(complete: Transcription) -> Any:
             """Return a new future of a transcription, which refers to that of its experiment."""
             sent_experiment = send_once(complete.experiment, send_experiment)
-            association = _with_fields(complete.association)
+            association = replace(
+                complete.association,
+                markers=_with_fields(complete.association.markers),
+            )
             rest = {
                 name: value
                 for name, value in complete.__getstate__().items()
@@ -431,7 +430,7 @@ def _identity(value: T) -> T:
 
 
 def _with_fields(instance: T, body: Body | None = None) -> T:
-    """Return a copy of an experiment or an association with another body; None removes it
+    """Return a copy of an experiment or a marker association with another body; None removes it
     for transfer.
     """
     names = [each.name for each in fields(instance)]  # pyright: ignore[reportArgumentType]
@@ -447,11 +446,12 @@ def _with_body(experiment: Experiment, body: Body) -> Experiment:
 
 
 def _restore_segment(
-    experiment: Experiment, chart: MarkerAssociation, rest: dict[str, Any]
+    experiment: Experiment, association: Association, rest: dict[str, Any]
 ) -> Transcription:
-    """Return a transcription from its experiment, its association `chart` without body, and its
-    other arguments by name; workers run this function.
+    """Return a transcription from its experiment, its association with markers without body, and
+    its other arguments by name; workers run this function.
     """
+    markers = _with_fields(association.markers, experiment.body)
     return Transcription(
-        experiment, association=_with_fields(chart, experiment.body), **rest
+        experiment, association=replace(association, markers=markers), **rest
     )

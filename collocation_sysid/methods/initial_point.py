@@ -17,7 +17,8 @@ import scipy.sparse.linalg as spla
 from ..common.array_types import Array
 from ..errors import SimulationError
 from ..program.collocation import Collocation, convert_variables
-from .condensed_program import CondensedCollocation
+from ..program.lifted.lifted_collocation import lifted_count
+from .condensed_program import CondensedCollocation, complete_program
 from .reduced_space import ReducedSpace
 from .solution import Iteration, Solution, Status, constraint_multipliers
 from .solve_recorder import Recorder, SearchEnded
@@ -149,17 +150,13 @@ def adjoint_multipliers(
         of_motion = constraint_multipliers(collocation, z)
     except SimulationError:
         return None
-    complete_program = (
-        program.complete
-        if isinstance(program, CondensedCollocation)
-        else program
-    )
-    variables = convert_variables(z, collocation, target=complete_program)
-    constraints = np.zeros(complete_program.constraint_count)
+    complete = complete_program(program)
+    variables = convert_variables(z, collocation, target=complete)
+    constraints = np.zeros(complete.constraint_count)
     constraints[: len(of_motion)] = of_motion
-    gradient = complete_program.gradient(variables)
-    jacobian = complete_program.jacobian(variables)
-    if added := complete_program.lifted_count():
+    gradient = complete.gradient(variables)
+    jacobian = complete.jacobian(variables)
+    if added := lifted_count(complete):
         # As many rows as variables: their multipliers follow from those of all other rows.
         slope = gradient + jacobian.T @ constraints
         lifted_jacobian = jacobian[-added:, -added:].T.tocsc()

@@ -26,11 +26,15 @@ from ..common.validated_types import (
 )
 from ..errors import located
 from ..program.collocation import Collocation
+from ..program.lifted.lifted_collocation import (
+    lifted_count,
+    with_lifted_variables,
+)
 from ..recording.experiment import Experiment
 from . import nlpsol
 from .callbacks import NlpFunctions
 from .complementarity import require_frictionless, solve_complementarity
-from .condensed_program import condense
+from .condensed_program import complete_program, condense
 from .initial_point import (
     InitialPoint,
     adjoint_multipliers,
@@ -268,7 +272,7 @@ class InteriorPoint(Options):
         """
         multipliers = None
         with recorder.stopwatch.building():
-            program = condense(recorder.collocation.with_lifted_variables())
+            program = condense(with_lifted_variables(recorder.collocation))
             if initial is not None and initial.is_close:
                 multipliers = adjoint_multipliers(
                     program, recorder.collocation, z=initial.coarse.z
@@ -350,7 +354,7 @@ class InteriorPoint(Options):
             settings |= {
                 # Rows of pressures are nearly dependent where a surface lies on another.
                 "ipopt.perturb_always_cd": "no"
-                if collocation.lifted_count("pressure")
+                if lifted_count(complete_program(collocation), "pressure")
                 else "yes",
                 "ipopt.jacobian_regularization_exponent": 0.0,
                 "ipopt.jacobian_regularization_value": min(

@@ -3,10 +3,12 @@ solved.
 
 Transcription
     `collocation` is the whole program (objective, constraints, derivatives) of several experiments.
-    `transcription` is one experiment of it, `experiment_iterate` one experiment at given variables,
-    `shared_nuisances` the nuisance parameters that experiments have in common. `motion_jacobian`
-    lays out the sparse Jacobian, `local_loss` the Hessian of the loss, and `lifted` has the
-    variables that are eliminated by default and can be added with equations of their own.
+    `transcription` is one experiment of it, of which `motion_transcription` is the part without
+    measurements; `association` states where on the body and in time these are evaluated,
+    `experiment_iterate` is one experiment at given variables, and `shared_nuisances` has the
+    nuisance parameters that experiments have in common. `motion_jacobian` lays out the sparse
+    Jacobian, `local_loss` the Hessian of the loss, and `lifted` the program in which
+    variables that are otherwise eliminated have equations of their own.
 Measurements
     `observables` are measurable quantities, `observable_response` linearises them along the
     equations of motion, and `measurement_residual` compares them with data. `custom_sensor_residual`

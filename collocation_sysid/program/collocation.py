@@ -14,9 +14,9 @@ x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axi
                    see `program.shared_nuisances`
 =================  =========================================================================
 
-Lifted variables (history variables, reaction forces, wrenches, contact pressures) are eliminated by
-default; with `Collocation.has_lifted_variables` they follow at the end of z, and their equations at
-the end of g.
+History variables, reaction forces, wrenches and contact pressures are eliminated. A subclass,
+`lifted.lifted_collocation.LiftedCollocation`, has them as variables at the end of z, with equations
+at the end of g.
 
 Constraints g, in this order:
 
@@ -33,9 +33,8 @@ c_{e,t,i} / f_e    equations of motion: experiment e, grid time t from 0 (start 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -45,13 +44,12 @@ from ..errors import InputError
 from ..model.parameters import Parameters
 from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
+from .association import Association
 from .experiment_iterate import ExperimentIterate
-from .lifted.lifted_variables import LiftedOffsets, LiftedVariables
-from .lifted.lifting import lift_variables
 from .linear_algebra.sparse_assembly import SparseAssembly
-from .markers.marker_association import MarkerAssociation
-from .shared_nuisances import nuisance_indices, shared_charts
-from .transcription import RowWeights, SegmentOffsets, Transcription
+from .motion_transcription import RowWeights, SegmentOffsets, WeightedHistory
+from .shared_nuisances import nuisance_indices, shared_associations
+from .transcription import Transcription
 
 # Distance of a parameter from its bound, in units of z, at which it counts as at the bound: more
 # than the distance at which interior-point methods stop.
@@ -134,15 +132,10 @@ class Collocation:
     huber : float, optional
         Threshold of Huber's loss in standard deviations, see `measurement_residual`; None means a
         quadratic loss.
-    associations : mapping of experiment name to MarkerAssociation
+    associations : mapping of experiment name to Association
         Elements, clock samples and correspondences of the measurements. Experiments that are
         missing, or whose association belongs to another body or other priors, get that of the
         stated places.
-    has_lifted_variables : bool, default False
-        If true, keep history variables, measured wrenches and contact pressures as variables with
-        constraints (lifted variables, see `lifted`), so that the exact matrices are sparse. If
-        false, they are eliminated. The optimum and the multipliers of the other constraints are the
-        same.
 
     Raises
     ------
@@ -156,8 +149,7 @@ class Collocation:
     substeps: int = 1
     has_grasp_constraints: bool = False
     huber: float | None = None
-    associations: Mapping[str, MarkerAssociation] = field(default_factory=dict)
-    has_lifted_variables: bool = False
+    associations: Mapping[str, Association] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if all(experiment.validation for experiment in self.experiments):
@@ -172,6 +164,7 @@ class Collocation:
                 None,
                 where="solver",
             )
+        # Building the transcriptions checks what experiments share.
         self.parameters.require_constants_of(
             {id(s.body): s.body for s in self.transcriptions}.values()
         )
@@ -190,7 +183,7 @@ class Collocation:
         ):
             chart = self.associations.get(experiment.name)
             if chart is None or not chart.matches(experiment):
-                chart = MarkerAssociation.from_experiment(experiment)
+                chart = Association.from_experiment(experiment)
             segments.append(
                 Transcription(
                     experiment,
@@ -210,36 +203,6 @@ class Collocation:
             segments, [segment.association for segment in segments]
         )
 
-    @cached_property
-    def lifted(self) -> tuple[LiftedVariables, ...]:
-        """Lifted variables, experiment by experiment; empty unless `has_lifted_variables`."""
-        if not self.has_lifted_variables:
-            return ()
-        last = self.transcriptions[-1].next_offsets
-        return lift_variables(
-            self.transcriptions,
-            self.phi_columns.start,
-            offsets=LiftedOffsets(self.phi_columns.stop, last.row),
-        )
-
-    def with_lifted_variables(self) -> Collocation:
-        """Return the program with lifted variables, or self if it has them already or nothing can
-        be lifted.
-
-        The transcriptions are shared with the copy.
-        """
-        has_sensors = any(len(s.sensed_dofs) for s in self.transcriptions)
-        has_complementarity = any(
-            s.dynamics.forces.complementarity_terms for s in self.transcriptions
-        )
-        if self.has_lifted_variables or not (
-            self.has_eliminated_histories or has_sensors or has_complementarity
-        ):
-            return self
-        other = replace(self, has_lifted_variables=True)
-        vars(other)["transcriptions"] = self.transcriptions
-        return other
-
     @property
     def nq(self) -> int:
         """Number of shared parameters q."""
@@ -256,34 +219,13 @@ class Collocation:
 
     @property
     def variable_count(self) -> int:
-        """Number of variables z, including lifted ones."""
-        return self.phi_columns.stop + self.lifted_count()
+        """Number of variables z."""
+        return self.phi_columns.stop
 
     @property
     def constraint_count(self) -> int:
-        """Number of constraints g, including the equations of lifted variables."""
-        return self.transcriptions[-1].next_offsets.row + self.lifted_count()
-
-    def lifted_count(self, kind: str | None = None) -> int:
-        """Return the number of lifted variables, which is also that of their equations; 0 unless
-        `has_lifted_variables`.
-
-        Parameters
-        ----------
-        kind : {"memory", "force", "pressure", "wrench"}, optional
-            Kind of lifted variables; None means all.
-        """
-        return sum(
-            each.count for each in self.lifted if kind in (None, each.kind)
-        )
-
-    @property
-    def lifted_nonzeros(self) -> tuple[int, int]:
-        """Numbers of additional entries due to lifted variables in the Jacobian, and in the upper
-        triangle of the Hessian.
-        """
-        both = [each.entry_counts for each in self.lifted]
-        return sum(each for each, _ in both), sum(each for _, each in both)
+        """Number of constraints g."""
+        return self.transcriptions[-1].next_offsets.row
 
     @property
     def measurement_count(self) -> int:
@@ -325,22 +267,7 @@ class Collocation:
         Returns
         -------
         (variables,) array
-            Scaled variables; lifted ones follow from positions and parameters.
-        """
-        parts = self.iterates_at(p, positions) if self.lifted else []
-        lifted = [
-            each.consistent_values(parts[each.segment_index])
-            for each in self.lifted
-        ]
-        return np.concatenate(
-            [self._pack_without_lifted(p, positions), *lifted]
-        )
-
-    def _pack_without_lifted(
-        self, p: Array, positions: Sequence[Array]
-    ) -> Array:
-        """Return z without lifted variables from p (nq + nphi,) and the positions (N, 3n) [m] of
-        each experiment: q, scaled positions, φ.
+            Scaled variables: q, scaled positions, φ.
         """
         pairs = zip(self.transcriptions, positions, strict=True)
         scaled = [np.ravel(x) / segment.length_m for segment, x in pairs]
@@ -348,7 +275,7 @@ class Collocation:
 
     def unpack(self, z: Array) -> tuple[Array, list[Array]]:
         """Return the parameters p (nq + nphi,) and the positions (N, 3n) of each fitted experiment
-        [m] from z; lifted variables are ignored.
+        [m] from z.
         """
         return self.parameters_from(z), [
             z[segment.columns].reshape(segment.grid_times, segment.dof_count)
@@ -367,13 +294,8 @@ class Collocation:
         return slice(first, first + self.nphi)
 
     def iterates(self, z: Array) -> list[ExperimentIterate]:
-        """Return every fitted experiment at the variables z, with lifted variables taken from z."""
-        parts = self.iterates_at(*self.unpack(z))
-        for each in self.lifted:
-            parts[each.segment_index] = each.with_lifted(
-                parts[each.segment_index], z
-            )
-        return parts
+        """Return every fitted experiment at the variables z."""
+        return self.iterates_at(*self.unpack(z))
 
     @cached_property
     def parameter_indices(self) -> list[Index]:
@@ -388,7 +310,7 @@ class Collocation:
     def iterates_at(
         self, p: Array, positions: Sequence[Array]
     ) -> list[ExperimentIterate]:
-        """Return every fitted experiment at parameters and positions, from which lifted quantities
+        """Return every fitted experiment at parameters and positions, from which all other quantities
         follow.
 
         Parameters
@@ -537,7 +459,7 @@ class Collocation:
 
     def _with_associations(
         self,
-        charts: Sequence[MarkerAssociation],
+        charts: Sequence[Association],
         p: Array,
         phis: Sequence[Array],
     ) -> tuple[Collocation, Array]:
@@ -545,15 +467,17 @@ class Collocation:
         with the φ of each experiment in `phis`, which refer to these associations.
 
         Of shared entries, the association and the φ of the first experiment are used. Values that
-        depend on associations are computed anew.
+        are cached here are computed anew, those of the motions are shared, see
+        `Transcription.with_association`.
         """
-        other = copy(self)
         updated = self._combine_parameters(p[: self.nq], phis)
         segments = _with_shared_associations(self.transcriptions, charts)
-        by_name = {s.experiment.name: s.association for s in segments}
-        vars(other).update(associations=by_name, transcriptions=segments)
-        for stale in ("_hessian", "hessian_diagonals", "lifted"):
-            vars(other).pop(stale, None)
+        other = replace(
+            self,
+            associations={s.experiment.name: s.association for s in segments},
+        )
+        # The same transcriptions, with the values that they have cached.
+        vars(other)["transcriptions"] = segments
         return other, updated
 
     @property
@@ -592,16 +516,9 @@ class Collocation:
         lows, highs = zip(
             *(segment.bounds() for segment in self.transcriptions), strict=True
         )
-        least = [np.full(each.count, each.lower_bound) for each in self.lifted]
-        return (
-            np.concatenate([self._pack_without_lifted(lower, lows), *least]),
-            np.concatenate(
-                [
-                    self._pack_without_lifted(upper, highs),
-                    np.full(self.lifted_count(), np.inf),
-                ]
-            ),
-        )
+        # Additional variables of a subclass have bounds of their own.
+        pack = partial(Collocation.pack, self)
+        return pack(lower, lows), pack(upper, highs)
 
     # Objective --------------------------------------------------------------------------------
 
@@ -625,20 +542,19 @@ class Collocation:
             of_x, of_p = part.gradient()
             by_x.append(of_x.ravel() * part.segment.length_m)
             by_p[part.segment.parameter_indices] += of_p
-        further = [
-            each.loss_gradient(parts[each.segment_index])
-            for each in self.lifted
-        ]
         return self.loss_scale * np.concatenate(
-            [by_p[: self.nq], *by_x, by_p[self.nq :], *further]
+            [
+                by_p[: self.nq],
+                *by_x,
+                by_p[self.nq :],
+                *self._additional_gradients(parts),
+            ]
         )
 
     # Constraints ------------------------------------------------------------------------------
 
     def constraint_values(self, z: Array) -> Array:
-        """Return the scaled constraints g (constraints,) at z: equations of motion, grasps, and
-        equations of lifted variables.
-        """
+        """Return the scaled constraints g (constraints,) at z: equations of motion and grasps."""
         parts = self.iterates(z)
         rows = [
             part.segment.constraint_values(
@@ -646,10 +562,7 @@ class Collocation:
             )
             for part in parts
         ]
-        further = [
-            each.residuals(parts[each.segment_index], z) for each in self.lifted
-        ]
-        return np.concatenate([*rows, *further])
+        return np.concatenate([*rows, *self._additional_equations(parts, z)])
 
     @property
     def jacobian_structure(self) -> tuple[Index, Index]:
@@ -658,7 +571,7 @@ class Collocation:
 
     @cached_property
     def _jacobian(self) -> SparseAssembly:
-        """Structure of ∂g/∂z: columns of q and x, then those of φ and of the lifted variables."""
+        """Structure of ∂g/∂z: columns of q and x, then those of φ, then additional entries."""
         own = self.transcriptions[-1].next_offsets.row
         indptr = [np.arange(self.nq + 1) * own]
         indices = [np.tile(np.arange(own), self.nq)]
@@ -676,11 +589,10 @@ class Collocation:
             columns = self.phi_columns.start + np.repeat(moving, len(rows))
             of_phi.append((np.tile(rows, len(moving)), columns))
         structure = np.concatenate(indptr), np.concatenate(indices)
-        further = [each.jacobian_entries() for each in self.lifted]
         return SparseAssembly.from_groups(
             structure,
             (self.constraint_count, self.variable_count),
-            groups=of_phi + further,
+            groups=of_phi + self._additional_jacobian_entries(),
         )
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
@@ -729,10 +641,7 @@ class Collocation:
             columns[:, segment.rows] = by_p[:, : self.nq].T
             further.append(by_p[:, self.nq :].T.ravel())
             used += segment.jacobian.nnz
-        added = [
-            each.jacobian_values(parts[each.segment_index], z)
-            for each in self.lifted
-        ]
+        added = self._additional_jacobian(parts, z)
         self._jacobian.assemble(
             values, own, groups=further + [entries for _, entries in added]
         )
@@ -755,9 +664,7 @@ class Collocation:
         """Whether history variables are eliminated, so that ∂g/∂z has more entries than
         `jacobian`.
         """
-        return not self.has_lifted_variables and any(
-            segment.has_histories for segment in self.transcriptions
-        )
+        return any(segment.has_histories for segment in self.transcriptions)
 
     def jacobian_vjp(self, z: Array, multipliers: Array) -> Array:
         """Return the vector–Jacobian product (∂g/∂z)ᵀ multipliers (variables,) at z, for
@@ -805,7 +712,7 @@ class Collocation:
             further += segment.additional_hessian_entries(
                 self.phi_columns.start
             )
-        further += [each.hessian_entries() for each in self.lifted]
+        further += self._additional_hessian_entries()
         structure = np.concatenate(indptr), np.concatenate(indices)
         return SparseAssembly.from_groups(
             structure,
@@ -870,20 +777,12 @@ class Collocation:
         for number, part in enumerate(parts):
             segment = part.segment
             here = own[used : used + segment.hessian.nnz]
-            mine = [
-                each for each in self.lifted if each.segment_index == number
-            ]
-            of_rows = sum(
-                (each.residual_weights(multipliers) for each in mine), start=0.0
+            of_rows, histories = self._additional_weights(
+                number, part, multipliers=multipliers
             )
             weights.append(
                 segment.lagrangian_weights(multipliers[segment.rows], of_rows)
             )
-            lifted_histories = [
-                each.weighted_history(part, multipliers)
-                for each in mine
-                if each.history_index is not None
-            ]
             by_q_own, further_own = segment.hessian_values(
                 part.x,
                 part.phi,
@@ -891,22 +790,19 @@ class Collocation:
                 weights=weights[number],
                 loss_weight=weight,
                 values=here,
-                lifted_histories=lifted_histories,
+                lifted_histories=histories,
                 has_observation_curvature=uses_observation_curvature,
             )
             by_q = by_q + by_q_own
             further = further + further_own
             used = used + len(here)
-        for each in self.lifted:
-            further.append(
-                each.hessian_values(
-                    parts[each.segment_index],
-                    z,
-                    loss_weight=weight,
-                    multipliers=multipliers,
-                    weights=weights[each.segment_index],
-                )
-            )
+        further = further + self._additional_hessian(
+            parts,
+            z,
+            loss_weight=weight,
+            multipliers=multipliers,
+            weights=weights,
+        )
         _, slopes = self.parameters.prior_residuals(parts[0].q)
         by_q += np.diag(2 * weight * slopes**2)
         rows, columns = np.triu_indices(self.nq)
@@ -955,6 +851,87 @@ class Collocation:
         values = self.hessian_values(z, loss_weight, multipliers=multipliers)
         upper = sp.csc_array((values, indices, indptr), shape=(len(z), len(z)))
         return sp.csc_array(upper + sp.triu(upper, 1).T)
+
+    # Additional variables of subclasses ---------------------------------------------------------
+
+    def _additional_equations(
+        self, parts: Sequence[ExperimentIterate], z: Array
+    ) -> list[Array]:
+        """Return the equations of additional variables, which follow all other constraints; `parts`
+        are the iterates at z.
+        """
+        return []
+
+    def _additional_jacobian_entries(self) -> list[tuple[Index, Index]]:
+        """Return groups of rows in g and columns in z of additional entries of the Jacobian."""
+        return []
+
+    def _additional_jacobian(
+        self, parts: Sequence[ExperimentIterate], z: Array
+    ) -> list[tuple[Array, Array]]:
+        """Return the equations of additional variables, and the values of each group of
+        `_additional_jacobian_entries`; `parts` are the iterates at z.
+        """
+        return []
+
+    def _additional_gradients(
+        self, parts: Sequence[ExperimentIterate]
+    ) -> list[Array]:
+        """Return the gradient of the loss by additional variables, at the iterates `parts`."""
+        return []
+
+    def _additional_weights(
+        self, number: int, part: ExperimentIterate, multipliers: Array
+    ) -> tuple[Array | float, list[WeightedHistory]]:
+        """Return what the equations of additional variables add to the Lagrangian of an experiment.
+
+        Parameters
+        ----------
+        number : int
+            Index of the experiment.
+        part : ExperimentIterate
+            The experiment at z.
+        multipliers : (constraints,) array
+            Multipliers of all constraints g.
+
+        Returns
+        -------
+        ((N, 3n) array or 0, list of WeightedHistory)
+            Weights of the residuals c, see `MotionTranscription.lagrangian_weights`, and history
+            variables that are variables of the program, with their weights.
+        """
+        return 0.0, []
+
+    def _additional_hessian_entries(self) -> list[tuple[Index, Index]]:
+        """Return groups of rows and columns in z of additional entries of the Hessian, upper
+        triangle.
+        """
+        return []
+
+    def _additional_hessian(
+        self,
+        parts: Sequence[ExperimentIterate],
+        z: Array,
+        loss_weight: float,
+        multipliers: Array,
+        weights: Sequence[RowWeights],
+    ) -> list[Array]:
+        """Return the values of each group of `_additional_hessian_entries`.
+
+        Parameters
+        ----------
+        parts : sequence of ExperimentIterate
+            The experiments at z.
+        z : (variables,) array
+            Variables.
+        loss_weight : float
+            Factor of the loss.
+        multipliers : (constraints,) array
+            Multipliers of all constraints g.
+        weights : sequence of RowWeights
+            Weights of the constraints and forces of each experiment.
+        """
+        return []
 
     # Reading a point --------------------------------------------------------------------------
 
@@ -1027,13 +1004,13 @@ class Collocation:
 
 
 def _with_shared_associations(
-    transcriptions: Sequence[Transcription], charts: Sequence[MarkerAssociation]
+    transcriptions: Sequence[Transcription], charts: Sequence[Association]
 ) -> tuple[Transcription, ...]:
     """Return the transcriptions with the given associations, in which places and clocks of shared
     nuisance parameters are those of the first experiment that shares them.
     """
     parts = zip(transcriptions, charts, strict=True)
-    same = shared_charts(
+    same = shared_associations(
         (s.nuisance_indices, s.nuisance, chart) for s, chart in parts
     )
     return tuple(

@@ -18,6 +18,7 @@ from ..errors import InputError
 from ..model.nuisance_map import NuisanceEntry, NuisanceMap
 from ..recording.experiment import Experiment
 from ..recording.nuisance import PLACE, POSE_TURN, NuisanceRow
+from .association import Association
 from .markers.marker_association import MarkerAssociation
 
 # Attributes of a `MarkerAssociation` with one row for each marker.
@@ -209,44 +210,46 @@ def _sharing_error(
     return InputError(message, None, where=f"experiment '{experiment.name}'")
 
 
-def shared_charts(
-    experiments: Iterable[
-        tuple[NuisanceIndices, NuisanceMap, MarkerAssociation]
-    ],
-) -> list[MarkerAssociation]:
+def shared_associations(
+    experiments: Iterable[tuple[NuisanceIndices, NuisanceMap, Association]],
+) -> list[Association]:
     """Return the association of each experiment, with shared places and clocks equal to those of
     the first experiment that shares them; an association without such differences is returned as it
     is.
 
     Parameters
     ----------
-    experiments : iterable of (NuisanceIndices, NuisanceMap, MarkerAssociation)
+    experiments : iterable of (NuisanceIndices, NuisanceMap, Association)
         The experiments in their order.
     """
     leaders = dict[int, tuple[MarkerAssociation, int]]()
     samples = dict[int, int]()
-    charts = []
-    for local, nuisance, chart in experiments:
+    associations = []
+    for local, nuisance, own in experiments:
+        association = own
         replaced = []
         for k in nuisance.indices_of_rows(PLACE):
             number = nuisance.entries[k].number
-            leader = leaders.setdefault(int(local.indices[k]), (chart, number))
-            if leader[0] is not chart:
+            leader = leaders.setdefault(
+                int(local.indices[k]), (own.markers, number)
+            )
+            if leader[0] is not own.markers:
                 replaced.append((number, *leader))
         for k in nuisance.clock_indices:
             shared = samples.setdefault(
-                int(local.indices[k]), chart.clock_samples
+                int(local.indices[k]), own.clock_samples
             )
-            chart = (
-                chart
-                if shared == chart.clock_samples
-                else replace(chart, clock_samples=shared)
-            )
+            if shared != association.clock_samples:
+                association = replace(association, clock_samples=shared)
         if replaced:
-            own = {name: getattr(chart, name).copy() for name in OF_MARKERS}
-            for name, values in own.items():
+            places = {
+                name: getattr(own.markers, name).copy() for name in OF_MARKERS
+            }
+            for name, values in places.items():
                 for number, leader, theirs in replaced:
                     values[number] = getattr(leader, name)[theirs]
-            chart = replace(chart, **own)
-        charts.append(chart)
-    return charts
+            association = replace(
+                association, markers=replace(own.markers, **places)
+            )
+        associations.append(association)
+    return associations

@@ -184,7 +184,7 @@ class StreamingModel:
             return self
         places_m = self.segment.marker_places_m(self.segment.guess_phi)
         nodes_m = x.reshape(-1, 3)
-        places_m[unknown] = self.segment.association.places_of_points(
+        places_m[unknown] = self.segment.association.markers.places_of_points(
             nodes_m, tracks_m[unknown]
         )
         return replace(
@@ -327,7 +327,8 @@ class StreamingModel:
             origin,
             rows,
             nuisance=segment.nuisance,
-            association=segment.association,
+            association=segment.association.markers,
+            clock_samples=segment.association.clock_samples,
             preceding_times=neighbours,
         )
 

@@ -262,7 +262,7 @@ def nuisance_of_fitted_recordings(
     for k, entry in enumerate(nuisance.entries):
         phi[k] = np.mean(known.get(entry.label, [0.0])) / entry.sigma
     start_m = segment.marker_places_m(np.zeros(nuisance.size))
-    for number in segment.association.estimated.tolist():
+    for number in segment.association.markers.estimated.tolist():
         name = segment.experiment.markers.names[number]
         places_m = [
             part.segment.marker_places_m(part.phi)[
@@ -273,8 +273,8 @@ def nuisance_of_fitted_recordings(
         ]
         if places_m:
             directions_m = (
-                segment.association.sigma_m[number]
-                * segment.association.axes[number]
+                segment.association.markers.sigma_m[number]
+                * segment.association.markers.axes[number]
             )
             way_m = np.mean(places_m, axis=0) - start_m[number]
             phi[places[number]] = np.linalg.pinv(directions_m) @ way_m

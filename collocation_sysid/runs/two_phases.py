@@ -29,8 +29,8 @@ from ..fem.two_phase import (
 )
 from ..methods.solution import Solution
 from ..problem import Problem
+from ..program.association import Association
 from ..program.collocation import Collocation
-from ..program.markers.marker_association import MarkerAssociation
 from ..recording.experiment import Experiment
 from ..statistics.field_estimates import mean_logarithm
 from ..statistics.linearised import (
@@ -472,8 +472,7 @@ def _fit_with_elements(
         solved,
         experiments=problem.experiments,
         parameters=problem.parameters,
-        associations=_marker_associations(solved, problem.experiments),
-        has_lifted_variables=False,
+        associations=_associations(solved, problem.experiments),
     )
     p, positions = solved.unpack(solution.z)
     values = dict(
@@ -558,7 +557,7 @@ def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
         replace(each, body=bodies.get(id(each.body), each.body))
         for each in collocation.experiments
     ]
-    charts = _marker_associations(collocation, experiments)
+    charts = _associations(collocation, experiments)
     return replace(
         solution,
         collocation=replace(
@@ -567,16 +566,16 @@ def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
     )
 
 
-def _marker_associations(
+def _associations(
     collocation: Collocation, experiments: Sequence[Experiment]
-) -> dict[str, MarkerAssociation]:
-    """Return the marker–element associations of a program, by experiment, for the bodies of
+) -> dict[str, Association]:
+    """Return the associations of a program, by experiment, for the bodies of
     `experiments`, which differ from those of the program in their fields only.
     """
     bodies = {experiment.name: experiment.body for experiment in experiments}
     return {
-        segment.experiment.name: replace(
-            segment.association, body=bodies[segment.experiment.name]
+        segment.experiment.name: segment.association.on_body(
+            bodies[segment.experiment.name]
         )
         for segment in collocation.transcriptions
     }

@@ -178,7 +178,7 @@ class WarmStart:
         """
         places_m = self.places_m.get(segment.experiment.name, {})
         names = segment.experiment.markers.names
-        estimated = segment.association.estimated.tolist()
+        estimated = segment.association.markers.estimated.tolist()
         return {
             m: places_m[names[m]] for m in estimated if names[m] in places_m
         }

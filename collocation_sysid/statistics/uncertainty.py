@@ -678,7 +678,7 @@ def marker_places(
     `uncertainty` (None), and where it is not finite, a place has no standard errors.
     """
     segment = iterate.segment
-    chart = segment.association
+    chart = segment.association.markers
     markers = segment.experiment.markers
     errors = _std_errors_m(iterate, uncertainty)
     return {
@@ -707,7 +707,7 @@ def _std_errors_m(
     if uncertainty is None:
         return None
     segment = iterate.segment
-    chart = iterate.segment.association
+    chart = segment.association.markers
     row = {name: k for k, name in enumerate(uncertainty.nuisance)}
     at = np.array(
         [row[name] for name in segment.nuisance.names], dtype=np.int64

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..program.collocation import Collocation
+from ..program.lifted.lifted_collocation import with_lifted_variables
 from .property_check import PropertyCheck
 from .small_problems import shaken_variables
 
@@ -39,7 +40,7 @@ def check_program(check: PropertyCheck, collocation: Collocation) -> None:
     for the parameters, the positions, the nuisance parameters and the lifted variables; blocks
     without variables are skipped. The collocation is not modified.
     """
-    program = collocation.with_lifted_variables()
+    program = with_lifted_variables(collocation)
     z = shaken_variables(program, check.rng)
     multipliers = check.rng.normal(size=program.constraint_count)
 

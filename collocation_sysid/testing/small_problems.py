@@ -15,6 +15,7 @@ from ..fem.meshes.mesh import TetMesh
 from ..fem.meshes.structured import box_mesh
 from ..model.parameters import Parameters, Unknown
 from ..program.collocation import Collocation
+from ..program.lifted.lifted_collocation import lifted_variables
 from ..recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 
 # A soft foam: stiffness [Pa], Poisson's ratio and density [kg/m³] of the bodies.
@@ -198,6 +199,6 @@ def shaken_variables(
     )
     p[is_lag] = np.abs(p[is_lag]) + 0.1
     z = collocation.pack(p, positions)
-    for lifted in collocation.lifted:
+    for lifted in lifted_variables(collocation):
         z[lifted.columns] += 0.01 * rng.normal(size=lifted.count)
     return z

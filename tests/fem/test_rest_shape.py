@@ -59,6 +59,17 @@ def scanned_body(element: str = "tet4", **changes) -> cs.Body:
 # The inverse equilibrium -------------------------------------------------------------------------
 
 
+def test_a_body_with_another_stress_free_shape_shares_no_gradients():
+    body = scanned_body()
+    assert body.shape_gradients.nnz
+    twice = body.with_stress_free(2.0 * body.nodes_m)
+    np.testing.assert_allclose(
+        2.0 * twice.shape_gradients.toarray(),
+        body.shape_gradients.toarray(),
+        atol=1e-9,
+    )
+
+
 @pytest.mark.parametrize("element", ["tet4", "tet10", "tet10-p0"])
 def test_the_forward_equilibrium_of_the_stress_free_shape_is_the_mesh(element):
     body = scanned_body(element)

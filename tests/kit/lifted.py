@@ -10,6 +10,10 @@ import numpy as np
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.lifted.lifted_collocation import (
+    LiftedCollocation,
+    with_lifted_variables,
+)
 from collocation_sysid.recording import Experiment
 from kit.memories import ONE
 from kit.problems import box, hung_cube, measured_with
@@ -43,6 +47,6 @@ def swung(
 
 
 def explicit(collocation: Collocation) -> Collocation:
-    found = collocation.with_lifted_variables()
-    assert found.has_lifted_variables
+    found = with_lifted_variables(collocation)
+    assert isinstance(found, LiftedCollocation)
     return found

@@ -22,6 +22,9 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.lifted.lifted_collocation import (
+    with_lifted_variables,
+)
 from collocation_sysid.recording import Experiment, Nuisance
 
 DEFAULT, ON_TIME = Nuisance(), Nuisance(time_shift_s=None)
@@ -70,7 +73,7 @@ def made(
 ) -> tuple[Collocation, Collocation, CondensedCollocation]:
     """A collocation, all that follows as variables, and without held dofs."""
     collocation = Collocation(*CASES[name](nuisance))
-    whole = collocation.with_lifted_variables()
+    whole = with_lifted_variables(collocation)
     program = condense(whole)
     assert isinstance(program, CondensedCollocation)
     return collocation, whole, program

@@ -49,6 +49,9 @@ from collocation_sysid.model.parameters import Parameter, Parameters, Unknown
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation, convert_variables
+from collocation_sysid.program.lifted.lifted_collocation import (
+    with_lifted_variables,
+)
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Markers, Nuisance
 from collocation_sysid.runs.warm_start import WarmStart
@@ -298,7 +301,7 @@ def test_initial_multipliers_balance_the_lagrangian(name: str):
     given = {k: Unknown(v, 0.1 * v, 10 * v) for k, v in truth.items()}
     collocation = Problem([make()], given, scheme="midpoint").collocation()
     z, _ = initial_variables(collocation)
-    program = condense(collocation.with_lifted_variables())
+    program = condense(with_lifted_variables(collocation))
     found = adjoint_multipliers(program, collocation, z)
     assert found is not None
     at = convert_variables(z, collocation, program)

@@ -18,6 +18,9 @@ from collocation_sysid.program.lifted.expression_patterns import (
     ExpressionPattern,
     PatternIndices,
 )
+from collocation_sysid.program.lifted.lifted_collocation import (
+    LiftedCollocation,
+)
 from collocation_sysid.program.lifted.lifted_variables import (
     LiftedOffsets,
     LiftedVariables,
@@ -93,8 +96,9 @@ class Stretches(LiftedVariables):
 
 @pytest.fixture(scope="module")
 def program() -> Collocation:
-    made = Collocation([hung_cube(5)], GUESS)
-    last = LiftedOffsets(made.variable_count, made.constraint_count)
+    plain = Collocation([hung_cube(5)], GUESS)
+    last = LiftedOffsets(plain.variable_count, plain.constraint_count)
+    made = LiftedCollocation([hung_cube(5)], GUESS)
     vars(made)["lifted"] = (
         Stretches(made.transcriptions[0], 0, made.phi_columns.start, last),
     )

@@ -28,6 +28,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.association import Association
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.markers.marker_association import (
     MarkerAssociation,
@@ -381,7 +382,7 @@ def test_a_place_beyond_an_edge_of_the_surface_settles():
         )
         before, (chart, phi) = (
             chart,
-            chart.follow_estimates(chart.centre_coordinates + nearest, 0.0),
+            chart.follow_estimates(chart.centre_coordinates + nearest),
         )
         found.append(chart.places_m(phi)[0])
     assert chart is before
@@ -396,7 +397,7 @@ def test_a_problem_with_other_places_does_not_keep_the_charts_of_the_old_ones():
     charted = Collocation(
         [cube],
         GUESS,
-        associations={cube.name: MarkerAssociation.from_experiment(cube)},
+        associations={cube.name: Association.from_experiment(cube)},
     )
     exact = replace(charted, experiments=[replace(cube, nuisance=IDEAL)])
     assert len(exact.guess_p) == exact.nq

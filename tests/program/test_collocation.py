@@ -403,3 +403,30 @@ def test_the_numpy_combiner_fills_the_same_values(monkeypatch):
     monkeypatch.setattr(block_band, "make_combiner", combine_with_numpy)
     for found, expected in zip(values(swung()), natively, strict=True):
         assert relative_error(found, expected) < 1e-14
+
+
+def test_a_program_with_other_associations_equals_one_made_for_them(rng):
+    """What was cached before is shared only where it does not depend on them."""
+    before = Collocation([cube_with_nuisance(5), swung()], GUESS)
+    before.hessian(some_point(before, rng), 1.0, None)
+    before.jacobian(some_point(before, rng))
+    p = before.guess_p + 0.5 * rng.normal(size=before.nq + before.nphi)
+    moved, _ = before.follow_estimates(p)
+    assert moved is not before
+    one, other = (each.transcriptions[0] for each in (before, moved))
+    assert one.association is not other.association
+    assert one.hessian is other.hessian
+    assert one.residuals is not other.residuals
+    assert one.local_loss is not other.local_loss
+    fresh = replace(moved, substeps=1)
+    assert fresh.transcriptions[0].hessian is not other.hessian
+    z = some_point(moved, rng)
+    multipliers = rng.normal(size=moved.constraint_count)
+    np.testing.assert_array_equal(moved.gradient(z), fresh.gradient(z))
+    np.testing.assert_array_equal(
+        moved.hessian(z, 1.0, multipliers).toarray(),
+        fresh.hessian(z, 1.0, multipliers).toarray(),
+    )
+    np.testing.assert_array_equal(
+        moved.jacobian(z).toarray(), fresh.jacobian(z).toarray()
+    )

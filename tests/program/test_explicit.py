@@ -18,6 +18,9 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.program.collocation import Collocation, convert_variables
+from collocation_sysid.program.lifted.lifted_collocation import (
+    with_lifted_variables,
+)
 
 
 def fitted(branches: int, steps: int, noise_m: float = 0.0) -> Collocation:
@@ -55,9 +58,9 @@ def test_the_recursion_holds_where_the_memory_follows_from_the_motion():
     np.testing.assert_allclose(
         convert_variables(z, program, collocation), given, rtol=1e-14
     )
-    assert Collocation(
-        [hung_cube(3)], GUESS
-    ).with_lifted_variables().variable_count < len(z)
+    assert with_lifted_variables(
+        Collocation([hung_cube(3)], GUESS)
+    ).variable_count < len(z)
 
 
 # What methods find ------------------------------------------------------------------------------

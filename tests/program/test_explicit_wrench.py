@@ -25,6 +25,7 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.program.collocation import Collocation, convert_variables
+from collocation_sysid.program.lifted.lifted_collocation import lifted_count
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Nuisance
 
@@ -52,7 +53,7 @@ def test_the_equations_hold_where_the_wrench_follows_from_the_motion(rng):
     (sensor,) = collocation.transcriptions[0].sensors
     of_reactions = 7 * len(sensor.observable.node_dofs)
     assert (
-        program.lifted_count("wrench")
+        lifted_count(program, "wrench")
         == 12 * sensor.observable.count + of_reactions
     )
 

@@ -29,6 +29,9 @@ from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.lifted.lifted_collocation import (
+    with_lifted_variables,
+)
 from collocation_sysid.recording import Experiment, Markers, Nuisance
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
@@ -90,7 +93,7 @@ def test_tares_are_shared():
         "gravity_rad",
     )
     pair = [sharing(each, *names) for each in (one, swung_again(one, "second"))]
-    program = Collocation(pair, GUESS).with_lifted_variables()
+    program = with_lifted_variables(Collocation(pair, GUESS))
     assert (
         len({name for name in program.parameter_names if "tare" in name}) == 6
     )
@@ -197,7 +200,8 @@ def test_markers_glued_once_are_found_once(on_surface: bool):
     np.testing.assert_array_equal(*places)
     assert np.abs(places[0] - really).max() < 1e-3
     one, two = (
-        segment.association for segment in solution.collocation.transcriptions
+        segment.association.markers
+        for segment in solution.collocation.transcriptions
     )
     np.testing.assert_array_equal(one.cells, two.cells)
     np.testing.assert_array_equal(one.axes, two.axes)

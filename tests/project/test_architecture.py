@@ -127,6 +127,40 @@ def test_the_core_is_loaded_without_the_packages_that_use_it():
     assert not loaded & {*OUTER, "problem"}
 
 
+# The methods that need sparse exact matrices, and what checks or measures their programs.
+LIFTING = (
+    "program.lifted",
+    "methods.interior_point",
+    "methods.initial_point",
+    "methods.complementarity",
+    "methods.comparison",
+    "runs.check",
+    "testing",
+)
+
+
+def test_only_methods_with_sparse_matrices_import_lifted_variables():
+    importing = {
+        name
+        for name in MODULES
+        if any(each.startswith("program.lifted") for each in imports(name))
+    }
+    assert {"methods.interior_point", "methods.comparison.merit"} <= importing
+    assert [n for n in importing if not n.startswith(LIFTING)] == []
+    reached = set()
+    pending = {
+        "methods.reduced_space",
+        "program.streaming",
+        "program.simulation",
+    }
+    while pending:
+        name = pending.pop()
+        reached.add(name)
+        pending |= imports(name) - reached
+    assert "program.collocation" in reached
+    assert [n for n in reached if n.startswith("program.lifted")] == []
+
+
 def test_no_module_imports_the_package_by_its_name():
     """Imports are relative, so that the other tests of this file see them."""
     for name in MODULES:

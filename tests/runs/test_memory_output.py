@@ -15,6 +15,11 @@ from collocation_sysid.fem.laws.constants import symbol_of
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.lifted.lifted_collocation import (
+    LiftedCollocation,
+    lifted_count,
+    with_lifted_variables,
+)
 from collocation_sysid.recording import Experiment
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.estimates import Estimate, memory_notes
@@ -148,9 +153,9 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     MEMORY(tiny)
     problem = Problem.read(tiny / "problem.toml", [GUESSED])
     findings = check_problem(problem)
-    program = problem.collocation().with_lifted_variables()
-    assert program.has_lifted_variables
-    assert findings.overstresses == program.lifted_count("memory")
+    program = with_lifted_variables(problem.collocation())
+    assert isinstance(program, LiftedCollocation)
+    assert findings.overstresses == lifted_count(program, "memory")
     assert findings.variables + findings.overstresses == program.variable_count
     assert (
         findings.constraints + findings.overstresses == program.constraint_count

@@ -21,6 +21,9 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.lifted.lifted_collocation import (
+    with_lifted_variables,
+)
 from collocation_sysid.program.simulation import (
     simulate,
     with_markers,
@@ -196,7 +199,7 @@ def test_check_tells_the_variables_that_a_wrench_brings():
     collocation = problem.collocation()
     findings, program = (
         check_problem(problem),
-        collocation.with_lifted_variables(),
+        with_lifted_variables(collocation),
     )
     assert (
         findings.wrenches

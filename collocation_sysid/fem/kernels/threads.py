@@ -12,10 +12,9 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, starmap
 from typing import Any, TypeVar
 
-T = TypeVar("T")
 R = TypeVar("R")
 
 
@@ -80,37 +79,39 @@ def run_in_slices(
 
 
 def map_experiments(
-    run: Callable[[T], R], items: Sequence[T], threads: int
+    run: Callable[..., R], *columns: Sequence[Any], threads: int
 ) -> list[R]:
-    """Return ``run(item)`` of every item, in their order.
+    """Return ``run(*row)`` for every row of one entry of each column, in their order.
 
-    Each item runs on one thread, see `concurrent_count`; context variables are those of the caller.
+    The columns have the same length. Each row runs on one thread, see `concurrent_count`; context
+    variables are those of the caller.
 
     Much of the work of an experiment is too short to release and acquire the interpreter lock: more
-    experiments than cores at a time fill the gaps. An exception of ``run`` is passed on; items that
+    experiments than cores at a time fill the gaps. An exception of ``run`` is passed on; rows that
     are running are then interrupted at their next `run_in_slices`.
     """
-    count = concurrent_count(len(items), threads)
+    rows = [*zip(*columns, strict=True)]
+    count = concurrent_count(len(rows), threads)
     if count == 1:
-        return [run(item) for item in items]
+        return [*starmap(run, rows)]
 
     stop = threading.Event()
 
-    def passed(item: T) -> R:
-        """Run one item on this thread, which can be stopped by `stop`."""
+    def passed(row: tuple[Any, ...]) -> R:
+        """Run one row on this thread, which can be stopped by `stop`."""
         _alone.stop = stop
-        return run_single_threaded(run, item)
+        return run_single_threaded(run, *row)
 
-    # Each item needs a copy of its own: a context cannot be entered by two threads.
-    contexts = [copy_context() for _ in items]
+    # Each row needs a copy of its own: a context cannot be entered by two threads.
+    contexts = [copy_context() for _ in rows]
 
     with ThreadPoolExecutor(count) as pool:
         try:
             return list(
                 pool.map(
-                    lambda context, item: context.run(passed, item),
+                    lambda context, row: context.run(passed, row),
                     contexts,
-                    items,
+                    rows,
                 )
             )
         except BaseException:

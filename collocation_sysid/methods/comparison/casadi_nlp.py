@@ -29,6 +29,7 @@ import numpy as np
 from ...common.array_types import Array
 from ...common.validated_types import Count, Options, Positive
 from ...program.collocation import Collocation
+from ...program.lifted.lifted_collocation import with_lifted_variables
 from .. import nlpsol
 from ..callbacks import HessianValues, NlpFunctions
 from ..solution import Solution, Status, Watch
@@ -94,7 +95,7 @@ class CasadiSolver(Options):
         )
         plugin = self.name.removeprefix(PREFIX)
         with recorder.stopwatch.building():
-            program = collocation.with_lifted_variables()
+            program = with_lifted_variables(collocation)
         return nlpsol.solve(
             recorder,
             program,

@@ -17,6 +17,7 @@ import scipy.sparse as sp
 
 from ...common.array_types import Array, Index
 from ...program.collocation import Collocation, convert_variables
+from ...program.lifted.lifted_collocation import with_lifted_variables
 from ...program.stopwatch import Stopwatch
 
 
@@ -59,7 +60,7 @@ class PenaltyProblem:
                 if has_grasp_constraints
                 else replace(collocation, has_grasp_constraints=True)
             )
-            self.nlp = grasped.with_lifted_variables()
+            self.nlp = with_lifted_variables(grasped)
             indptr, indices = self.nlp.jacobian_structure
             shape = (self.nlp.constraint_count, self.nlp.variable_count)
             self._entries = np.zeros(len(indices))

@@ -3,7 +3,8 @@
 Interior-point methods and the methods for comparison keep them, because the sparse program then
 has simpler equations; reduced space eliminates them.
 
-- `lifted_variables`: base class; `lifting`: adds the variables to a collocation.
+- `lifted_collocation`: the program with these variables; `lifting`: its groups of variables;
+  `lifted_variables`: their base class.
 - `lifted_memory`: internal variables of viscoelastic materials; `lifted_force_histories`: those of
   forces with a history.
 - `lifted_contact_pressures`: contact pressures with complementarity conditions.

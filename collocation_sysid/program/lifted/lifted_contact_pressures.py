@@ -20,7 +20,7 @@ from ...common.array_types import Array
 from ...model.contact import Contact
 from ..experiment_iterate import ExperimentIterate
 from ..linear_algebra.sparse_assembly import EntryBlock
-from ..transcription import WeightedHistory
+from ..motion_transcription import WeightedHistory
 from .lifted_force_histories import LiftedForceHistory
 
 

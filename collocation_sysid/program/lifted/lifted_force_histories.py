@@ -23,7 +23,7 @@ from ...model.force_internal_variables import ForceHistory
 from ...model.point_forces import LawDerivatives
 from ..experiment_iterate import ExperimentIterate
 from ..linear_algebra.sparse_assembly import EntryBlock
-from ..transcription import RowWeights, WeightedHistory
+from ..motion_transcription import RowWeights, WeightedHistory
 from .lifted_reactions import LiftedReactions, motion_equations
 from .lifted_variables import LiftedVariables, concatenated_entries
 

@@ -24,7 +24,7 @@ from ...common.array_types import Array, Index
 from ...model.viscoelasticity import EVALUATIONS_PER_CHUNK, MemoryHistory
 from ..experiment_iterate import ExperimentIterate
 from ..linear_algebra.sparse_assembly import EntryBlock
-from ..transcription import RowWeights, WeightedHistory
+from ..motion_transcription import RowWeights, WeightedHistory
 from .lifted_reactions import LiftedReactions, MotionEquations, motion_equations
 from .lifted_variables import LiftedVariables, concatenated_entries
 

@@ -1,6 +1,6 @@
 """Lifted variables: variables of the program that follow from the others, each with an equation.
 
-By default they are eliminated; `Collocation.has_lifted_variables` adds them so that exact matrices
+By default they are eliminated; `lifted_collocation.LiftedCollocation` has them so that exact matrices
 stay sparse. Their equations come after all other constraints, and the variables after all other
 variables. Subclass `LiftedVariables` to lift another quantity; most subclasses only declare
 `patterns` of small expressions, see `expression_patterns`.
@@ -18,7 +18,8 @@ import numpy as np
 
 from ...common.array_types import Array, Index
 from ..experiment_iterate import ExperimentIterate
-from ..transcription import RowWeights, Transcription, WeightedHistory
+from ..motion_transcription import RowWeights, WeightedHistory
+from ..transcription import Transcription
 from .expression_patterns import ExpressionPattern
 
 

@@ -22,7 +22,7 @@ from ...common.array_types import Array, Index
 from ...model.generated_functions import GeneratedFunction
 from ..experiment_iterate import ExperimentIterate
 from ..measurement_residual import MeasurementResidual
-from ..transcription import RowWeights
+from ..motion_transcription import RowWeights
 from ..wrench.wrench_observable import LOW_PASS, MOMENT, GraspWrench
 from .expression_patterns import ExpressionPattern, PatternIndices
 from .lifted_reactions import LiftedReactions

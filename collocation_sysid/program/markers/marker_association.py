@@ -1,12 +1,9 @@
-"""Marker–element association: the element of each marker's place, and the whole samples of the
-clock.
+"""Marker–element association: the element of each marker's place.
 
-The place X of a marker on the undeformed body and the shift τ of its clock are estimated.
-Predictions are smooth functions of them within one element and around one sample; a
-`MarkerAssociation` states which. When estimates leave it, `MarkerAssociation.follow_estimates`
-returns another association, and the problem stays the same up to the tolerances below. An
-association also contains the surface correspondences of depth cameras, see
-`surface_correspondences`.
+The place X of a marker on the undeformed body is estimated. Predictions are smooth functions of it
+within one element; a `MarkerAssociation` states which. When estimates leave it,
+`MarkerAssociation.follow_estimates` returns another association, and the problem stays the same up
+to the tolerances below.
 """
 
 from __future__ import annotations
@@ -21,16 +18,10 @@ from ...common.array_types import Array, Index
 from ...fem.body import Body
 from ...recording.experiment import Experiment
 from ...recording.placement import LocatedBody, Placement
-from ..depth.surface_correspondences import (
-    SurfaceCorrespondences,
-    initial_correspondences,
-)
 
 # A place leaves its element when another contains it better by this barycentric coordinate, so that
 # it cannot alternate between two.
 BETTER = 0.01
-# The clock leaves its sample when its shift differs by more than this [samples].
-SAMPLES_OFF = 1.0
 # Number of times in succession that a place may leave the surface across the same edge; after that
 # it stays in its plane.
 LARGEST_CROSSING_COUNT = 2
@@ -59,7 +50,7 @@ class ShapeFunctions(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MarkerAssociation:
-    """Element of each marker, directions in which its place may move, and the clock's sample.
+    """Element of each marker, and directions in which its place may move.
 
     Attributes
     ----------
@@ -84,10 +75,6 @@ class MarkerAssociation:
         not.
     crossing_counts : (M,) array
         How often in succession it left the surface across this edge before.
-    clock_samples : int
-        Whole samples of the clock's shift.
-    correspondences : tuple of SurfaceCorrespondences
-        Surface correspondences of depth cameras.
     """
 
     body: Body
@@ -101,13 +88,10 @@ class MarkerAssociation:
     axes: Array
     crossed_edges: Array
     crossing_counts: Index
-    clock_samples: int = 0
-    correspondences: tuple[SurfaceCorrespondences, ...] = ()
 
     @classmethod
     def from_experiment(cls, experiment: Experiment) -> MarkerAssociation:
-        """Return the association for the stated places of an experiment's markers and depth
-        cameras.
+        """Return the association for the stated places of an experiment's markers.
 
         Markers without a stated place get the place where their first sample lies on the undeformed
         body in its grasp; `Transcription.place_unknown_markers` replaces it before a solve.
@@ -130,7 +114,6 @@ class MarkerAssociation:
             axes=np.zeros((len(points), 3, k)),
             crossed_edges=np.full((len(points), 2, 3), np.nan),
             crossing_counts=np.zeros(len(points), dtype=np.int64),
-            correspondences=initial_correspondences(experiment),
         )
         return chart.centred_at(points)
 
@@ -159,14 +142,12 @@ class MarkerAssociation:
 
     def matches(self, experiment: Experiment) -> bool:
         """Return whether the association belongs to the experiment's body (the same object), and
-        has the same priors and cameras.
+        has the same priors.
         """
         return (
             self.body is experiment.body
             and self.on_surface == experiment.markers.on_surface
             and np.array_equal(self.sigma_m, experiment.place_sigma_m)
-            and [s.camera.depth for s in self.correspondences]
-            == [*experiment.depths]
         )
 
     @cached_property
@@ -263,20 +244,15 @@ class MarkerAssociation:
             cells[m], _ = self._shape.nearest_cell(points[m])
         return replace(self, centre_places_m=points, cells=cells, axes=axes)
 
-    def follow_estimates(
-        self, phi: Array, shift_samples: float
-    ) -> tuple[MarkerAssociation, Array]:
+    def follow_estimates(self, phi: Array) -> tuple[MarkerAssociation, Array]:
         """Return an association for estimates that have left this one, and φ in it.
 
-        If a place has left its element, all centres are moved to the estimates. The clock is moved
-        if its shift differs by more than `SAMPLES_OFF`.
+        If a place has left its element, all centres are moved to the estimates.
 
         Parameters
         ----------
         phi : (M, k) array
             Coordinates of the places, in prior standard deviations along `axes`.
-        shift_samples : float
-            Shift of the clock over the sample interval.
 
         Returns
         -------
@@ -289,18 +265,9 @@ class MarkerAssociation:
             changed_cell = changed_cell or self._is_outside(
                 points[m], int(self.cells[m])
             )
-        samples = self.clock_samples
-        if abs(shift_samples - samples) > SAMPLES_OFF:
-            samples = round(shift_samples)
         if not changed_cell:
-            return (
-                self
-                if samples == self.clock_samples
-                else replace(self, clock_samples=samples)
-            ), phi
-        chart = replace(
-            self._without_alternation(points), clock_samples=samples
-        )
+            return self, phi
+        chart = self._without_alternation(points)
         return chart, chart.centre_coordinates
 
     def _without_alternation(self, points_m: Array) -> MarkerAssociation:

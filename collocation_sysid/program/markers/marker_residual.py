@@ -9,7 +9,6 @@ offset b; without φ it is h(x_t). See `observables` for h and `model.nuisance_m
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -48,12 +47,18 @@ class MarkerResidual(MeasurementResidual):
         time is predicted there, otherwise such samples are not compared.
     preceding_times : int
         Number of the observable's times before the first sample.
+    clock_samples : int
+        Whole samples of the clock's shift.
+    delay_s : float
+        Time by which samples are taken later than `t_s` [s].
     """
 
     observable: PointPositions
     markers: Markers
     is_initially_at_rest: bool
     preceding_times: int
+    clock_samples: int
+    delay_s: float = 0.0
 
     @classmethod
     def from_markers(
@@ -62,6 +67,7 @@ class MarkerResidual(MeasurementResidual):
         rows: Index,
         nuisance: NuisanceMap,
         association: MarkerAssociation,
+        clock_samples: int = 0,
         huber: float | None = None,
         is_initially_at_rest: bool = True,
         preceding_times: int = 0,
@@ -78,6 +84,8 @@ class MarkerResidual(MeasurementResidual):
             Nuisance parameters of the experiment.
         association : MarkerAssociation
             Elements of the markers.
+        clock_samples : int
+            Whole samples of the clock's shift.
         huber : float or None
             Threshold of Huber's loss in standard deviations; None means a quadratic loss.
         is_initially_at_rest : bool
@@ -89,11 +97,7 @@ class MarkerResidual(MeasurementResidual):
         places[association.estimated] = nuisance.indices_of_rows(PLACE).reshape(
             -1, places.shape[1]
         )
-        shifted = (
-            preceding_times
-            + np.arange(len(markers.t_s))
-            + association.clock_samples
-        )
+        shifted = preceding_times + np.arange(len(markers.t_s)) + clock_samples
         covered = (shifted < len(rows)) & (
             (shifted >= 0) | is_initially_at_rest
         )
@@ -113,6 +117,7 @@ class MarkerResidual(MeasurementResidual):
             markers=markers,
             is_initially_at_rest=is_initially_at_rest,
             preceding_times=preceding_times,
+            clock_samples=clock_samples,
         )
 
     @property
@@ -155,7 +160,7 @@ class MarkerResidual(MeasurementResidual):
         """
         first = (
             self._sample_indices
-            + self.observable.association.clock_samples
+            + self.clock_samples
             - self._neighbour_count // 2
         )
         first = np.minimum(first, self.observable.count - self._neighbour_count)
@@ -171,11 +176,14 @@ class MarkerResidual(MeasurementResidual):
     @cached_property
     def _stencil(self) -> RowStencil:
         """Stencil of all samples; its data are the position of the sample among its neighbours, in
-        samples, and the sample's time [s].
+        samples, and the sample's time [s], delay included.
         """
         count = len(self.markers.names)
         place = np.array(
-            [self._sample_indices - self._first_neighbour, self.t_s],
+            [
+                self._sample_indices - self._first_neighbour,
+                self.t_s + self.delay_s,
+            ],
             dtype=np.float64,
         )
         places = (
@@ -198,12 +206,9 @@ class MarkerResidual(MeasurementResidual):
         """
         if not self._full_expression.residual.depends_on_datum(1):
             return self
-        other = copy(self)
-        data = self._stencil.data.copy()
-        instruments = self._expressions
-        data[1] += by_s
-        shifted = self._stencil._replace(data=data)
-        vars(other).update(_stencil=shifted, _expressions=instruments)
+        other = replace(self, delay_s=self.delay_s + by_s)
+        # Derivatives of the same expression are generated once.
+        vars(other)["_expressions"] = self._expressions
         return other
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:

@@ -26,6 +26,10 @@ from ...model.schemes import as_scheme
 from ...problem import Problem
 from ...program.collocation import Collocation, ExperimentIterate
 from ...program.contact.contact_summary import contact_summaries_of_parts
+from ...program.lifted.lifted_collocation import (
+    lifted_count,
+    with_lifted_variables,
+)
 from ...program.modes.stability import Instability, find_instabilities
 from ...recording.experiment import Experiment
 from ...statistics.assessment import (
@@ -459,7 +463,7 @@ def _program_fields(
     first_z : (variables,) array
         Variables of `first` at the guess.
     """
-    lifted = collocation.with_lifted_variables()
+    lifted = with_lifted_variables(collocation)
     jacobian, hessian = nonzeros(problem, lifted)
     # Reduced space as the file has it, whichever method is chosen.
     named = (
@@ -484,8 +488,8 @@ def _program_fields(
     return {
         "variables": collocation.variable_count,
         "constraints": collocation.constraint_count,
-        "overstresses": lifted.lifted_count("memory"),
-        "wrenches": lifted.lifted_count("wrench"),
+        "overstresses": lifted_count(lifted, "memory"),
+        "wrenches": lifted_count(lifted, "wrench"),
         "jacobian_nonzeros": jacobian,
         "hessian_nonzeros": hessian,
         "method": name,

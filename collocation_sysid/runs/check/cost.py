@@ -16,6 +16,10 @@ from ...methods.interior_point import InteriorPoint
 from ...methods.reduced_space import ReducedSpace, memory_mb
 from ...problem import Problem
 from ...program.collocation import Collocation
+from ...program.lifted.lifted_collocation import (
+    lifted_nonzeros,
+    with_lifted_variables,
+)
 from ...program.linear_algebra.factorisation import Choice
 from ...program.sweep import Sweep
 from ...statistics.concerns import Concern
@@ -57,7 +61,7 @@ def require_memory(
         return
     if isinstance(method, InteriorPoint):
         needed_mb = interior_point_mb(
-            sum(nonzeros(problem, collocation.with_lifted_variables()))
+            sum(nonzeros(problem, with_lifted_variables(collocation)))
         )
         fits = memory_mb(collocation) < there_mb
         remedy = (
@@ -97,7 +101,7 @@ def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
     lifted : Collocation
         Program of the problem with lifted variables, as interior point needs it.
     """
-    further = lifted.lifted_nonzeros
+    further = lifted_nonzeros(lifted)
     short = shortened_problem(problem)
     total = least = _count_nonzeros(short)
     for k, experiment in enumerate(problem.experiments):

@@ -14,6 +14,10 @@ from ...common.time_dependence import at_times
 from ...model.contact import contact_terms
 from ...problem import Problem
 from ...program.collocation import Collocation, convert_variables
+from ...program.lifted.lifted_collocation import (
+    lifted_nonzeros,
+    with_lifted_variables,
+)
 from ...recording.depth_camera import until_all_cameras_see
 from ...recording.experiment import Experiment
 from ...recording.measured_wrench import Wrench
@@ -128,10 +132,10 @@ def derivative_errors(
     rng = np.random.default_rng(0)
     of_slopes = 0.0
     step = _difference_step(collocation)
-    program = collocation.with_lifted_variables()
+    program = with_lifted_variables(collocation)
     plain = collocation
     if (
-        program.has_lifted_variables
+        program is not collocation
     ):  # methods use these without memory and wrenches as variables
         of_slopes = _slope_error(
             plain.objective, plain.gradient, z=z, rng=rng, step=step
@@ -142,7 +146,7 @@ def derivative_errors(
             pushed = lambda at: forces @ plain.constraint_values(at)  # noqa: E731
             slope = _slope_error(pushed, through, z=z, rng=rng, step=step)
             of_slopes = max(of_slopes, slope)
-        if sum(program.lifted_nonzeros) > MOST_LIFTED_NONZEROS:
+        if sum(lifted_nonzeros(program)) > MOST_LIFTED_NONZEROS:
             return of_slopes, 0.0
         collocation = program
         z = convert_variables(z, plain, target=program)

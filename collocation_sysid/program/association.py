@@ -1,0 +1,106 @@
+"""Association of the measurements of one experiment with its body and its time grid.
+
+Predictions are smooth functions of the estimates within one element, around one sample of the clock
+and for one set of corresponding surface points. An `Association` states which; when estimates leave
+it, `Transcription.follow_estimates` returns another one, and the problem stays the same up to the
+tolerances of its parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from ..common.array_types import Array
+from ..fem.body import Body
+from ..recording.experiment import Experiment
+from .depth.surface_correspondences import (
+    SurfaceCorrespondences,
+    initial_correspondences,
+)
+from .markers.marker_association import MarkerAssociation
+
+# The clock leaves its sample when its shift differs by more than this [samples].
+SAMPLES_OFF = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Association:
+    """Elements of the markers, sample of the clock, and surface points of depth cameras.
+
+    Attributes
+    ----------
+    markers : MarkerAssociation
+        Elements and directions of the marker places.
+    clock_samples : int
+        Whole samples of the clock's shift.
+    correspondences : tuple of SurfaceCorrespondences
+        Surface correspondences of the depth cameras, in their order.
+    """
+
+    markers: MarkerAssociation
+    clock_samples: int = 0
+    correspondences: tuple[SurfaceCorrespondences, ...] = ()
+
+    @classmethod
+    def from_experiment(cls, experiment: Experiment) -> Association:
+        """Return the association for the stated places of an experiment's markers and depth
+        cameras, with a clock that is not shifted.
+        """
+        return cls(
+            MarkerAssociation.from_experiment(experiment),
+            correspondences=initial_correspondences(experiment),
+        )
+
+    def matches(self, experiment: Experiment) -> bool:
+        """Return whether the association belongs to the experiment's body (the same object), and
+        has the same priors and cameras.
+        """
+        return self.markers.matches(experiment) and [
+            each.camera.depth for each in self.correspondences
+        ] == [*experiment.depths]
+
+    def centred_at(self, places_m: Array) -> Association:
+        """Return the association with the markers centred at places (M, 3) [m] on the undeformed
+        body.
+        """
+        return replace(self, markers=self.markers.centred_at(places_m))
+
+    def on_body(self, body: Body) -> Association:
+        """Return the association for a body with the same mesh."""
+        return replace(self, markers=replace(self.markers, body=body))
+
+    def updated(
+        self,
+        markers: MarkerAssociation,
+        shift_samples: float,
+        correspondences: Sequence[SurfaceCorrespondences],
+    ) -> Association:
+        """Return the association at other estimates; self if nothing has changed.
+
+        Parameters
+        ----------
+        markers : MarkerAssociation
+            Association of the markers; the present object if it has not changed.
+        shift_samples : float
+            Shift of the clock over the sample interval. The clock is moved if it differs by more
+            than `SAMPLES_OFF`.
+        correspondences : sequence of SurfaceCorrespondences
+            One for each depth camera; the present object where it has not changed.
+        """
+        clock_samples = self.clock_samples
+        if abs(shift_samples - clock_samples) > SAMPLES_OFF:
+            clock_samples = round(shift_samples)
+        is_same = (
+            markers is self.markers
+            and clock_samples == self.clock_samples
+            and all(
+                new is old
+                for new, old in zip(
+                    correspondences, self.correspondences, strict=True
+                )
+            )
+        )
+        if is_same:
+            return self
+        return Association(markers, clock_samples, tuple(correspondences))
