@@ -138,7 +138,7 @@ class CoarseStart:
             return x
         matrix = relation.interpolation
         points = x.reshape(len(x), -1, 3)
-        own = matrix.shape[1]
+        own = len(relation.coarse.nodes.points_m)
         by_node = points[:, :own].transpose(1, 0, 2).reshape(own, -1)
         interpolated = np.asarray(matrix @ by_node).reshape(-1, len(x), 3)
         return np.concatenate(

@@ -258,12 +258,15 @@ class _CollapseState:
         rank = np.arange(len(removed)) - np.searchsorted(removed, removed)
         return _Collapses(removed, kept).subset(rank < NEIGHBOURS)
 
-    def _stays_in_groups(self, removed: Index, kept: Index) -> Array:
+    def _stays_in_groups(
+        self, removed: Index, kept: Index
+    ) -> NDArray[np.bool_]:
         """Return whether each kept node (k,) has elements of all groups of the removed one."""
         groups = self.groups[self.sources]
         in_group = np.zeros((len(self.points), int(groups.max()) + 1), bool)
         in_group[self.cells, groups[:, None]] = True
-        return ~(in_group[removed] & ~in_group[kept]).any(axis=1)
+        outside = in_group[removed] & ~in_group[kept]
+        return np.asarray(~outside.any(axis=1))
 
     def _surface_distances(self, removed: Index, kept: Index) -> Array:
         """Return the root mean square distances (k,) [m] of the kept nodes from the planes of the
