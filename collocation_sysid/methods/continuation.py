@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 from ..common.array_types import Array
+from ..common.time_dependence import at_times
 from ..common.validated_types import Options
 from ..errors import InputError, hint_at
 from ..program.collocation import Collocation
@@ -150,11 +151,11 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
     stop, depths = until_all_cameras_see(
         experiment.depths, experiment.t_s, count=stop, fewest=fewest
     )
-    shorter = replace(
-        markers, t_s=markers.t_s[:stop], positions_m=markers.positions_m[:stop]
-    )
     return replace(
-        experiment, t_s=experiment.t_s[:stop], markers=shorter, depths=depths
+        experiment,
+        t_s=experiment.t_s[:stop],
+        markers=at_times(markers, slice(stop)),
+        depths=depths,
     )
 
 

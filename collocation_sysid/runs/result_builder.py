@@ -16,6 +16,7 @@ from ..common.files import SCHEMA
 from ..common.serialisation import copy_fields
 from ..fem.laws.constants import GAMMA_R
 from ..methods.solution import custom_sensor_rms, pooled_wrench_rms
+from ..methods.stiffness_scan import ScanSummary
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
@@ -41,7 +42,6 @@ from .result_content import (
     Provenance,
     RecordingsAgreement,
     Result,
-    ScanResult,
     SimulatedExperiment,
     UncertaintyResult,
 )
@@ -82,7 +82,7 @@ def build_result(answer: SolvedProblem) -> Result:
         uncertainty=_uncertainty_result(answer),
         scan=None
         if solution.scan is None
-        else copy_fields(ScanResult, solution.scan),
+        else copy_fields(ScanSummary, solution.scan),
         fit=_fit_result(answer),
         residuals=answer.diagnoses,
         dynamics=DynamicsResult(

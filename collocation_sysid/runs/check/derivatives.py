@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from ...common.array_types import Array
+from ...common.time_dependence import at_times
 from ...model.contact import contact_terms
 from ...problem import Problem
 from ...program.collocation import Collocation, convert_variables
@@ -66,18 +67,22 @@ def shortened_experiment(experiment: Experiment, samples: int) -> Experiment:
         experiment.depths, experiment.t_s, count=samples, fewest=fewest
     )
     markers = experiment.markers
-    here = slice(samples)
-    tracks = markers.positions_m[here]
-    if not np.isfinite(tracks).any():
-        tracks = np.nan_to_num(tracks)  # at least one sample has to be there
-    markers = replace(markers, t_s=markers.t_s[here], positions_m=tracks)
-    t_s = experiment.t_s[here]
+    if not np.isfinite(markers.positions_m[:samples]).any():
+        # At least one sample has to be there.
+        markers = replace(
+            markers, positions_m=np.nan_to_num(markers.positions_m)
+        )
+    t_s = experiment.t_s[:samples]
     grasps = [
         replace(g, wrench=_shortened_wrench(g.wrench, t_s, fewest=fewest))
         for g in experiment.grasps
     ]
     return replace(
-        experiment, t_s=t_s, markers=markers, grasps=grasps, depths=depths
+        experiment,
+        t_s=t_s,
+        markers=at_times(markers, slice(samples)),
+        grasps=grasps,
+        depths=depths,
     )
 
 
@@ -93,7 +98,7 @@ def _shortened_wrench(
     here = (wrench.t_s >= t_s[0]) & (wrench.t_s <= t_s[-1])
     if here.sum() < fewest or not wrench.is_measured[here].any():
         return None
-    return replace(wrench, t_s=wrench.t_s[here], values=wrench.values[here])
+    return at_times(wrench, here)
 
 
 def derivative_errors(
