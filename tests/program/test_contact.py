@@ -771,7 +771,7 @@ def test_a_long_cylinder_presses_as_hertz_found():
     assert misses[-1] < misses[0] / 2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_two_elements_to_the_radius_suffice_for_the_force_of_hertz_by_default():
     """On a graded mesh, with stiffness, width and faces of the contact left open."""
     assert 0.98 < sphere_on_half_space(2) < 1.03
