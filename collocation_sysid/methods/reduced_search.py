@@ -577,7 +577,7 @@ class ReducedSearch:
         trajectories, and replace the collocation of the search and the horizon, in place.
 
         Nothing happens after the first time, unless the trajectories were then too short for the
-        cameras; nor if all positions are known.
+        cameras; nor if all positions are known or there are no trajectories.
 
         Parameters
         ----------
@@ -742,7 +742,9 @@ class ReducedSearch:
             )
         )
         violation_n = max(each.violation_n for each in summaries)
-        values = self.collocation.parameter_values(p)
+        values = self.collocation.parameters.scalar_values(
+            p[: self.collocation.nq]
+        )
         time_s = self.recorder.elapsed_s
         share = sum(each.rows for each in summaries) / sum(
             s.grid_times for s in self.collocation.transcriptions

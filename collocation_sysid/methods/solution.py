@@ -395,7 +395,9 @@ class Solution:
 
     @cached_property
     def readings(self) -> dict[str, dict[str, Array]]:
-        """Predicted values (S, m) of custom sensors, by experiment name and sensor name."""
+        """Predicted values (S, m) of custom sensors, by name of the fitted experiment and of the
+        sensor; experiments without custom sensors have empty mappings.
+        """
         return {
             part.segment.experiment.name: {
                 gauge.sensor.name: gauge.without_padding(

@@ -104,6 +104,17 @@ class Recipe(Options):
         require_among(self.integrator, (NEWMARK, *SCHEMES), where="integrator")
 
 
+def _share_of_experiment(
+    progress: Callable[[float], None] | None, index: int, count: int
+) -> Callable[[float], None] | None:
+    """Return a function that reports the share of one simulation, by its index among `count`, as a
+    share of all to `progress`; None if that is None.
+    """
+    if progress is None:
+        return None
+    return lambda share: progress((index + share) / count)
+
+
 def write_data(
     problem: Problem,
     folder: str | Path,
@@ -128,7 +139,7 @@ def write_data(
     recipe : Recipe, optional
         Integrator, noise and seed; without noise by default.
     progress : callable, optional
-        Called with the completed share of a simulation, from 0 to 1.
+        Called with the completed share of all simulations, ascending from 0 to 1.
 
     Returns
     -------
@@ -173,10 +184,14 @@ def write_data(
             substeps="auto"
             if recipe.integrator == NEWMARK
             else problem.substeps,
-            progress=progress,
+            progress=_share_of_experiment(
+                progress, number, count=len(problem.experiments)
+            ),
         )
-        for experiment in problem.experiments
+        for number, experiment in enumerate(problem.experiments)
     ]
+    if progress is not None:
+        progress(1.0)
     written: list[Path] = []
     drafts_of: dict[Path, Path] = {}
     with ExitStack() as stack:  # all files appear at its end, or none
@@ -348,13 +363,15 @@ def _write_specimen(
 
 
 def _wrench_layouts(section: ExperimentSection | None) -> list[WrenchSection]:
-    """Return the table layout of each force sensor in order; empty without a problem file."""
+    """Return the table layout of each force sensor, those of grasps before those of obstacles;
+    empty if `section` is None, for a problem without a file.
+    """
     moved = section.moved_sections if section is not None else []
     return [each.wrench for each in moved if each.wrench is not None]
 
 
 def _require_guesses(problem: Problem) -> None:
-    """Raise an InputError if a parameter has no guess."""
+    """Raise an `InputError`, naming the parameter and the remedy, if a parameter has no guess."""
     if names := problem.parameters.names_without_guess:
         key = f"parameters.{names[0]}"
         raise InputError(
@@ -473,7 +490,9 @@ def _table_names(
 
 
 def _numbered_key(kind: str, index: int) -> str:
-    """Return the key of a file of the grasp with this index, counted from 0: poses, poses_2, …"""
+    """Return the key of a file of a kind, such as "poses", for the grasp with this index from 0:
+    poses, poses_2, …
+    """
     return f"{kind}_{index + 1}" if index else kind
 
 

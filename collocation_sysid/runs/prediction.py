@@ -150,7 +150,14 @@ def instrument_misfits(
     """Return the RMS of (prediction − measurement) / σ of each instrument, with the stated σ.
 
     The order is markers, wrenches, custom sensors, depth cameras. Markers and depth cameras without
-    measurements are left out. The prediction must be at the samples of the experiment.
+    measurements are left out; values that are NaN, measured or predicted, do not count.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Recording with the measurements.
+    predicted : InstrumentPrediction
+        Prediction at the same samples and for the same instruments, in the same order.
     """
     results = []
     markers = experiment.markers

@@ -596,7 +596,9 @@ def _contact_concerns(
 
 
 def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
-    """Return the finding of each body, with the names of its experiments."""
+    """Return the finding of each body at the guess, with the names of its experiments; every
+    parameter must have a guess.
+    """
     guesses = problem.parameters.guesses
     names = [
         tuple(e.name for e in problem.experiments if e.body is b)
@@ -609,6 +611,11 @@ def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
             body.theta_from_values(guesses),
             experiments=own,
             is_homogeneous=specimens.issuperset(own),
+            point_masses_kg={
+                e.name: sum(mass.mass_kg for mass in e.masses)
+                for e in problem.experiments
+                if e.name in own and e.masses
+            },
         )
         for body, own in zip(problem.bodies, names, strict=True)
     )
@@ -626,7 +633,9 @@ def _body_concerns(body: BodyCheck, alone: bool) -> tuple[Concern, ...]:
 
 
 def _depth_notes(problem: Problem) -> list[str]:
-    """Return a note on bodies with too many nodes for a comparison with depth images."""
+    """Return one note if a body with depth images has too many nodes for a comparison with the
+    equilibria of many stiffnesses; otherwise an empty list.
+    """
     large = any(
         e.depths and len(e.body.nodes_m) > NODES for e in problem.experiments
     )

@@ -10,7 +10,6 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...fem.body import Body
-from ...fem.laws.constants import is_field_coefficient
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.mesh import TetMesh
 from ...fem.meshes.mesh_checks import edge_lengths, mean_ratios
@@ -82,7 +81,9 @@ class Slenderness:
 
 
 def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
-    """Return the `count` elements of lowest quality, worst first; all of them if there are fewer."""
+    """Return the shapes of the `count` elements of lowest quality, worst first; all of them if
+    there are fewer.
+    """
     corners = mesh.points_m[mesh.tetrahedra]
     areas = [_areas(corners[:, face]) for face in _FACES]
     heights = 3 * mesh.volumes_m3 / np.max(areas, axis=0)
@@ -207,6 +208,8 @@ class BodyCheck:
         Numbers of nodes and elements.
     volume_m3, mass_kg : float
         Volume of the mesh, and mass at the guess, without point masses.
+    point_masses_kg : mapping of str to float
+        Sum of the point masses of each experiment that has any, by its name.
     size_m : (x, y, z) extents of the mesh along the axes
     smallest_element_quality, median_element_quality : float
         Mean ratio, see `ElementShape`.
@@ -237,6 +240,7 @@ class BodyCheck:
     element: str
     volume_m3: float
     mass_kg: float
+    point_masses_kg: Mapping[str, float]
     size_m: tuple[float, float, float]
     edges_m: tuple[float, float, float]
     smallest_element_quality: float
@@ -267,6 +271,7 @@ def check_body(
     experiments: tuple[str, ...],
     *,
     is_homogeneous: bool = False,
+    point_masses_kg: Mapping[str, float] | None = None,
 ) -> BodyCheck:
     """Return a summary of size, mesh and guess of a body, with concerns.
 
@@ -297,6 +302,7 @@ def check_body(
         element=body.element.name,
         volume_m3=mesh.volume_m3,
         mass_kg=float(body.mass_of_dofs(theta).sum()) / 3,
+        point_masses_kg=dict(point_masses_kg or {}),
         size_m=(x, y, z),
         edges_m=(quality.edge_min_m, quality.edge_mean_m, quality.edge_max_m),
         smallest_element_quality=quality.quality_min,
@@ -329,7 +335,7 @@ def _rest_shape(body: Body) -> str | None:
 
 def _rest_shape_change_m(body: Body, theta: Array) -> float:
     """Return the largest distance of the mesh of a body from its stress-free shape [m]: 0 if the
-    mesh is that shape, NaN if none can be computed at the constants θ (k,).
+    mesh is that shape, NaN if none can be computed at the constants `theta` (k,).
     """
     if body.inverse_equilibrium is None:
         return 0.0
@@ -351,8 +357,9 @@ def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
 
 
 def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
-    """Return E and ν at small strain of each part, then the constants θ of the body without
-    coefficients of fields, by name with the region; stated moduli replace computed ones.
+    """Return E [Pa] and ν at small strain of each part, then the constants of the body without
+    coefficients of fields, by name with the region; stated moduli replace computed ones. `theta`
+    (k,) are the constants.
     """
     moduli = {}
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
@@ -362,10 +369,9 @@ def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
             part.full_name("poisson"): poisson,
         }
     constants = zip(body.constants, theta.tolist(), strict=True)
+    coefficients = body.field_coefficient_names
     return moduli | {
-        name: value
-        for name, value in constants
-        if not is_field_coefficient(name)
+        name: value for name, value in constants if name not in coefficients
     }
 
 
@@ -481,7 +487,9 @@ def _check_grasp(
 
 
 def grasp_sentence(grasp_check: GraspCheck) -> str:
-    """Return number, share, bounding box [mm] and axes of the grasped nodes as text."""
+    """Return number and share of the grasped nodes, size and lower corner of their bounding box
+    [mm], and the axes along which they are held unless these are all, as text.
+    """
     size = " × ".join(
         f"{1e3 * (b - a):.4g}"
         for a, b in zip(grasp_check.low_m, grasp_check.high_m, strict=True)

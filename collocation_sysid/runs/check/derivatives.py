@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from ...common.array_types import Array
+from ...common.time_dependence import at_times
 from ...model.contact import contact_terms
 from ...problem import Problem
 from ...program.collocation import Collocation, convert_variables
@@ -70,18 +71,22 @@ def shortened_experiment(experiment: Experiment, samples: int) -> Experiment:
         experiment.depths, experiment.t_s, count=samples, fewest=fewest
     )
     markers = experiment.markers
-    here = slice(samples)
-    tracks = markers.positions_m[here]
-    if not np.isfinite(tracks).any():
-        tracks = np.nan_to_num(tracks)  # at least one sample has to be there
-    markers = replace(markers, t_s=markers.t_s[here], positions_m=tracks)
-    t_s = experiment.t_s[here]
+    if not np.isfinite(markers.positions_m[:samples]).any():
+        # At least one sample has to be there.
+        markers = replace(
+            markers, positions_m=np.nan_to_num(markers.positions_m)
+        )
+    t_s = experiment.t_s[:samples]
     grasps = [
         replace(g, wrench=_shortened_wrench(g.wrench, t_s, fewest=fewest))
         for g in experiment.grasps
     ]
     return replace(
-        experiment, t_s=t_s, markers=markers, grasps=grasps, depths=depths
+        experiment,
+        t_s=t_s,
+        markers=at_times(markers, slice(samples)),
+        grasps=grasps,
+        depths=depths,
     )
 
 
@@ -97,7 +102,7 @@ def _shortened_wrench(
     here = (wrench.t_s >= t_s[0]) & (wrench.t_s <= t_s[-1])
     if here.sum() < fewest or not wrench.is_measured[here].any():
         return None
-    return replace(wrench, t_s=wrench.t_s[here], values=wrench.values[here])
+    return at_times(wrench, here)
 
 
 def derivative_errors(
@@ -106,14 +111,14 @@ def derivative_errors(
     """Return the largest relative errors of the first and the second derivatives.
 
     Exact derivatives along a random direction are compared with fourth-order central differences at
-    a disturbed start.
+    a disturbed start; the random numbers are the same in every call.
 
     Parameters
     ----------
     collocation : Collocation
         Program without lifted variables.
     z : (variables,) array
-        Start.
+        Start; not modified.
 
     Returns
     -------
@@ -224,8 +229,19 @@ def _slope_error(
 def _deviation(
     function, exact: Array, point: Array, direction: Array, step: float
 ) -> float:
-    """Return the largest deviation of `exact` from fourth-order central differences of `function`
-    along `direction` at `point`, relative to the largest entry of `exact`.
+    """Return the largest deviation of an exact derivative from fourth-order central differences,
+    relative to the largest entry of `exact`.
+
+    Parameters
+    ----------
+    function : callable
+        Function of the variables, which returns a number or an array.
+    exact : array
+        Its derivative along `direction` at `point`.
+    point, direction : (variables,) arrays
+        Where and along which the function is differentiated.
+    step : float
+        Step of the differences.
     """
     after, before, two_after, two_before = (
         function(point + k * step * direction) for k in (1, -1, 2, -2)

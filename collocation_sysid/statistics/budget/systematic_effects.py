@@ -13,10 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic_core import CoreSchema, core_schema
 
 from ...common.array_types import Array, Index
 from ...common.schema_tables import ByForm, Section
@@ -39,6 +41,7 @@ from ...recording.homogeneous_deformation import (
     HomogeneousDeformation,
 )
 from ...recording.nuisance import DEGREE
+from .platen_slip import slip_displacements_m
 from .shape_error import (
     CORRELATION,
     SURFACE_MODES,
@@ -576,7 +579,7 @@ def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of a larger Poisson's ratio, per unit, where it is stated (fixed, or tied
     to a fixed one), in all such parts together; None if there is none.
     """
-    items = {item.name: item for item in at.parameters.items}
+    items = {item.name: item for item in at.parameters.components}
     constants = {
         name
         for name, item in items.items()
@@ -709,6 +712,18 @@ def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
             length = np.linalg.norm(way, axis=1, keepdims=True)
             force[:, dofs] -= press[:, None] * way / np.maximum(length, 1e-9)
     return Effect(force) if platens else None
+
+
+def _platen_slip(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of faces that slide freely on platens instead of sticking; None if other
+    measurements than loads show the grip, or no face may slide, see `slip_displacements_m`.
+    """
+    displacement_m = slip_displacements_m(
+        at.iterate, at.theta, reactions_n=at.grasp_force_n
+    )
+    if displacement_m is None:
+        return None
+    return Effect(displacement_m=displacement_m)
 
 
 def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
@@ -959,6 +974,14 @@ ASSUMPTIONS = (
         effect=_platen_friction,
     ),
     Assumption(
+        "platen_slip",
+        "1",
+        sigma=1.0,
+        description="slip of faces that are pressed by platens and held along all axes, as a fraction of "
+        "that without friction, if only loads are measured",
+        effect=_platen_slip,
+    ),
+    Assumption(
         "contact_stiffness",
         "1",
         sigma=1.0,
@@ -1050,6 +1073,9 @@ class Assumptions(Options):
         Compliance of the test bench [m/N].
     platen_friction
         Coefficient of friction of platens between which nodes slide [1].
+    platen_slip
+        Slip of faces that are pressed by platens and held along all axes, as a fraction of that
+        without friction, if only loads are measured [1].
     contact_stiffness
         Compliance of the contact with obstacles, as a fraction of that of the pressure law [1].
     buoyancy
@@ -1149,6 +1175,7 @@ class Assumptions(Options):
     grip_layer_m: KnownDeviation = 0.0002
     machine_compliance_m_n: KnownDeviation = 1e-06
     platen_friction: Deviation = 0.1
+    platen_slip: Deviation = 1.0
     contact_stiffness: Deviation = 1.0
     buoyancy: Deviation = AIR_DENSITY_DEVIATION
     added_mass: Deviation = AIR_COEFFICIENT_DEVIATION
@@ -1222,3 +1249,36 @@ class Assumptions(Options):
             for name, deviation in vars(self).items()
             if isinstance(deviation, KnownEffect)
         }
+
+
+class ExactIfNone:
+    """Annotation of a table of assumptions that may be "none": all of them exactly true."""
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Return the schema of the table with "none" replaced by `Assumptions.exact`."""
+        return core_schema.no_info_before_validator_function(
+            self._exact_if_none, handler(source)
+        )
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """Return the JSON schema: the table, or "none"."""
+        return {"anyOf": [handler(schema), {"const": "none", "type": "string"}]}
+
+    @staticmethod
+    def _exact_if_none(value: Any) -> Any:
+        """Return the values of all assumptions in place of "none"; other values unchanged.
+
+        Raises
+        ------
+        ValueError
+            If the value is another text.
+        """
+        if isinstance(value, str) and value != "none":
+            raise ValueError(
+                f'found "{value}"; expected a table, or "none" if all assumptions are exact'
+            )
+        return vars(Assumptions.exact()) if value == "none" else value
