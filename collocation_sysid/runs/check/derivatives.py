@@ -13,10 +13,8 @@ from ...common.array_types import Array
 from ...model.contact import contact_terms
 from ...problem import Problem
 from ...program.collocation import Collocation, convert_variables
-from ...recording.depth_camera import until_all_cameras_see
 from ...recording.experiment import Experiment
-from ...recording.measured_wrench import Wrench
-from ...recording.time_tables import FEWEST_SHARED_SAMPLES
+from ...recording.measurement_selection import shortened_experiment
 
 # First samples of a motion that contain all kinds of equations; more would not change derivatives.
 SAMPLES = 12
@@ -42,58 +40,10 @@ def shortened_problem(problem: Problem) -> Problem:
     validation.
     """
     short = tuple(
-        shortened_experiment(e, first_sample_count(e))
+        shortened_experiment(e, first_sample_count(e), shortens_sensors=True)
         for e in problem.experiments
     )
     return replace(problem, experiments=short)
-
-
-def shortened_experiment(experiment: Experiment, samples: int) -> Experiment:
-    """Return the experiment with its first samples, and more if cameras begin to see later.
-
-    If no marker is measured in these samples, their positions are set to zero. Sensors of grasps
-    without enough measurements there are removed.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Experiment to shorten; not modified.
-    samples : int
-        Least number of samples.
-    """
-    fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
-    samples, depths = until_all_cameras_see(
-        experiment.depths, experiment.t_s, count=samples, fewest=fewest
-    )
-    markers = experiment.markers
-    here = slice(samples)
-    tracks = markers.positions_m[here]
-    if not np.isfinite(tracks).any():
-        tracks = np.nan_to_num(tracks)  # at least one sample has to be there
-    markers = replace(markers, t_s=markers.t_s[here], positions_m=tracks)
-    t_s = experiment.t_s[here]
-    grasps = [
-        replace(g, wrench=_shortened_wrench(g.wrench, t_s, fewest=fewest))
-        for g in experiment.grasps
-    ]
-    return replace(
-        experiment, t_s=t_s, markers=markers, grasps=grasps, depths=depths
-    )
-
-
-def _shortened_wrench(
-    wrench: Wrench | None, t_s: Array, fewest: int
-) -> Wrench | None:
-    """Return the samples of a wrench from the first to the last of the times `t_s` (T,) [s].
-
-    None if there is no wrench, or fewer than `fewest` samples or no measured component there.
-    """
-    if wrench is None:
-        return None
-    here = (wrench.t_s >= t_s[0]) & (wrench.t_s <= t_s[-1])
-    if here.sum() < fewest or not wrench.is_measured[here].any():
-        return None
-    return replace(wrench, t_s=wrench.t_s[here], values=wrench.values[here])
 
 
 def derivative_errors(
@@ -118,16 +68,14 @@ def derivative_errors(
     second : float
         Error of the Hessian; 0 if the program with lifted variables is too large to be laid out.
     """
-    if any(segment.depths for segment in collocation.transcriptions):
+    if any(s.association.correspondences for s in collocation.transcriptions):
         collocation = replace(collocation, huber=LARGE_HUBER)
     rng = np.random.default_rng(0)
     of_slopes = 0.0
     step = _difference_step(collocation)
     program = collocation.with_lifted_variables()
     plain = collocation
-    if (
-        program.has_lifted_variables
-    ):  # methods use these without memory and wrenches as variables
+    if program.has_lifted_variables:  # gradients alone need no such variables
         of_slopes = _slope_error(
             plain.objective, plain.gradient, z=z, rng=rng, step=step
         )
