@@ -18,6 +18,7 @@ from ..common.array_types import Array
 from ..common.files import RESULT_FILE, write_text_file
 from ..common.serialisation import as_json
 from ..errors import InputError
+from ..features.depth_feature import fitted_surfaces
 from ..fem.body import Body
 from ..program.contact.contact_summary import surface_gaps_and_pressures
 from ..program.depth.depth_comparison import SurfaceComparison
@@ -276,14 +277,9 @@ def _depth_rows(
     rollout = finished.rollouts[experiment.name]
     surfaces: Mapping[str, SurfaceComparison] = {}
     if part is not None:
-        surfaces = {
-            reading.correspondences.camera.depth.name: SurfaceComparison.from_fit(
-                reading, part.x, values=values, phi=part.phi
-            )
-            for reading, values in part.depth_residuals
-        }
+        surfaces = fitted_surfaces(part)
     elif isinstance(rollout, ForwardSimulation):
-        surfaces = rollout.depth_surfaces
+        surfaces = rollout.predicted.surfaces
     if not surfaces:
         return {}
     from .depth_overlays import surface_rows  # which needs matplotlib
@@ -349,7 +345,7 @@ def _wrench_columns(
     fitted = finished.solution.wrenches
     fit = fitted.get(experiment.name, [None] * len(sensors))
     rolled = (
-        rollout.wrenches
+        rollout.predicted.wrenches
         if isinstance(rollout, ForwardSimulation)
         else [None] * len(sensors)
     )
@@ -372,7 +368,11 @@ def _custom_sensor_columns(
     """
     rollout = finished.rollouts[experiment.name]
     fit = finished.solution.readings
-    rolled = rollout.readings if isinstance(rollout, ForwardSimulation) else {}
+    rolled = (
+        rollout.predicted.readings
+        if isinstance(rollout, ForwardSimulation)
+        else {}
+    )
     both = fit.get(experiment.name, {}), rolled
     return {
         gauge.name: _comparison_columns(

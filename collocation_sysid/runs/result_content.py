@@ -11,12 +11,11 @@ from ..common.display import short
 from ..common.files import RESULT_FILE, damage_refused, read_json
 from ..common.serialisation import optional, read
 from ..errors import InputError
+from ..features.measurement_results import FitResult, ForwardResult
 from ..fem.laws.constants import is_field_coefficient, symbol_of, unit_of
 from ..fem.spatial_field import FieldResolution
 from ..fem.two_phase import PhaseSummary
 from ..methods.solution import Iteration, Timing
-from ..program.contact.contact_summary import FrictionSummary
-from ..program.depth.depth_comparison import DepthError
 from ..statistics.assessment import Assessment
 from ..statistics.budget.discretisation_error import (
     DiscretisationError,
@@ -26,7 +25,6 @@ from ..statistics.estimates import Estimate, IntervalCoordinate
 from ..statistics.probes.relaxed_assumptions import Probe
 from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
 from ..statistics.uncertainty import MarkerPlace
-from .prediction import CopyError, PredictionErrors
 
 
 @dataclass(frozen=True)
@@ -347,144 +345,6 @@ class ScanResult:
     samples: int
     time_s: float
     sentence: str
-
-
-@dataclass(frozen=True)
-class FittedExperiment:
-    """Residuals of the fit of an experiment.
-
-    Attributes
-    ----------
-    rms_m : float
-        RMS distance of the markers from the fit.
-    samples, missing : int
-        Numbers of marker samples that are present, and that are missing.
-    static : bool
-        Whether it is a series of equilibria.
-    notes : tuple of str
-        Sentences on the nuisance parameters of this recording.
-    wrench_rms_n, wrench_rms_nm, reading_rms
-        RMS differences of forces, torques and custom sensors; None if not measured.
-    wrench_sigma_n, wrench_sigma_nm, reading_sigma
-        Stated standard deviations of their noise.
-    reading_unit : mapping of name to str, optional
-        Units of the custom sensors that state one.
-    friction : mapping of obstacle to FrictionSummary
-        Of the obstacles with friction.
-    depth : mapping of depth camera to DepthError
-        Distances of its points from the fitted surface.
-    air_density_kg_m3 : float
-        Density of the air around the body in the model; zero in a vacuum.
-    test : str, optional
-        Kind of material test of a specimen without a mesh.
-    """
-
-    rms_m: float
-    samples: int
-    missing: int
-    static: bool
-    notes: tuple[str, ...]
-    wrench_rms_n: float | None = optional()
-    wrench_rms_nm: float | None = optional()
-    reading_rms: Mapping[str, float] | None = optional()
-    wrench_sigma_n: float | None = optional()
-    wrench_sigma_nm: float | None = optional()
-    reading_sigma: Mapping[str, float] | None = optional()
-    reading_unit: Mapping[str, str] | None = optional()
-    friction: Mapping[str, FrictionSummary] | None = optional()
-    depth: Mapping[str, DepthError] | None = optional()
-    air_density_kg_m3: float = 0.0
-    test: str | None = optional()
-
-
-@dataclass(frozen=True)
-class FitResult:
-    """Residuals of the fit of all experiments.
-
-    Attributes
-    ----------
-    rms_m, noise_rms_m : float
-        RMS distance of all markers, and that expected from the stated noise.
-    experiments : mapping of name to FittedExperiment
-        Residuals of each fitted experiment.
-    wrench_rms_n, wrench_rms_nm : float or None
-        RMS differences of all forces and torques.
-    symmetry : mapping of experiment to int, optional
-        Of experiments whose loads are reported for the whole specimen: ratio of these to the loads
-        of the modelled part. Energies of friction and nuisance parameters are those of the modelled
-        part.
-    """
-
-    rms_m: float
-    noise_rms_m: float
-    experiments: Mapping[str, FittedExperiment]
-    wrench_rms_n: float | None = optional()
-    wrench_rms_nm: float | None = optional()
-    symmetry: Mapping[str, int] | None = optional()
-
-
-@dataclass(frozen=True)
-class SimulatedExperiment:
-    """Errors of the forward simulation of an experiment; if `failed` is set, all else is missing.
-
-    Attributes
-    ----------
-    fitted : bool
-        Whether the experiment was fitted, not only predicted.
-    failed : str, optional
-        Why there is no simulation.
-    rms_m, max_m : float, optional
-        RMS and largest distance of the markers [m]; 0 without markers.
-    wrench_rms_n, wrench_rms_nm, reading_rms
-        RMS differences of forces [N], torques [N m] and custom sensors, by name; None if not
-        measured.
-    reading_unit : mapping of name to str, optional
-        Units of the custom sensors that state one.
-    nuisance, places_m : mapping, optional
-        Nuisance parameters and marker places that were fitted to a recording for validation.
-    depth : mapping of depth camera to DepthError
-        Distances of its points from the simulated surface.
-    blind : PredictionErrors, optional
-        Of an experiment for validation, with the nuisance parameters of the fitted recordings in
-        place of its own.
-    copied : CopyError, optional
-        Of an experiment for validation, with the measurements of the nearest fitted recording as
-        the prediction.
-    not_copied : str, optional
-        Why there is no such copy.
-    """
-
-    fitted: bool
-    failed: str | None = optional()
-    rms_m: float | None = optional()
-    max_m: float | None = optional()
-    reading_unit: Mapping[str, str] | None = optional()
-    nuisance: Mapping[str, float] | None = optional()
-    places_m: Mapping[str, tuple[float, ...]] | None = optional()
-    wrench_rms_n: float | None = optional()
-    wrench_rms_nm: float | None = optional()
-    reading_rms: Mapping[str, float] | None = optional()
-    depth: Mapping[str, DepthError] | None = optional()
-    blind: PredictionErrors | None = optional()  # noqa: RUF009, it returns a field
-    copied: CopyError | None = optional()  # noqa: RUF009, it returns a field
-    not_copied: str | None = optional()
-
-
-@dataclass(frozen=True)
-class ForwardResult:
-    """Forward simulations with the estimates.
-
-    Attributes
-    ----------
-    rms_m, max_m : float or None
-        RMS and largest distance of the markers of all fitted experiments; None without any.
-    experiments : mapping of name to SimulatedExperiment
-        Results of each experiment, also of those for validation.
-    """
-
-    rms_m: float | None
-    max_m: float | None
-    experiments: Mapping[str, SimulatedExperiment]
 
 
 @dataclass(frozen=True)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from ..common.array_types import Array
 from ..errors import InputError
+from ..features.registry import FEATURES
 from ..fem.laws.constants import usual_value, without_region
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
 from ..methods.initial_trajectories import associated_at_guess
@@ -22,9 +21,6 @@ from ..problem import Problem
 from ..program.collocation import Collocation
 from ..statistics.field_estimates import field_estimates_at
 from ..statistics.linearised import parameter_values
-from ..statistics.misspecification.camera_misspecifications import (
-    require_depth_units,
-)
 from .check.cost import require_memory
 from .several_starts import follow_starts
 from .two_phases import solve_two_phases
@@ -199,7 +195,8 @@ def _solve_once(
         collocation = problem.collocation()
         started_from: list[str] = []
         for experiment in collocation.experiments:
-            require_depth_units(experiment)
+            for feature in FEATURES:
+                feature.require_valid(experiment)
         if warm_start is not None and problem.substeps == "auto":
             collocation = replace(collocation, substeps=warm_start.substeps)
         has_guesses = not collocation.parameters.names_without_guess
@@ -254,43 +251,14 @@ def _solve_once(
         *scan_notes,
         *started_from,
         *solution.notes,
-        *_depth_notes(solution),
+        *(
+            note
+            for part in solution.parts
+            for feature in FEATURES
+            for note in feature.notes(part)
+        ),
     )
     return replace(solution, scan=scan or solution.scan, notes=notes)
-
-
-def _depth_notes(solution: Solution) -> Iterator[str]:
-    """Yield notes on the distances of depth points and outlines from the fitted surface, per
-    camera.
-    """
-    for part in solution.parts:
-        for reading, observation in part.depth_residuals:
-            distance_m = reading.signed_distances_m(observation, part.phi)
-            sighting = reading.correspondences
-            excluded = ", ".join(
-                f"{count} {why}"
-                for why, count in sighting.excluded_counts.items()
-                if count
-            )
-            distances = "are compared, because none is near enough to the body"
-            if sighting.is_compared.any():
-                distances = (
-                    f"deviate from the surface by {1e3 * np.sqrt(np.nanmean(distance_m**2)):.3g} "
-                    f"mm (RMS; median {1e3 * np.nanmedian(np.abs(distance_m)):.3g} mm)"
-                )
-            yield (
-                f"experiment '{part.segment.experiment.name}': {sighting.is_compared.sum()} "
-                f"points of '{sighting.camera.depth.name}' {distances}; excluded: "
-                f"{excluded or 'none'}"
-            )
-        for outline, distance_px in part.outline_distances_px:
-            if len(distance_px):
-                yield (
-                    f"experiment '{part.segment.experiment.name}': {len(distance_px)} points of "
-                    "the model's outline deviate from the edges in "
-                    f"'{outline.correspondences.camera.depth.name}' by "
-                    f"{np.sqrt(np.mean(distance_px**2)):.2g} pixels (RMS)"
-                )
 
 
 def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:

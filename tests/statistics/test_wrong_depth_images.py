@@ -13,11 +13,11 @@ import pytest
 from depth_twins import TRUTH, hanging_twin, swinging_twin
 from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
 
+from collocation_sysid.features.depth_feature import depth_image_hypotheses
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.check import (
     check_problem,
-    depth_image_hypotheses,
     misspecification_hypotheses,
 )
 from collocation_sysid.runs.solving import solve
