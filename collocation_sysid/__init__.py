@@ -39,7 +39,13 @@ if TYPE_CHECKING:
     from .methods.interior_point import InteriorPoint
     from .methods.reduced_space import ReducedSpace
     from .methods.solution import Iteration, Solution, Status
-    from .model.parameters import Parameter, Parameters, Tied, Unknown
+    from .model.parameters import (
+        FieldCoefficients,
+        Parameter,
+        Parameters,
+        Tied,
+        Unknown,
+    )
     from .model.schemes import Scheme, Stencil
     from .pipeline import Run, run, solve
     from .problem import Problem, RolloutOptions, UncertaintyOptions
@@ -101,6 +107,7 @@ __all__ = [
     "Experiment",
     "Face",
     "Field",
+    "FieldCoefficients",
     "Force",
     "Gauge",
     "Grasp",

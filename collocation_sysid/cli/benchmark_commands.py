@@ -199,7 +199,9 @@ def score_tables(scores: Sequence[Score]) -> list[Table]:
         if own[0].rms_without_offsets is None:
             heads = heads[:-1]
             rows = tuple(row[:-1] for row in rows)
-        tables.append(Table(f"{title[0]}, {title[1]} ({role})", heads, rows))
+        tables.append(
+            Table(f"{title[0]}, {title[1]} ({role})", heads, rows=rows)
+        )
     return tables
 
 

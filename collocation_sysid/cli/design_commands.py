@@ -103,9 +103,9 @@ def design(options: DesignCommand) -> None:
             answer = designed(
                 problem,
                 limits,
-                options.duration,
-                criterion,
-                options.search,
+                duration_s=options.duration,
+                criterion=criterion,
+                options=options.search,
                 experiment=options.experiment,
                 add=options.add,
                 watch=progress.show_best,

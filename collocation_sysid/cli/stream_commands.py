@@ -95,7 +95,7 @@ def processed(
     """Return the update of a frame, and add it to the recording if there is one."""
     update = estimator.process_frame(frame)
     if recording is not None:
-        recording.write(frame, update, estimator.node_positions_m)
+        recording.write(frame, update, positions_m=estimator.node_positions_m)
     return update
 
 
@@ -175,7 +175,7 @@ def live(options: LiveCommand) -> None:
         gripper_transforms=gripper_transforms(
             estimator.problem,
             estimator.model.experiment.name,
-            estimator.model.moving_grasps,
+            grasps=estimator.model.moving_grasps,
         ),
     )
     bad = 0
@@ -189,7 +189,7 @@ def live(options: LiveCommand) -> None:
                     error_console.print(Text(f"error: {error}"), soft_wrap=True)
                     continue
                 if frame is not None:
-                    update = processed(estimator, frame, recording)
+                    update = processed(estimator, frame, recording=recording)
                     typer.echo(update_as_json(update))
         settled = settled_update(estimator, recording)
     if settled is not None:
@@ -253,7 +253,7 @@ def replay(options: ReplayCommand) -> None:
     with options.open_recording(estimator) as recording:
         with without_garbage_of_startup(), shown if watched else nullcontext():
             for frame in paced_frames(frames, pace) if pace else frames:
-                updates.append(processed(estimator, frame, recording))
+                updates.append(processed(estimator, frame, recording=recording))
                 if options.as_json:
                     typer.echo(json_line(updates[-1]))
                 elif watched:

@@ -122,7 +122,7 @@ class Options:
                 object.__setattr__(self, name, adapter.validate_python(value))
             except ValidationError as error:
                 raise _refusal(
-                    name, value, error.errors(include_url=False)[0]
+                    name, value, fault=error.errors(include_url=False)[0]
                 ) from error
 
 

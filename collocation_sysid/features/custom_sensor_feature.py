@@ -111,7 +111,7 @@ def step_differences(
         fitted_x,
         reactions=(
             ReactionGrid.from_dynamics(segment.dynamics),
-            part.motion.reactions,
+            part.reactions,
         ),
         phi=part.phi,
     )
@@ -147,7 +147,7 @@ def _predict_sensors(
         Nuisance parameters of the recording.
     """
     grid, reaction_forces = reactions
-    motion = ObservedMotion(x, lambda: reaction_forces)
+    motion = ObservedMotion(x, reaction_forces)
     gauges = custom_sensor_residuals(
         segment.experiment,
         segment.experiment.t_s,

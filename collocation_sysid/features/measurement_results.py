@@ -114,27 +114,32 @@ class FittedExperiment:
     Attributes
     ----------
     rms_m : float
-        RMS distance of the markers from the fit.
+        RMS distance of the markers from the fit [m]; 0 without markers.
     samples, missing : int
         Numbers of marker samples that are present, and that are missing.
     static : bool
         Whether it is a series of equilibria.
     notes : tuple of str
         Sentences on the nuisance parameters of this recording.
-    wrench_rms_n, wrench_rms_nm, reading_rms
-        RMS differences of forces, torques and custom sensors; None if not measured.
-    wrench_sigma_n, wrench_sigma_nm, reading_sigma
-        Stated standard deviations of their noise.
-    reading_unit : mapping of name to str, optional
-        Units of the custom sensors that state one.
-    friction : mapping of obstacle to FrictionSummary
-        Of the obstacles with friction.
-    depth : mapping of depth camera to DepthError
-        Distances of its points from the fitted surface.
+    wrench_rms_n, wrench_rms_nm : float or None
+        RMS differences of forces [N] and torques [N m]; None if not measured.
+    reading_rms : mapping of name to float, or None
+        RMS differences of custom sensors in their units; None without any.
+    wrench_sigma_n, wrench_sigma_nm : float or None
+        Stated standard deviations of the noise of forces [N] and torques [N m]; None if not
+        measured.
+    reading_sigma : mapping of name to float, or None
+        Stated standard deviations of the noise of custom sensors; None without any.
+    reading_unit : mapping of name to str, or None
+        Units of the custom sensors that state one; None if none does.
+    friction : mapping of obstacle to FrictionSummary, or None
+        Friction of the obstacles that have some; None without any.
+    depth : mapping of depth camera to DepthError, or None
+        Distances of its points from the fitted surface; None without depth cameras.
     air_density_kg_m3 : float
         Density of the air around the body in the model; zero in a vacuum.
-    test : str, optional
-        Kind of material test of a specimen without a mesh.
+    test : str or None
+        Kind of material test of a specimen without a mesh; None for other experiments.
     """
 
     rms_m: float
@@ -183,33 +188,36 @@ class FitResult:
 
 @dataclass(frozen=True)
 class SimulatedExperiment:
-    """Errors of the forward simulation of an experiment; if `failed` is set, all else is missing.
+    """Errors of the forward simulation of an experiment; if `failed` is set, all else but `fitted`
+    is None.
 
     Attributes
     ----------
     fitted : bool
         Whether the experiment was fitted, not only predicted.
-    failed : str, optional
-        Why there is no simulation.
-    rms_m, max_m : float, optional
+    failed : str or None
+        Why there is no simulation; None if there is one.
+    rms_m, max_m : float or None
         RMS and largest distance of the markers [m]; 0 without markers.
-    wrench_rms_n, wrench_rms_nm, reading_rms
-        RMS differences of forces [N], torques [N m] and custom sensors, by name; None if not
-        measured.
-    reading_unit : mapping of name to str, optional
-        Units of the custom sensors that state one.
-    nuisance, places_m : mapping, optional
-        Nuisance parameters and marker places that were fitted to a recording for validation.
-    depth : mapping of depth camera to DepthError
-        Distances of its points from the simulated surface.
-    blind : PredictionErrors, optional
+    wrench_rms_n, wrench_rms_nm : float or None
+        RMS differences of forces [N] and torques [N m]; None if not measured.
+    reading_rms : mapping of name to float, or None
+        RMS differences of custom sensors in their units; None without any.
+    reading_unit : mapping of name to str, or None
+        Units of the custom sensors that state one; None if none does.
+    nuisance, places_m : mapping or None
+        Nuisance parameters and marker places that were fitted to a recording for validation; empty
+        for fitted experiments.
+    depth : mapping of depth camera to DepthError, or None
+        Distances of its points from the simulated surface; None without depth cameras.
+    blind : PredictionErrors or None
         Of an experiment for validation, with the nuisance parameters of the fitted recordings in
-        place of its own.
-    copied : CopyError, optional
+        place of its own; None where that cannot be simulated, and for fitted experiments.
+    copied : CopyError or None
         Of an experiment for validation, with the measurements of the nearest fitted recording as
-        the prediction.
-    not_copied : str, optional
-        Why there is no such copy.
+        the prediction; None if there is no such copy.
+    not_copied : str or None
+        Why there is no such copy; empty for fitted experiments.
     """
 
     fitted: bool

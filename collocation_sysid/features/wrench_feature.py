@@ -102,7 +102,7 @@ def step_differences(
     predicted.
     """
     sensors = part.segment.sensors
-    fitted = part.observation.predict_wrenches(part.x) if sensors else []
+    fitted = part.predict_wrenches() if sensors else []
     rows = zip(sensors, fitted, predicted.wrenches, strict=True)
     for sensor, of_fit, of_simulation in rows:
         way = share * np.nan_to_num(

@@ -543,7 +543,9 @@ class Discretisation(ConstantsModel):
         memory = bool(part.prony) and name != "energy"
         kernel = KERNELS[name](self.element, self.law(number, memory))
         cells, geometry = self.part_elements(part)
-        destinations = self._destinations(name, number, cells, kernel)
+        destinations = self._destinations(
+            name, number, cells=cells, kernel=kernel
+        )
         columns = self._data_columns(name, number, points=geometry.shape[1])
         return KernelBatch(
             kernel,

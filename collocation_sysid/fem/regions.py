@@ -20,10 +20,10 @@ from ..errors import InputError, hint_at
 from .laws.constants import (
     CONTRAST,
     DENSITY,
+    FIELD_COEFFICIENT,
     GAMMA_M,
     MASS,
     Constant,
-    is_field_coefficient,
 )
 from .laws.materials import (
     DampingLaw,
@@ -637,8 +637,22 @@ class ConstantsModel:
     def field_coefficient_names(self) -> tuple[str, ...]:
         """Names of all constants of fields that are coefficients of shapes, in the order of θ."""
         return tuple(
-            name for name in self.constants if is_field_coefficient(name)
+            name for names in self.field_vectors.values() for name in names
         )
+
+    @property
+    def field_vectors(self) -> dict[str, tuple[str, ...]]:
+        """Names of the coefficients of each smooth field in the order of θ, by the name of their
+        vector: "field", or "core.field" for the field of the region "core".
+        """
+        return {
+            part.full_name(FIELD_COEFFICIENT.name): tuple(
+                part.full_name(constant.name)
+                for constant in part.field_constants
+            )
+            for part in self.parts
+            if part.field and part.field.field.prior != TWO_PHASE
+        }
 
     @property
     def contrast_deviations(self) -> dict[str, float]:

@@ -107,13 +107,13 @@ class EliminatedDofs:
         return cls(
             transcription,
             transcription.offsets.position + dofs,
-            transcription.offsets.row + rows,
-            phi,
+            rows=transcription.offsets.row + rows,
+            phi=phi,
         )
 
     def evaluate(self, phi: Array) -> tuple[Array, Array]:
         """Return the scaled positions (h,) of the eliminated dofs, and their derivatives (h, k) by
-        the φ of the motion, at φ of the experiment.
+        the k parameters of `self.phi`, from all nuisance parameters `phi` of the experiment.
         """
         segment = self.segment
         prescribed = self.segment.prescribed_motion.evaluate_at(phi)
@@ -243,7 +243,10 @@ class CondensedPattern:
         )
         places = [np.searchsorted(unique_codes, each) for each in codes]
         return cls(
-            (indptr, unique_codes % shape[0]), remaining, places, eliminated
+            (indptr, unique_codes % shape[0]),
+            remaining,
+            targets=places,
+            eliminated=eliminated,
         )
 
 
@@ -285,8 +288,8 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def _condensed_indices(self) -> tuple[Index, Index]:
-        """Index of each variable and of each constraint among those that remain, −1 for the
-        others.
+        """Index of each variable and of each constraint of the complete program among those that
+        remain, −1 for those that are eliminated: two arrays of the complete sizes.
         """
         sizes = self.complete.variable_count, self.complete.constraint_count
         indices = np.full(sizes[0], -1), np.full(sizes[1], -1)
@@ -406,7 +409,9 @@ class CondensedCollocation(Collocation):
         return slope[self._remaining[0]]
 
     def constraint_values(self, z: Array) -> Array:
-        """Return the scaled values (constraints,) of the constraints g that remain."""
+        """Return the scaled values (constraints,) of the constraints g that remain, at z
+        (variables,).
+        """
         return self.complete.constraint_values(self.complete_variables(z))[
             self._remaining[1]
         ]

@@ -97,13 +97,26 @@ class Continuation(Options):
         watch: Watch | None = None,
         start: Array | None = None,
     ) -> Solution:
-        """Solve the NLP, see `Method`; the first part starts from the first rows of `start`, by
-        default as the method of the parts does.
+        """Solve the NLP on growing parts of the recordings, see `Method`.
 
-        Numbers and times of the history, with whose entries `watch` is called, continue from part
-        to part. The solve ends with a part that was interrupted or refused; the notes contain the
-        result of each part. A part that does not converge otherwise is followed by the next one.
-        Exceptions of the method are not caught.
+        Numbers and times of the history continue from part to part. The solve ends with a part that
+        was interrupted or refused; the notes contain the result of each part. A part that does not
+        converge otherwise is followed by the next one. Exceptions of the method are not caught.
+
+        Parameters
+        ----------
+        collocation : Collocation
+            Problem with the complete recordings; not modified.
+        watch : callable, optional
+            Called with every entry of the history.
+        start : (variables,) array, optional
+            Variables of the complete problem, from whose first rows the first part starts; by
+            default as the method of the parts starts.
+
+        Returns
+        -------
+        Solution
+            Solution of the last part, as one of the complete problem.
         """
         climb = _ContinuationState(
             self.method, Recorder(self.name, collocation, watch=watch)
@@ -146,13 +159,20 @@ def first_share(collocation: Collocation, share: float) -> Collocation:
 class _ContinuationState:
     """State between the parts: known positions, the last solution, and counts.
 
+    Parameters
+    ----------
+    method : Method
+        Method that solves each part.
+    recorder : Recorder
+        Record of the whole solve, with the complete problem.
+
     Attributes
     ----------
     known : tuple or None
-        Parameters p and positions of each experiment as far as they were solved; None before the
-        first part.
+        Parameters p and positions of each experiment [m] as far as they were solved; None before
+        the first part.
     last : Solution or None
-        Solution of the last part.
+        Solution of the last part; None before the first part.
     iterations, evaluations : int
         Sums over all parts.
     """
@@ -237,11 +257,11 @@ class _ContinuationState:
         self.evaluations += solution.evaluations
         spent = solution.timing
         self.recorder.stopwatch.add(
-            spent.build, spent.evaluations, spent.linear_algebra
+            spent.build, spent.evaluations, linear_algebra=spent.linear_algebra
         )
         values = ", ".join(
             f"{name} = {value:.4g}"
-            for name, value in solution.parameters.items()
+            for name, value in part.parameters.scalar_values(solution.q).items()
         )
         self.recorder.notes.append(
             f"{100 * share:.3g} % of the samples by {solution.method}: {solution.status.value} "
@@ -253,11 +273,20 @@ class _ContinuationState:
 def _continue_variables(
     collocation: Collocation, p: Array, positions: list[Array]
 ) -> Array:
-    """Return variables z from parameters p (np,) and the first rows of positions [m] of each
+    """Return variables z (variables,) from parameters and the first rows of the positions of each
     experiment.
 
     The missing rows are simulated or, from where that fails, those of a rigid motion with the
     grasp; surplus rows are cut.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem.
+    p : (np,) array
+        Parameters (q, φ).
+    positions : list of (rows, 3n) array
+        Known first rows of each experiment [m].
     """
     parts = collocation.iterates_at(p, positions)
     known, _ = simulate_trajectories(

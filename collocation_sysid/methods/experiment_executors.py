@@ -74,7 +74,7 @@ class ExperimentExecutor(Protocol):
 
 
 class LocalExecutor:
-    """Executor with threads of this process, see `map_experiments`.
+    """Executor with threads of this process, see `ExperimentExecutor`.
 
     Parameters
     ----------
@@ -92,8 +92,15 @@ class LocalExecutor:
     def map_experiments(
         self, run: Callable[..., Any], *columns: Sequence[Any]
     ) -> list[Any]:
-        """Apply a function to every experiment, in parallel threads, and return the results
-        themselves; an exception of the function is raised.
+        """Apply a function to every experiment, in parallel threads, and return its results
+        themselves, in the order of the experiments; an exception of the function is raised.
+
+        Parameters
+        ----------
+        run : callable
+            Function of one entry of each column.
+        columns : sequence
+            Arguments, one entry per experiment each; all must have the same length.
         """
         return map_experiments(
             lambda row: run(*row),
@@ -156,7 +163,15 @@ class DaskExecutor:
         self, run: Callable[..., Any], *columns: Sequence[Any]
     ) -> list[Any]:
         """Apply a function to every experiment on its worker, and return futures of the results at
-        once, see `ExperimentExecutor`; `store_segments` must have been called.
+        once; `store_segments` must have been called. Exceptions of the function are raised by
+        `fetch`.
+
+        Parameters
+        ----------
+        run : callable
+            Function of one entry of each column.
+        columns : sequence
+            Arguments, one entry per experiment each; entries may be futures.
 
         Raises
         ------
@@ -362,7 +377,7 @@ def _require_package(client: Any) -> set[str]:
 
 
 def _refusal(message: str) -> InputError:
-    """Return an error that refers to the option --scheduler."""
+    """Return an error with this message that refers to the option --scheduler."""
     return InputError(message, None, where="--scheduler")
 
 
@@ -373,7 +388,9 @@ def _require_workers(threads: dict[str, int]) -> None:
 
 
 def _disconnection(reason: str) -> SearchEnded:
-    """Return the exception that ends the search because the cluster is lost."""
+    """Return the exception that ends the search because the cluster is lost; its message ends with
+    the sentence `reason`.
+    """
     return SearchEnded(
         Status.CLUSTER_DISCONNECTED,
         f"{Status.CLUSTER_DISCONNECTED.sentence} {reason}",

@@ -24,9 +24,9 @@ from ..program.sweep import Sweep
 from .experiment_executors import ExperimentExecutor, LocalExecutor
 from .trajectory_sweeps import (
     FitSummary,
+    LinearisedTrajectory,
     SimulationResult,
     SweepReport,
-    SweepResult,
     extrapolate,
     fit_summary,
     reassociate,
@@ -45,7 +45,7 @@ class Iterate:
     ----------
     p : (np,) array
         All parameters (q, φ), see `Collocation.pack`.
-    trajectories : list of SweepResult
+    trajectories : list of LinearisedTrajectory
         Sweep of each experiment, stored by the workers.
     reports : list of SweepReport
         Reports of the sweeps.
@@ -206,7 +206,10 @@ class Horizon:
 
     @one_blas_thread()
     def _run(
-        self, p: Array, run: Callable[..., SweepResult], *columns: Sequence[Any]
+        self,
+        p: Array,
+        run: Callable[..., LinearisedTrajectory],
+        *columns: Sequence[Any],
     ) -> Iterate:
         """Run a function of `trajectory_sweeps` for every experiment, and return the iterate of the
         joined results.
@@ -220,7 +223,7 @@ class Horizon:
         p : (np,) array
             All parameters (q, φ).
         run : callable
-            Function of (solver, transcription, huber, p of the experiment, entries of the columns).
+            Function of (solver, transcription, p of the experiment, entries of the columns).
         columns : sequence
             Further arguments, one entry per experiment each.
 
@@ -231,12 +234,10 @@ class Horizon:
         Exception
             Those of the function, as `SimulationError`.
         """
-        thresholds = self._repeat(self.collocation.huber)
         trajectories = self.workers.map_experiments(
             run,
             self.solvers,
             self.segments,
-            thresholds,
             self._by_experiment(p),
             *columns,
         )
@@ -371,12 +372,12 @@ class Horizon:
         return [value] * len(self.rows)
 
 
-def _report(result: SweepResult) -> SweepReport:
+def _report(result: LinearisedTrajectory) -> SweepReport:
     """Return the report of a sweep; workers run this function."""
     return result.report
 
 
-def _row_count(result: SweepResult | SimulationResult | Array) -> int:
+def _row_count(result: LinearisedTrajectory | SimulationResult | Array) -> int:
     """Return the number of rows of a trajectory; workers run this function."""
     return len(trajectory_positions(result))
 
@@ -391,7 +392,7 @@ def _failure_and_times(
 
 
 def _first_rows(
-    result: SweepResult | SimulationResult | Array, count: int
+    result: LinearisedTrajectory | SimulationResult | Array, count: int
 ) -> Array:
     """Return the first `count` rows of a trajectory; workers run this function."""
     return trajectory_positions(result)[:count]

@@ -225,7 +225,7 @@ class InteriorPoint(Options):
         coarse = initial.coarse
         spent = coarse.timing
         recorder.stopwatch.add(
-            spent.build, spent.evaluations, spent.linear_algebra
+            spent.build, spent.evaluations, linear_algebra=spent.linear_algebra
         )
         recorder.notes.append(initial.note)
         if coarse.status in (Status.INTERRUPTED, Status.TIME_LIMIT):

@@ -143,7 +143,7 @@ def exact_curvature(
     SimulationError
         If the equations of a time step are singular.
     """
-    projected = [each.x + each.tangent.step for each in iterate.trajectories]
+    projected = [each.x + each.step for each in iterate.trajectories]
     z = collocation.pack(iterate.p, projected)
     multipliers = constraint_multipliers(collocation, z, stopwatch=stopwatch)
     directions = np.column_stack(
@@ -167,8 +167,7 @@ def _tangent_direction(
     """
     unit = np.eye(len(iterate.p))[k]
     position_changes = [
-        each.tangent.by_p
-        @ unit[segment.parameter_indices[segment.dynamic_parameters]]
+        each.by_p @ unit[segment.parameter_indices[segment.dynamic_parameters]]
         for each, segment in zip(
             iterate.trajectories, collocation.transcriptions, strict=True
         )

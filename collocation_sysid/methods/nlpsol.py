@@ -233,7 +233,9 @@ class _NlpsolResult(NamedTuple):
 
     @classmethod
     def failure(cls, count: int, return_status: str) -> _NlpsolResult:
-        """Return the result of a solver that failed, for `count` variables."""
+        """Return the result of a solver that failed or was abandoned, for `count` variables, with a
+        `return_status`.
+        """
         return cls(
             np.full(count, np.nan),
             np.zeros(0),

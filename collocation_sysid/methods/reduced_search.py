@@ -7,6 +7,7 @@ correspondences of points with the surface), the search also updates the associa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -577,7 +578,7 @@ class ReducedSearch:
         trajectories, and replace the collocation of the search and the horizon, in place.
 
         Nothing happens after the first time, unless the trajectories were then too short for the
-        cameras; nor if all positions are known.
+        cameras; nor if all positions are known or there are no trajectories.
 
         Parameters
         ----------
@@ -703,14 +704,20 @@ class ReducedSearch:
         self.indefinite_steps = sum(
             report.indefinite_steps for report in point.reports
         )
-        summaries = [report.fit_summary for report in point.reports]
         self._record(
-            point.p, point.trajectories, loss=point.loss, summaries=summaries
+            point.p,
+            point.trajectories,
+            loss=point.loss,
+            summaries=point.reports,
         )
         return point
 
     def _record(
-        self, p: Array, x: list[Any], loss: float, summaries: list[FitSummary]
+        self,
+        p: Array,
+        x: list[Any],
+        loss: float,
+        summaries: Sequence[FitSummary],
     ) -> None:
         """Store parameters and trajectories as the best so far, and add an entry to the history.
 
@@ -724,7 +731,7 @@ class ReducedSearch:
             Trajectories, as the workers store them.
         loss : float
             Loss with priors.
-        summaries : list of FitSummary
+        summaries : sequence of FitSummary
             Fit of each experiment.
         """
         self.p = p
@@ -736,7 +743,9 @@ class ReducedSearch:
             )
         )
         violation_n = max(each.violation_n for each in summaries)
-        values = self.collocation.parameter_values(p)
+        values = self.collocation.parameters.scalar_values(
+            p[: self.collocation.nq]
+        )
         time_s = self.recorder.elapsed_s
         share = sum(each.rows for each in summaries) / sum(
             s.grid_times for s in self.collocation.transcriptions

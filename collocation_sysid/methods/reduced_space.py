@@ -131,8 +131,8 @@ class ReducedSpace(SearchOptions):
 
 
 def memory_mb(collocation: Collocation) -> float:
-    """Return an estimate of the memory of a solve [MB]; it increases linearly with the number of
-    time steps.
+    """Return an estimate of the memory of a solve by reduced space [MB]; it increases linearly with
+    the number of time steps.
     """
     # Two points with positions, p and Z; positions of the answer and of its gradients.
     columns = 2 * (2 + collocation.nq) + 6

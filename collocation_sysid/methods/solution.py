@@ -150,7 +150,12 @@ class Timing:
             `time.perf_counter()` at the start of the solve [s], for the total.
         """
         total = time.perf_counter() - start_s
-        return cls(watch.build, watch.evaluations, watch.linear_algebra, total)
+        return cls(
+            watch.build,
+            watch.evaluations,
+            linear_algebra=watch.linear_algebra,
+            total=total,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,9 +373,7 @@ class Solution:
         """
         parts = [part for part in self.parts if part.segment.sensors]
         return {
-            part.segment.experiment.name: part.observation.predict_wrenches(
-                part.x
-            )
+            part.segment.experiment.name: part.predict_wrenches()
             for part in parts
         }
 
@@ -392,11 +395,15 @@ class Solution:
 
     @cached_property
     def readings(self) -> dict[str, dict[str, Array]]:
-        """Predicted values (S, m) of custom sensors, by experiment name and sensor name."""
+        """Predicted values (S, m) of custom sensors, by name of the fitted experiment and of the
+        sensor; experiments without custom sensors have empty mappings.
+        """
         return {
             part.segment.experiment.name: {
                 gauge.sensor.name: gauge.without_padding(
-                    gauge.predict_motion(part.motion, part.phi)
+                    gauge.predict_motion(
+                        part.motion_for(gauge.observable), part.phi
+                    )
                 )
                 for gauge in part.segment.custom_sensors
             }

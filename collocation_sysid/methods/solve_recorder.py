@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
 from ..common.array_types import Array
 from ..errors import SimulationError
-from ..fem.laws.constants import is_field_coefficient
 from ..program.collocation import Collocation
 from ..program.stopwatch import Stopwatch
 from .initial_trajectories import initial_variables
@@ -155,7 +153,9 @@ class Recorder:
             loss,
             rms_m=collocation.rms_marker_distance_m(z),
             violation_n=violation_n,
-            parameters=collocation.parameter_values(z),
+            parameters=collocation.parameters.scalar_values(
+                z[: collocation.nq]
+            ),
             time_s=self.elapsed_s,
         )
         self.add(line)
@@ -163,16 +163,7 @@ class Recorder:
     def add(self, line: Iteration) -> None:
         """Add an entry to the history and pass it to `watch`, unless that is None; exceptions of
         `watch` are not caught.
-
-        Coefficients of spatially varying parameters are removed from the entry, because there are
-        many.
         """
-        shown_values = {
-            name: value
-            for name, value in line.parameters.items()
-            if not is_field_coefficient(name)
-        }
-        line = replace(line, parameters=shown_values)
         self.history.append(line)
         if self.watch is not None:
             self.watch(line)

@@ -290,7 +290,7 @@ def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
     """
     guesses = {
         i.name: i.guess
-        for i in parameters.items
+        for i in parameters.components
         if i.tied is None and i.guess is not None
     }
 
@@ -322,8 +322,15 @@ def typical_constants(parameters: Parameters) -> dict[str, float]:
 
 
 def _ranked_moduli(young_pa: Array, misfit: Array) -> list[float]:
-    """Return the moduli [Pa] that could be simulated, from the best on to stiffer ones; empty if
-    none could. The moduli ascend; a misfit is NaN where the simulation failed.
+    """Return the moduli [Pa] that could be simulated: the one with the smallest misfit, followed by
+    the stiffer ones in ascending order; softer ones are left out. Empty if none could be simulated.
+
+    Parameters
+    ----------
+    young_pa : (k,) array
+        Young's moduli, ascending [Pa].
+    misfit : (k,) array
+        Misfit at each modulus; NaN where the simulation failed.
     """
     if np.isnan(misfit).all():
         return []
@@ -340,11 +347,8 @@ def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
     modulus [Pa].
     """
     unit = young_pa / 10
-    return Parameters(
-        tuple(
-            replace(i, unit=unit) if np.isnan(i.unit) else i
-            for i in parameters.items
-        )
+    return parameters.map_components(
+        lambda item: replace(item, unit=unit) if np.isnan(item.unit) else item
     )
 
 
@@ -372,8 +376,10 @@ def without_guesses(collocation: Collocation) -> Collocation:
         )
 
     free = collocation.parameters.free
-    items = tuple(map(without_guess, collocation.parameters.items))
-    return replace(collocation, parameters=Parameters(items))
+    return replace(
+        collocation,
+        parameters=collocation.parameters.map_components(without_guess),
+    )
 
 
 def _misfit(
@@ -406,7 +412,7 @@ def _residuals(iterate: ExperimentIterate) -> Array:
     """
     residuals = []
     slopes = []
-    predictions = iterate.observation.linearise_fixed_motion(iterate.x)
+    predictions = iterate.linearise_fixed_motion()
     for reading, (residual, slope) in zip(
         iterate.segment.residuals, predictions, strict=True
     ):
@@ -555,8 +561,8 @@ class TrialSimulation:
         return np.concatenate([q, np.zeros(self.collocation.nphi)])
 
     def _evaluate(self, p: Array, positions: Sequence[Array]) -> float:
-        """Return the misfit of the first part of the recordings at parameters p (np,), see
-        `_misfit`; NaN if it is not finite.
+        """Return the misfit of the first part of the recordings, see `_misfit`; NaN if it is not
+        finite.
 
         Parameters
         ----------
@@ -572,10 +578,17 @@ class TrialSimulation:
     def _simulate(
         self, p: Array, warm: list[Array] | None, rows: Sequence[int]
     ) -> tuple[list[Array], SimulationError | None]:
-        """Return trajectories of the given numbers of rows at p (np,), and the first failure or
-        None, see `simulate_trajectories`.
+        """Return trajectories (rows, 3n) [m] of each experiment, and the first failure or None, see
+        `simulate_trajectories`.
 
-        Equilibria are searched near the trajectories `warm`; None for no guess.
+        Parameters
+        ----------
+        p : (np,) array
+            Parameters (q, φ).
+        warm : list of (N, 3n) array or None
+            Trajectories near which equilibria are searched [m]; None for no guess.
+        rows : sequence of int
+            Number of grid rows of each experiment.
         """
         return simulate_trajectories(
             self.collocation,
@@ -590,12 +603,17 @@ class TrialSimulation:
 class ScanState:
     """Moduli that were tried so far, with their misfits.
 
+    Parameters
+    ----------
+    trial : TrialSimulation
+        Simulation that is repeated for every modulus.
+
     Attributes
     ----------
     misfits : dict of float to float
         Misfit by Young's modulus [Pa]; NaN where the simulation failed.
     last_trajectories : list or None
-        Trajectories of the last simulation that succeeded.
+        Trajectories of the last simulation that succeeded; None before.
     is_ended_early : bool
         Whether the scan ended before the softest modulus.
     """

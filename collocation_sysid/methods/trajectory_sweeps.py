@@ -1,13 +1,14 @@
 """One experiment's trajectory during a search: sweeps, trials and simulations.
 
 These functions run where the experiment is stored, in this process or on a worker of a cluster. A
-`SweepResult` is stored there because its size grows with the number of time steps; the search needs
-only its `SweepReport`, whose size does not. Parameters p are the (q, φ) of the experiment alone.
+`LinearisedTrajectory` is stored there because its size grows with the number of time steps; the
+search needs only its `SweepReport`, whose size does not. Parameters p are the (q, φ) of the
+experiment alone.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from ..program.forward.newton_solver import NewtonOptions
 from ..program.forward.scheme_simulation import continue_simulation
 from ..program.least_squares import SquareRootInformation
 from ..program.measurement_residual import huber_as_least_squares
-from ..program.sweep import Sweep, Tangent
+from ..program.observable_response import ObservableResponse
+from ..program.sweep import Sweep, SweepResult
 from ..program.transcription import Transcription
 from .initial_trajectories import continue_trajectory
 
@@ -66,13 +68,20 @@ class FitSummary:
             Largest residual of the equations of motion [N], as the caller knows it.
         """
         squares = iterate.segment.markers.squared_distances_m2(x, iterate.phi)
-        return cls(len(x), violation_n, float(squares.sum()), len(squares))
+        return cls(
+            len(x),
+            violation_n,
+            squares_m2=float(squares.sum()),
+            samples=len(squares),
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class SweepReport:
+class SweepReport(FitSummary):
     """Result of a sweep that the search needs; its size does not depend on the number of time
     steps.
+
+    The fit to the measurements is that of the positions after the feasibility step.
 
     Attributes
     ----------
@@ -86,8 +95,6 @@ class SweepReport:
         Largest change of a coordinate since the previous trajectory [m].
     indefinite_steps : int
         Number of time steps whose matrix is not positive definite.
-    fit_summary : FitSummary
-        Fit of the positions after the feasibility step.
     times_s : tuple of three floats
         Times for `Stopwatch.add` [s].
     """
@@ -97,36 +104,40 @@ class SweepReport:
     feasibility_m: float
     position_change_m: float
     indefinite_steps: int
-    fit_summary: FitSummary
     times_s: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class SweepResult:
-    """Trajectory with the result of one sweep.
+class LinearisedTrajectory(SweepResult):
+    """Result of a sweep with the linearised residuals of the measurements.
 
     Attributes
     ----------
-    x : (rows, 3n) array
-        Positions [m], before the feasibility step.
-    tangent : Tangent
-        Feasibility step and sensitivities.
     slope : (M, k) array
         Derivatives S of all M measurement residuals by the parameters, after the feasibility step.
     report : SweepReport
         Result that the search needs.
     """
 
-    x: Array
-    tangent: Tangent
     slope: Array
     report: SweepReport
+
+    @classmethod
+    def from_sweep(
+        cls, result: SweepResult, slope: Array, report: SweepReport
+    ) -> LinearisedTrajectory:
+        """Return a sweep result with the linearised residuals; arguments as the attributes."""
+        swept = {
+            field.name: getattr(result, field.name)
+            for field in fields(SweepResult)
+        }
+        return cls(**swept, slope=slope, report=report)
 
     def __sizeof__(self) -> int:
         """Return the memory size in bytes, from which a scheduler estimates the cost of a
         transfer.
         """
-        arrays = (self.x, self.tangent.step, self.tangent.by_p, self.slope)
+        arrays = (self.x, self.step, self.by_p, self.slope)
         return object.__sizeof__(self) + sum(each.nbytes for each in arrays)
 
 
@@ -150,7 +161,7 @@ class SimulationResult:
 
 
 def trajectory_positions(
-    trajectory: SweepResult | SimulationResult | Array,
+    trajectory: LinearisedTrajectory | SimulationResult | Array,
 ) -> Array:
     """Return the positions (rows, 3n) [m] of a sweep result (before its feasibility step) or of a
     simulation; an array of positions is returned as it is.
@@ -161,12 +172,11 @@ def trajectory_positions(
 def sweep(
     solver: Sweep,
     transcription: Transcription,
-    huber: float | None,
     p: Array,
-    trajectory: SweepResult | SimulationResult | Array,
-    known_sweep: SweepResult | None = None,
-    previous: SweepResult | None = None,
-) -> SweepResult:
+    trajectory: LinearisedTrajectory | SimulationResult | Array,
+    known_sweep: LinearisedTrajectory | None = None,
+    previous: LinearisedTrajectory | None = None,
+) -> LinearisedTrajectory:
     """Return the result of one sweep at parameters p and given positions.
 
     Parameters
@@ -175,15 +185,13 @@ def sweep(
         Solver of the experiment's linearised equations of motion; its stopwatch is read and reset.
     transcription : Transcription
         Transcription of the experiment.
-    huber : float or None
-        Not used: each measurement residual has a threshold of its own.
     p : (k,) array
         Parameters (q, φ) of the experiment.
-    trajectory : SweepResult, SimulationResult or (rows, 3n) array
+    trajectory : LinearisedTrajectory, SimulationResult or (rows, 3n) array
         Positions [m].
-    known_sweep : SweepResult, optional
+    known_sweep : LinearisedTrajectory, optional
         Sweep of the first rows at the same p and positions, which is continued.
-    previous : SweepResult, optional
+    previous : LinearisedTrajectory, optional
         Previous trajectory, from which changes are measured.
 
     Raises
@@ -195,15 +203,9 @@ def sweep(
     dynamics = part.equations.dynamics
     if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
         raise SimulationError(massless, float(dynamics.t_s[0]))
-    tangent = solver.forward(
-        part.x,
-        part.equations,
-        known=known_sweep.tangent if known_sweep else None,
-    )
-    return _sweep_result(
+    return _linearised_trajectory(
         part,
-        huber,
-        tangent=tangent,
+        solver.forward(part.x, part.equations, known=known_sweep),
         previous=previous,
         times_s=solver.stopwatch.read_and_reset(),
     )
@@ -212,11 +214,10 @@ def sweep(
 def sweep_after_step(
     solver: Sweep,
     transcription: Transcription,
-    huber: float | None,
     p: Array,
-    previous: SweepResult,
+    previous: LinearisedTrajectory,
     step: Array,
-) -> SweepResult:
+) -> LinearisedTrajectory:
     """Return the result of one sweep after a step of the parameters to p.
 
     The positions are those of `previous` after its feasibility step, extrapolated along the
@@ -230,11 +231,9 @@ def sweep_after_step(
         Solver of the experiment's linearised equations of motion; its stopwatch is read and reset.
     transcription : Transcription
         Transcription of the experiment.
-    huber : float or None
-        See `sweep`.
     p : (k,) array
         Parameters (q, φ) after the step.
-    previous : SweepResult
+    previous : LinearisedTrajectory
         Trajectory before the step.
     step : (k,) array
         Step of the parameters.
@@ -258,18 +257,15 @@ def sweep_after_step(
             approximate_solution=x,
         )
         x = equilibria if failure is None else x
-    return sweep(
-        solver, transcription, huber=huber, p=p, trajectory=x, previous=previous
-    )
+    return sweep(solver, transcription, p=p, trajectory=x, previous=previous)
 
 
 def reassociate(
     solver: Sweep,
     transcription: Transcription,
-    huber: float | None,
     p: Array,
-    sweep_result: SweepResult,
-) -> SweepResult:
+    sweep_result: LinearisedTrajectory,
+) -> LinearisedTrajectory:
     """Return the sweep with its measurements evaluated by another transcription.
 
     The positions and sensitivities are not computed again. The change of positions and
@@ -281,32 +277,31 @@ def reassociate(
         Solver, for its stopwatch, which is read and reset.
     transcription : Transcription
         Transcription with new marker or camera associations.
-    huber : float or None
-        See `sweep`.
     p : (k,) array
         Parameters (q, φ) of the experiment.
-    sweep_result : SweepResult
+    sweep_result : LinearisedTrajectory
         Sweep at p.
     """
-    return _sweep_result(
+    return _linearised_trajectory(
         _iterate(transcription, p, x=sweep_result.x),
-        huber,
-        tangent=sweep_result.tangent,
+        sweep_result,
         previous=None,
         times_s=solver.stopwatch.read_and_reset(),
     )
 
 
 def extrapolate(
-    transcription: Transcription, sweep_result: SweepResult, step: Array
+    transcription: Transcription,
+    sweep_result: LinearisedTrajectory,
+    step: Array,
 ) -> Array:
     """Return positions (rows, 3n) [m] after the feasibility step of `sweep_result` and a step (k,)
     of the experiment's parameters, to first order.
     """
     return (
         sweep_result.x
-        + sweep_result.tangent.step
-        + sweep_result.tangent.by_p @ step[transcription.dynamic_parameters]
+        + sweep_result.step
+        + sweep_result.by_p @ step[transcription.dynamic_parameters]
     )
 
 
@@ -314,8 +309,8 @@ def simulate_rows(
     solver: Sweep,
     transcription: Transcription,
     p: Array,
-    known_rows: SweepResult | SimulationResult | Array | None,
-    guess: SweepResult | None,
+    known_rows: LinearisedTrajectory | SimulationResult | Array | None,
+    guess: LinearisedTrajectory | None,
 ) -> SimulationResult:
     """Simulate the rows of the solver at parameters p, as far as the simulation succeeds.
 
@@ -329,9 +324,9 @@ def simulate_rows(
         Transcription of the experiment.
     p : (k,) array
         Parameters (q, φ) of the experiment.
-    known_rows : SweepResult, SimulationResult, (m, 3n) array or None
+    known_rows : LinearisedTrajectory, SimulationResult, (m, 3n) array or None
         First rows, which are continued; None for none.
-    guess : SweepResult or None
+    guess : LinearisedTrajectory or None
         Trajectory at other parameters, near which equilibria are searched first.
     """
     part = _iterate(
@@ -373,37 +368,31 @@ def _iterate(
     )
 
 
-def _sweep_result(
+def _linearised_trajectory(
     iterate: ExperimentIterate,
-    huber: float | None,
-    tangent: Tangent,
-    previous: SweepResult | None,
+    swept: SweepResult,
+    previous: LinearisedTrajectory | None,
     times_s: tuple[float, float, float],
-) -> SweepResult:
-    """Return the sweep result: measurement residuals and slopes after the feasibility step, as
-    least squares with Huber's loss.
+) -> LinearisedTrajectory:
+    """Return the sweep result with the measurement residuals and slopes after the feasibility step,
+    as least squares with Huber's loss.
 
     Parameters
     ----------
     iterate : ExperimentIterate
         Experiment at the parameters and positions of the sweep.
-    huber : float or None
-        Not used: each measurement residual has a threshold of its own.
-    tangent : Tangent
+    swept : SweepResult
         Feasibility step and sensitivities.
-    previous : SweepResult or None
+    previous : LinearisedTrajectory or None
         Previous trajectory; for None the change of positions and `previous_slopes_residual` are
         zero.
     times_s : tuple of three floats
         Times for `Stopwatch.add` [s].
     """
-    response = iterate.observation.response_of_array(
-        tangent.by_p, tangent.grasp_forces
+    response = ObservableResponse.from_array(
+        iterate, swept.by_p, swept.grasp_forces, step=swept.step
     )
-    predictions = iterate.observation.linearise(
-        iterate.x, response, step=tangent.step
-    )
-    matches = zip(predictions, iterate.segment.residuals, strict=True)
+    matches = zip(response.linearise(), iterate.segment.residuals, strict=True)
     residuals_and_slopes = [
         huber_as_least_squares(*each, reading.huber)
         for each, reading in matches
@@ -417,21 +406,22 @@ def _sweep_result(
             for values, by in residuals_and_slopes
         ]
     )
+    summary = FitSummary.from_iterate(
+        iterate, iterate.x + swept.step, violation_n=swept.violation_n
+    )
     report = SweepReport(
+        **vars(summary),
         fit=SquareRootInformation.empty(slope.shape[1]).with_rows(
             residual, slope
         ),
         previous_slopes_residual=np.zeros(slope.shape[1])
         if previous is None
         else previous.slope.T @ residual,
-        feasibility_m=float(np.abs(tangent.step).max()),
+        feasibility_m=float(np.abs(swept.step).max()),
         position_change_m=0.0
         if previous is None
         else float(np.abs(iterate.x - previous.x).max()),
-        indefinite_steps=tangent.indefinite_count,
-        fit_summary=FitSummary.from_iterate(
-            iterate, iterate.x + tangent.step, violation_n=tangent.violation_n
-        ),
+        indefinite_steps=swept.indefinite_count,
         times_s=times_s,
     )
-    return SweepResult(iterate.x, tangent, slope=slope, report=report)
+    return LinearisedTrajectory.from_sweep(swept, slope, report)

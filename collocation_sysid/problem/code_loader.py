@@ -171,7 +171,9 @@ class CodeLoader:
             """Whether a value of the file is callable or a `NodeForce`."""
             return callable(value) or isinstance(value, NodeForce)
 
-        return self._load(file, name, key, "function", is_function)
+        return self._load(
+            file, name, key=key, kind="function", is_kind=is_function
+        )
 
     def _load(
         self,

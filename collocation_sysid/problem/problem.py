@@ -274,13 +274,7 @@ class Problem:
             experiments=[
                 replace(e, body=bodies[id(e.body)]) for e in self.experiments
             ],
-            parameters=Parameters(
-                tuple(
-                    item
-                    for item in self.parameters.items
-                    if item.name not in removed_names
-                )
-            ),
+            parameters=self.parameters.without(removed_names),
         )
 
     @property
@@ -368,10 +362,11 @@ class Problem:
                     require_steps(experiment, self.rollout.timestep_s)
         self.solver()
         free = [item.name for item in self.parameters.free]
+        scalars = [item.name for item in self.parameters.free_scalars]
         for name in self.uncertainty.profile:
             if name not in free:
                 raise InputError(
-                    f"found {name!r}; expected estimated parameters, {', '.join(free)}",
+                    f"found {name!r}; expected estimated parameters, {', '.join(scalars)}",
                     where="uncertainty.profile",
                 )
 
@@ -388,7 +383,9 @@ def _require_rest_shapes(
     The message is located at "object.rest_shape". Bodies without a scan under gravity pass.
     """
     if any(
-        item.guess is None for item in parameters.items if item.tied is None
+        item.guess is None
+        for item in parameters.components
+        if item.tied is None
     ):
         return
     for body in bodies:

@@ -442,7 +442,7 @@ class RecordingReader:
             **declared_in(section, Gauge, where=key),
         }
         _, arguments["expression"] = self.code.function(
-            section.code, section.function, f"{key}.code"
+            section.code, section.function, key=f"{key}.code"
         )
         if section.grasp and section.grasp > (
             count := len(self.section.grasp_list)

@@ -8,9 +8,10 @@ Transcription
     lays out the sparse Jacobian, `local_loss` the Hessian of the loss, and `lifted` has the
     variables that are eliminated by default and can be added with equations of their own.
 Measurements
-    `observables` are measurable quantities, `observation` evaluates them along a motion, and
-    `measurement_residual` compares them with data. `custom_sensor_residual` is the measurement of a
-    custom sensor; the packages `markers`, `wrench` and `depth` contain the other kinds.
+    `observables` are measurable quantities, `observable_response` linearises them along the
+    equations of motion, and `measurement_residual` compares them with data. `custom_sensor_residual`
+    is the measurement of a custom sensor; the packages `markers`, `wrench` and `depth` contain the
+    other kinds.
 Linear algebra
     `sweep` solves the linearised equations of motion forward and backward in time,
     `least_squares` accumulates normal equations in square-root form, `stopwatch` measures time, and

@@ -631,7 +631,7 @@ class Collocation:
         parts = self.iterates(z)
         rows = [
             part.segment.constraint_values(
-                part.x, part.equations, part.histories
+                part.x, part.equations, histories=part.histories
             )
             for part in parts
         ]
@@ -712,7 +712,7 @@ class Collocation:
             segment = part.segment
             here = own[used : used + segment.jacobian.nnz]
             constraints, by_p = segment.constraints_and_jacobian(
-                part.x, part.equations, part.forces, here
+                part.x, part.equations, forces=part.forces, values=here
             )
             rows[segment.rows] = constraints
             columns[:, segment.rows] = by_p[:, : self.nq].T
@@ -723,7 +723,7 @@ class Collocation:
             for each in self.lifted
         ]
         self._jacobian.assemble(
-            values, own, further + [entries for _, entries in added]
+            values, own, groups=further + [entries for _, entries in added]
         )
         return np.concatenate(
             [rows, *(equations for equations, _ in added)]
@@ -876,7 +876,7 @@ class Collocation:
             by_q_own, further_own = segment.hessian_values(
                 part.x,
                 part.phi,
-                part.equations,
+                equations=part.equations,
                 weights=weights[number],
                 loss_weight=weight,
                 values=here,
@@ -901,7 +901,7 @@ class Collocation:
         rows, columns = np.triu_indices(self.nq)
         order = np.lexsort((rows, columns))
         own[: len(rows)] = by_q[rows[order], columns[order]]
-        self._hessian.assemble(values, own, further)
+        self._hessian.assemble(values, own, groups=further)
         return values
 
     def kkt_residual(self, z: Array, multipliers: Array) -> float:
@@ -941,7 +941,7 @@ class Collocation:
         Arguments as in `hessian_values`; `multipliers` is None for the Gauss–Newton matrix.
         """
         indptr, indices = self.hessian_structure
-        values = self.hessian_values(z, loss_weight, multipliers)
+        values = self.hessian_values(z, loss_weight, multipliers=multipliers)
         upper = sp.csc_array((values, indices, indptr), shape=(len(z), len(z)))
         return sp.csc_array(upper + sp.triu(upper, 1).T)
 

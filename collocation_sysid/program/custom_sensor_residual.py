@@ -25,8 +25,8 @@ from ..recording.sample_times import TIME_TOLERANCE_S
 from .markers.marker_association import MarkerAssociation
 from .measurement_residual import (
     GROUP,
-    Channel,
     MeasurementResidual,
+    Observable,
     RowStencil,
     lagrange_weights,
     neighbouring_times,
@@ -67,7 +67,7 @@ class CustomSensorResidual(MeasurementResidual):
         cls,
         sensor: Gauge,
         number: int,
-        observable: Channel,
+        observable: Observable,
         at_s: Array,
         nuisance: NuisanceMap,
         huber: float | None,
@@ -83,7 +83,7 @@ class CustomSensorResidual(MeasurementResidual):
             The user's sensor with its samples.
         number : int
             Index of the sensor in the experiment, from 0.
-        observable : Channel
+        observable : Observable
             Observable.
         at_s : (n,) array
             Times of the observable [s]; samples outside are not compared.
@@ -209,7 +209,7 @@ class CustomSensorResidual(MeasurementResidual):
         unknowns = ca.vertsplit(
             phi * self.nuisance.scales[self.own_parameters[0]][:, None]
         )
-        predicted = self.sensor.read(t_s, at, unknowns)
+        predicted = self.sensor.read(t_s, at, unknowns=unknowns)
         return ca.vertcat(
             predicted, ca.SX.zeros(self.measured.shape[2] - predicted.numel())
         )
@@ -290,7 +290,7 @@ def custom_sensor_residuals(
     models = []
     for number, gauge in enumerate(experiment.readings):
         if gauge.grasp is None:
-            channel = observed_points(experiment, gauge, len(t_s))
+            channel = observed_points(experiment, gauge, rows=len(t_s))
             at_s = t_s
         else:
             grasp = experiment.grasps[gauge.grasp - 1]

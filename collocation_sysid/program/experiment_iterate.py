@@ -1,14 +1,15 @@
 """One experiment at given variables of the nonlinear program: its parameters, motion and
 observables.
 
-Methods and statistics use a `ExperimentIterate` to evaluate the loss, its gradient and the forces
-at one iterate; derived quantities are computed once and cached.
+Methods and statistics use an `ExperimentIterate` to evaluate the loss, its gradient and the forces
+at one iterate; derived quantities are computed once and cached. Derivatives of its observables
+along the equations of motion are in `observable_response`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,9 +20,10 @@ from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.internal_variables import AnyHistory
 from .depth.depth_residual import DepthResidual
 from .depth.outline_residual import OutlineResidual
-from .observables import ObservedMotion
-from .observation import Observation
+from .measurement_residual import Observable
+from .observables import ObservedMotion, ReactionForces
 from .transcription import Transcription
+from .wrench.reaction_forces import reaction_vjp, reactions_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,16 +78,22 @@ class ExperimentIterate:
         return (*dynamics.histories(self.x, self.lifted_histories), *pressed)
 
     @cached_property
-    def observation(self) -> Observation:
-        """Evaluation of the observables of this experiment."""
-        return Observation(self.segment, self.equations, phi=self.phi)
+    def reactions(self) -> ReactionForces:
+        """Reaction forces on the sensed dofs, without changes."""
+        return reactions_at(
+            self.equations.dynamics,
+            self.x,
+            dofs=self.segment.sensed_dofs,
+            histories=self.histories,
+        )
 
-    @cached_property
-    def motion(self) -> ObservedMotion:
-        """Motion without changes, as observables use it; its reaction forces are computed on first
-        use.
+    def motion_for(self, observable: Observable) -> ObservedMotion:
+        """Return the motion without changes; with reaction forces if the observable measures
+        them.
         """
-        return self.observation.motion(self.x, self.histories)
+        return ObservedMotion(
+            self.x, self.reactions if observable.measures_reactions else None
+        )
 
     @cached_property
     def observables(self) -> list[Array]:
@@ -95,7 +103,9 @@ class ExperimentIterate:
         return [
             self.lifted_observables[k]
             if k in self.lifted_observables
-            else reading.observable.evaluate(self.motion, self.phi)
+            else reading.observable.evaluate(
+                self.motion_for(reading.observable), self.phi
+            )
             for k, reading in enumerate(self.segment.residuals)
         ]
 
@@ -171,7 +181,9 @@ class ExperimentIterate:
             by_p[nq:] += by_phi
             if k not in self.lifted_observables:
                 products = reading.observable.vjp(
-                    self.motion, phi, by_values=by_observables
+                    self.motion_for(reading.observable),
+                    phi,
+                    by_values=by_observables,
                 )
                 by_x = by_x + products.by_x
                 by_p[nq:] = by_p[nq:] + products.by_phi
@@ -180,12 +192,73 @@ class ExperimentIterate:
                         0.0 if by_reaction is None else by_reaction
                     )
         if by_reaction is not None:
-            through_x, through_p = self.observation.reaction_vjp(
-                self.x, by_reaction
-            )
+            through_x, through_p = self._reaction_vjp(by_reaction)
             by_x += through_x
             by_p[self.segment.dynamic_parameters] += through_p
         return by_x, by_p
+
+    def _reaction_vjp(self, weights: Array) -> tuple[Array, Array]:
+        """Vector–Jacobian product of the reaction forces R, including the dependence through
+        history variables. The segment's `linearisation_buffer` is overwritten.
+
+        Parameters
+        ----------
+        weights : (N, g) array
+            Weights of the reaction forces [1/N].
+
+        Returns
+        -------
+        ((N, 3n) array, (m,) array)
+            Derivatives of Σ weights · R by x [1/m] and by the parameters that change the motion.
+        """
+        direct = reaction_vjp(
+            self.equations,
+            self.x,
+            weights=weights,
+            dofs=self.segment.sensed_dofs,
+            buffer=self.segment.linearisation_buffer,
+        )
+        through_x, through_p = self.segment.history_vjp(
+            self.x, self.equations, weights=direct.force_weights
+        )
+        return direct.by_x + through_x, direct.by_parameters + through_p
+
+    def linearise_fixed_motion(self) -> list[tuple[Array, Array]]:
+        """Linearise the residuals of all measurements by φ, at a motion that does not change.
+
+        Returns
+        -------
+        list of (array, array)
+            For each measurement, residuals (s, G, 3) and derivatives (s, G, 3, k). Wrenches are
+            included, with the reaction forces of the motion.
+        """
+        none = np.zeros(0, dtype=np.int64)
+        count = len(self.phi)
+        reactions = None
+        if any(r.observable.measures_reactions for r in self.segment.residuals):
+            nothing = np.zeros((*self.reactions.reaction.shape, 0))
+            reactions = replace(
+                self.reactions, reaction_by=nothing, position_by=nothing
+            )
+        motion = ObservedMotion(self.x, reactions)
+        linearised = []
+        for reading in self.segment.residuals:
+            values_and_slopes = reading.observable.linearise(
+                motion, self.phi, none, count
+            )
+            linearised.append(
+                reading.linearise(*values_and_slopes, self.phi, count)
+            )
+        return linearised
+
+    def predict_wrenches(self) -> list[Array]:
+        """Return the prediction (S, 6) for each wrench sensor [N, N m]; NaN at samples for which
+        the rows of x do not suffice.
+        """
+        return [
+            sensor.predict_reactions(self.reactions, self.phi)
+            for sensor in self.segment.sensors
+        ]
 
     @cached_property
     def forces(self) -> Linearisation:
@@ -193,11 +266,15 @@ class ExperimentIterate:
         `linearisation_buffer`, hence valid until the segment linearises again.
         """
         rows = self.segment.linearisation_buffer
-        return self.equations.dynamics.linearise(self.x, rows, self.histories)
+        return self.equations.dynamics.linearise(
+            self.x, rows, histories=self.histories
+        )
 
     @property
     def residual_n(self) -> Array:
         """Residuals of the equations of motion (N, free dofs) [N],
         see `Transcription.residual_n`.
         """
-        return self.segment.residual_n(self.x, self.equations, self.histories)
+        return self.segment.residual_n(
+            self.x, self.equations, histories=self.histories
+        )

@@ -137,11 +137,16 @@ class LocalLoss:
             yield reading.hessian(
                 values,
                 phi,
-                points.derivative_matrix(
+                derivatives=points.derivative_matrix(
                     x, phi, position_count=self.position_count
                 ),
-                has_observation_curvature,
+                has_observation_curvature=has_observation_curvature,
             )
             if has_observation_curvature and not points.is_linear:
                 by_values, _ = reading.loss_gradient(values, phi)
-                yield points.curvature(x, phi, by_values, self.position_count)
+                yield points.curvature(
+                    x,
+                    phi,
+                    by_values=by_values,
+                    position_count=self.position_count,
+                )

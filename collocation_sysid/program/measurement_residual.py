@@ -32,7 +32,7 @@ from .wrench.wrench_observable import GraspWrench, ReactionGrid
 GROUP = 3
 
 # Observables of measurements.
-Channel = PointPositions | GraspWrench
+Observable = PointPositions | GraspWrench
 
 T = TypeVar("T", float, ca.SX)
 Expression = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
@@ -252,7 +252,7 @@ class MeasurementResidual(ABC):
 
     Attributes
     ----------
-    observable : Channel
+    observable : Observable
         Observable; its values c are (n, e, 3), at the first n of its times.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment.
@@ -285,7 +285,7 @@ class MeasurementResidual(ABC):
         to be small.
     """
 
-    observable: Channel
+    observable: Observable
     nuisance: NuisanceMap
     huber: float | None
     names: tuple[str, ...]
@@ -670,7 +670,9 @@ class MeasurementResidual(ABC):
         size = by.shape[3] + len(phi)
         slopes = ObservableDerivatives.without_own(np.arange(by.shape[3]), by)
         return self.pool_values(
-            self.linearise(values, slopes, phi, size)[1][..., : by.shape[3]]
+            self.linearise(values, slopes, phi=phi, size=size)[1][
+                ..., : by.shape[3]
+            ]
         )
 
     def loss(self, values: Array, phi: Array) -> float:
@@ -808,7 +810,9 @@ class MeasurementResidual(ABC):
         """
         inputs = self._inputs_at(values, phi)
         curvature = inputs.functions.curvature(
-            inputs.u, inputs.data, has_observation_curvature
+            inputs.u,
+            inputs.data,
+            has_observation_curvature=has_observation_curvature,
         )
         by_u = np.moveaxis(curvature, (0, 1), (2, 3))
         by_u = by_u.reshape(-1, *by_u.shape[2:])

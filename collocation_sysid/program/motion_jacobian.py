@@ -150,7 +150,7 @@ class MotionJacobian:
             columns = self._inertia_rows(lag) - lag
             positions.append(
                 self.structure.positions(
-                    columns, lag, place, self.free_dofs
+                    columns, lag, rows=place, columns=self.free_dofs
                 ).ravel()
             )
         prescribed = np.setdiff1d(self.constrained_dofs, self.free_dofs)
@@ -158,8 +158,8 @@ class MotionJacobian:
         grasps = self.structure.positions(
             rows,
             0,
-            np.searchsorted(self.constrained_dofs, prescribed),
-            prescribed,
+            rows=np.searchsorted(self.constrained_dofs, prescribed),
+            columns=prescribed,
         )
         return np.concatenate(positions), grasps.ravel()
 
@@ -219,7 +219,7 @@ class MotionJacobian:
         """
         threads = dynamics.body.threads
         self.structure.fill(
-            values, forces.by_position, forces.by_velocity, threads
+            values, forces.by_position, b=forces.by_velocity, threads=threads
         )
         positions, grasps = self._constant_positions
         values[positions] += (
@@ -231,7 +231,10 @@ class MotionJacobian:
         of_rates = full_skew_values(self.pattern, forces.by_velocity_skew)
         if skew.size:
             self._skew.fill(
-                values, skew, of_rates if of_rates.size else skew, threads
+                values,
+                skew,
+                b=of_rates if of_rates.size else skew,
+                threads=threads,
             )
         self._released_grasps.correct(
             values,
@@ -338,7 +341,7 @@ class ReleasedGrasps:
         )
         ones = [
             band.positions(
-                np.array([t]), 0, place[[dof]], np.array([dof])
+                np.array([t]), 0, rows=place[[dof]], columns=np.array([dof])
             ).ravel()
             for t, dof in zip(times, dofs, strict=True)
         ]
@@ -432,8 +435,8 @@ def _dropped_forces(
                     positions = band.positions(
                         np.array([k - i]),
                         i + j,
-                        place[rows[entries]],
-                        columns[entries],
+                        rows=place[rows[entries]],
+                        columns=columns[entries],
                     )
                     dropped.append(
                         _DroppedForce(

@@ -10,7 +10,6 @@ lifted to variables of the program, see `lifted_variables`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, NamedTuple
@@ -46,27 +45,22 @@ class ReactionForces:
 
 @dataclass(frozen=True, eq=False)
 class ObservedMotion:
-    """A motion as observables use it.
+    """A motion with its changes, as one observable uses it.
 
     Attributes
     ----------
     x : (rows, 3n) array
         Positions of the first grid times [m].
-    compute_reactions : callable
-        Returns the reaction forces; called at most once, on the first use of `reactions`.
+    reactions : ReactionForces or None
+        Reaction forces on the sensed dofs; None for observables that do not measure them.
     changes : (R, p, c) array or None
         Changes with c columns of the p values of an observable's operator applied to the R rows of
         x at which it is observed; None means no change.
     """
 
     x: Array
-    compute_reactions: Callable[[], ReactionForces]
+    reactions: ReactionForces | None = None
     changes: Array | None = None
-
-    @cached_property
-    def reactions(self) -> ReactionForces:
-        """Reaction forces, computed on first use."""
-        return self.compute_reactions()
 
 
 class ObservableDerivatives(NamedTuple):
@@ -149,6 +143,8 @@ class PointPositions:
         Indices in φ of the estimated coordinates of X; −1 for points that are exact.
     delay_steps : int
         Number of grid times after which a value is known; 0.
+    measures_reactions : bool
+        Whether values depend on reaction forces; False.
     """
 
     rows: Index
@@ -156,6 +152,7 @@ class PointPositions:
     coordinate_parameters: Index
 
     delay_steps: ClassVar[int] = 0
+    measures_reactions: ClassVar[bool] = False
 
     @property
     def local(self) -> PointPositions:
@@ -224,7 +221,7 @@ class PointPositions:
                 (len(self.rows), 0, 3, self.coordinate_parameters.shape[1])
             )
         return self._interpolate(
-            x, nodes[estimated], functions.gradients[estimated]
+            x, nodes[estimated], weights=functions.gradients[estimated]
         )
 
     def evaluate(self, motion: ObservedMotion, phi: Array) -> Array:
@@ -238,7 +235,7 @@ class PointPositions:
         rows that x (rows, 3n) [m] contains.
         """
         nodes, shape = self.shape_functions(phi)
-        return self._interpolate(x, nodes, shape.weights)
+        return self._interpolate(x, nodes, weights=shape.weights)
 
     def linearise(
         self, motion: ObservedMotion, phi: Array, columns: Index, size: int
@@ -467,7 +464,7 @@ class PointPositions:
         value = np.einsum("tmi,mak->tmaik", weights, shape.gradients[estimated])
         rows, columns = np.broadcast_arrays(row, column[:, None, None])
         by_coordinates = self._interpolate(
-            x, nodes[estimated], shape.hessians[estimated]
+            x, nodes[estimated], weights=shape.hessians[estimated]
         )
         by_coordinates = np.einsum("tmi,tmikl->mkl", weights, by_coordinates)
         upper = np.nonzero(

@@ -30,7 +30,7 @@ from .forward.newmark import simulate_newmark
 from .forward.newton_solver import NewtonOptions
 from .forward.scheme_simulation import Progress, simulate_scheme
 from .observables import ObservedMotion, ReactionForces
-from .wrench.reaction_forces import forces_on_dofs, reaction_forces
+from .wrench.reaction_forces import reactions_at
 from .wrench.wrench_observable import ReactionGrid, sensed_dofs
 from .wrench.wrench_residual import wrench_residuals
 
@@ -315,7 +315,7 @@ def _with_steps(
         )
     else:
         dynamics = Dynamics.from_experiment(
-            experiment, integrator, steps
+            experiment, integrator, substeps=steps
         ).with_theta(theta)
         grid = simulate_scheme(
             experiment, dynamics, options=options, progress=progress
@@ -328,13 +328,7 @@ def _with_steps(
             else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
         )
         at = ReactionGrid.from_dynamics(dynamics)
-        force = forces_on_dofs(dynamics, grid, dofs=sensed)
-        mass_kg = dynamics.mass.inertia_kg[:, sensed]
-        acceleration = dynamics.acceleration(grid)
-        reaction = reaction_forces(
-            dynamics, mass_kg, force=force, acceleration=acceleration[:, sensed]
-        )
-        forced = ReactionForces(reaction, grid[:, sensed])
+        forced = reactions_at(dynamics, grid, dofs=sensed)
     shape = (len(x), -1, 3)
     positions = x.reshape(shape)
     markers = experiment.markers.predict_positions(positions)
@@ -382,12 +376,8 @@ def _custom_sensor_values(
     readings = custom_sensor_residuals(
         experiment, experiment.t_s, grid=reactions[0], nuisance=ideal
     )
-
-    def known_reactions() -> ReactionForces:
-        return reactions[1]
-
     motion = ObservedMotion(
-        positions_m.reshape(len(positions_m), -1), known_reactions
+        positions_m.reshape(len(positions_m), -1), reactions[1]
     )
     return tuple(
         reading.without_padding(

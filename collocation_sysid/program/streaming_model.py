@@ -384,7 +384,8 @@ class StreamingModel:
         still = self.segment.experiment
         gauges = [gauge for gauge in still.readings if gauge.grasp is None]
         return tuple(
-            observed_points(still, gauge, GAUGE_NEIGHBOURS) for gauge in gauges
+            observed_points(still, gauge, rows=GAUGE_NEIGHBOURS)
+            for gauge in gauges
         )
 
     @cached_property

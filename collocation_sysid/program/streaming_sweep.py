@@ -30,7 +30,6 @@ from .measurement_residual import huber_as_least_squares, lagrange_weights
 from .observables import (
     ObservableDerivatives,
     ObservedMotion,
-    ReactionForces,
 )
 from .streaming_model import ROW_TOLERANCE, ROWS_PER_CHUNK, StreamingModel
 from .sweep import (
@@ -263,7 +262,10 @@ class StreamingSweep:
         empty = np.zeros((rows, dofs))
         node_loads = np.zeros((rows, len(self.grasped), self.count))
         reactions = GraspReactions.zeros(
-            rows, len(self.sensed), self.count, len(self.model.first_poses)
+            rows,
+            len(self.sensed),
+            columns=self.count,
+            grasps=len(self.model.first_poses),
         )
         return SweepState(
             0,
@@ -541,7 +543,7 @@ class StreamingSweep:
         at = self.forces.linearise(
             stencils.p[rows, known] @ x,
             stencils.q[rows, known] @ x,
-            self.model.linearisation_memory[: len(here)],
+            out=self.model.linearisation_memory[: len(here)],
         )
         force[rows] = at.force
         total = stencils.w[rows, known] @ force
@@ -594,7 +596,7 @@ class StreamingSweep:
             solved.append(row_columns)
             try:
                 factor = solver.factoriser.factorise(
-                    block, skew_block, self.model.factor_memory
+                    block, skew_block, buffer=self.model.factor_memory
                 )
                 step = FactorisedStep(
                     t,
@@ -674,16 +676,16 @@ class StreamingSweep:
         x = self.x[: here.stop, self.sensed]
         rows = np.arange(first, here.stop)
         reactions, channels = self.reactions.wrenches(
-            sensors, self.setting, x, (stencils.w, stencils.s), rows
+            sensors,
+            self.setting,
+            x=x,
+            weights=(stencils.w, stencils.s),
+            rows=rows,
         )
-
-        def known_reactions() -> ReactionForces:
-            return reactions
-
-        motion = ObservedMotion(x, known_reactions)
+        motion = ObservedMotion(x, reactions)
         for k, channel in enumerate(channels):
             value, slopes = channel.linearise(
-                motion, self.phi, self.moving, size
+                motion, self.phi, columns=self.moving, size=size
             )
             sensor_wrenches = wrenches[first - here.start :, k]
             sensor_wrenches[..., 0] = value.reshape(-1, 6)
@@ -818,7 +820,7 @@ class StreamingSweep:
         values = values.reshape(len(needed_rows), -1, 3, 1 + len(columns))
         slopes = ObservableDerivatives.without_own(columns, values[..., 1:])
         residual, slope = sensor.linearise(
-            values[..., 0], slopes, self.phi, model.parameter_count
+            values[..., 0], slopes, phi=self.phi, size=model.parameter_count
         )
         return zip(
             np.where(sensor.compared_with(len(needed_rows)), residual, np.nan),
@@ -864,7 +866,7 @@ class StreamingSweep:
         since_s = (self.row - 1 - back) / model.substeps * model.interval_s
         markers = markers.shifted(since_s)
         residual, slope = markers.linearise(
-            values, slopes, self.phi, model.parameter_count
+            values, slopes, phi=self.phi, size=model.parameter_count
         )
         return residual[0] - reading.values / markers.sigmas[:, None], slope[0]
 

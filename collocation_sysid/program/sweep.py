@@ -56,11 +56,13 @@ LARGEST_CHUNK_ROWS = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Tangent:
+class SweepResult:
     """Feasibility step and sensitivities of one experiment at given positions and parameters.
 
     Attributes
     ----------
+    x : (N, 3n) array
+        Positions [m], before the feasibility step.
     step : (N, 3n) array
         Feasibility step p = −c_x⁻¹ c [m].
     by_p : (N, 3n, m) array
@@ -76,6 +78,7 @@ class Tangent:
         by p.
     """
 
+    x: Array
     step: Array
     by_p: Array
     violation_n: float
@@ -215,7 +218,7 @@ class PrescribedColumns:
         p = step.row.p[0]
         q = step.row.q[0]
         force = np.zeros((len(sweep.free), self.column_count))
-        skew = step.row.skew(0, step.skew, step.rate_skew)
+        skew = step.row.skew(0, step.skew, by_velocity_skew=step.rate_skew)
         matrix = sweep.prescribed_block.extract(
             p * step.by_position + q * step.by_velocity, skew
         )
@@ -380,7 +383,7 @@ class Sweep:
         self.free = transcription.free_dofs
         self.sensed = transcription.sensed_dofs
         self.factoriser = Factoriser.cached(
-            self.pattern, self.free, factorisation
+            self.pattern, self.free, choice=factorisation
         )
         self.matrix = Submatrix(self.pattern, self.free)
         self.prescribed_block = Submatrix(
@@ -408,8 +411,8 @@ class Sweep:
         self,
         x: Array,
         equations: EquationsAtParameters,
-        known: Tangent | None = None,
-    ) -> Tangent:
+        known: SweepResult | None = None,
+    ) -> SweepResult:
         """Compute the feasibility step p and the sensitivities Z at all grid times of this sweep.
 
         Parameters
@@ -418,7 +421,7 @@ class Sweep:
             Positions [m].
         equations : EquationsAtParameters
             Equations of motion at the parameters.
-        known : Tangent, optional
+        known : SweepResult, optional
             Result for the first rows at the same positions and parameters; it is continued, not
             modified.
 
@@ -430,7 +433,7 @@ class Sweep:
         sweep_columns = SweepColumns.by_parameters(self, equations, x=x)
         columns = np.zeros((*x.shape, sweep_columns.count))
         grasp_forces = GraspForces.zeros(
-            len(x), len(self.sensed), sweep_columns.count
+            len(x), len(self.sensed), columns=sweep_columns.count
         )
         march = ForwardSubstitution(
             self,
@@ -449,7 +452,8 @@ class Sweep:
             x, 0 if known is None else len(known.step), out=columns
         ):
             pass
-        return Tangent(
+        return SweepResult(
+            x,
             step=columns[:, :, 0],
             by_p=columns[:, :, 1:],
             violation_n=march.violation_n,
@@ -1028,7 +1032,10 @@ class ForwardSubstitution:
             block = row.p[i] * step.by_position
             block += row.q[i] * step.by_velocity
             return (
-                matrix.extract(block, row.skew(i, step.skew, step.rate_skew))
+                matrix.extract(
+                    block,
+                    row.skew(i, step.skew, by_velocity_skew=step.rate_skew),
+                )
                 @ self.past[i - 1]
             )
         past = weighted_sum_of_past(row.q, self.past, shape=self.shape)

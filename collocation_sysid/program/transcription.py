@@ -175,7 +175,7 @@ class Transcription:
         """
         return with_inputs(
             Dynamics.from_experiment(
-                self.experiment, self.scheme, self.substeps
+                self.experiment, self.scheme, substeps=self.substeps
             ),
             self.nuisance,
         )
@@ -255,7 +255,9 @@ class Transcription:
         """Camera models of all depth cameras of the experiment, in their order."""
         cameras = range(len(self.experiment.depths))
         return tuple(
-            DepthCameraModel.from_experiment(self.experiment, k, self.nuisance)
+            DepthCameraModel.from_experiment(
+                self.experiment, k, nuisance=self.nuisance
+            )
             for k in cameras
         )
 
@@ -875,7 +877,10 @@ class Transcription:
         """
         dynamics = equations.dynamics
         self.motion_rows.fill(
-            values, forces, dynamics, equations.mass_depends_on_parameters
+            values,
+            forces,
+            dynamics=dynamics,
+            has_variable_mass=equations.mass_depends_on_parameters,
         )
         by_p = np.zeros(
             (self.grid_times, self.dof_count, len(self.dynamic_parameters))
@@ -1153,20 +1158,27 @@ class Transcription:
         dynamics = equations.dynamics
         band = self.hessian
         curvature = self._curvature(
-            x, equations, weights.forces, lifted_histories
+            x,
+            equations,
+            weights=weights.forces,
+            lifted_histories=lifted_histories,
         )
         band.fill(
             values,
             curvature.position_position,
-            curvature.position_velocity,
-            self.body.threads,
+            b=curvature.position_velocity,
+            threads=self.body.threads,
         )
         if curvature.velocity_velocity.size:
             rates = curvature.velocity_velocity
-            self._rate_hessian.fill(values, rates, rates, self.body.threads)
+            self._rate_hessian.fill(
+                values, rates, b=rates, threads=self.body.threads
+            )
         skew = full_skew_values(self.pattern, curvature.position_velocity_skew)
         if skew.size:
-            self._skew_hessian.fill(values, skew, skew, self.body.threads)
+            self._skew_hessian.fill(
+                values, skew, b=skew, threads=self.body.threads
+            )
         by_x, twice = equations.weighted_second_derivatives(
             x, curvature, row_weights=weights.rows
         )
@@ -1197,7 +1209,9 @@ class Transcription:
         of_loss = (
             loss_weight
             * self._loss_scale
-            * self.local_loss.hessian(x, phi, has_observation_curvature)
+            * self.local_loss.hessian(
+                x, phi, has_observation_curvature=has_observation_curvature
+            )
         )
         of_states = (
             self.length_m * by_x[..., self.state_dependent_nuisance].ravel()
@@ -1240,7 +1254,7 @@ class Transcription:
         for history, mu in lifted_histories:
             forces = history.with_variable_weights(forces, mu)
         curvature = forces.weighted_hessian(
-            xi, nu, weights, self._curvature_buffer
+            xi, nu, weights=weights, out=self._curvature_buffer
         )
         for history, mu in lifted_histories:
             history.add_curvature(curvature, mu)
@@ -1266,7 +1280,7 @@ class Transcription:
         """Positions (N · 3n,) of the diagonal entries of x in the values of `hessian`."""
         dofs = np.arange(self.dof_count)
         return self.hessian.positions(
-            np.arange(self.grid_times), 0, dofs, dofs
+            np.arange(self.grid_times), 0, rows=dofs, columns=dofs
         ).ravel()
 
     def additional_hessian_entries(

@@ -372,7 +372,9 @@ class Depth:
         options["images_m"] = [
             image if k in outlined else None for k, image in enumerate(images)
         ]
-        return cls(name, t_s, clouds, sigma_m, camera, **options)
+        return cls(
+            name, t_s, clouds=clouds, sigma_m=sigma_m, camera=camera, **options
+        )
 
     def _thin_cloud(self, cloud: Array) -> Array:
         """Return the finite points of a cloud (P, 3) or (P, 6), one for each cube of a grid of

@@ -233,7 +233,7 @@ class Markers:
         """Return an empty set of markers at the times `t_s` (T,), for an experiment without
         markers.
         """
-        return cls(t_s, np.zeros((len(np.atleast_1d(t_s)), 0, 3)), 1.0)
+        return cls(t_s, np.zeros((len(np.atleast_1d(t_s)), 0, 3)), sigma_m=1.0)
 
     @property
     def first_visible_sample(self) -> int:

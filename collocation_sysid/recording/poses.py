@@ -104,7 +104,9 @@ class PoseSequence:
         where they are undeformed.
         """
         return cls(
-            np.array([t0_s]), np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]])
+            np.array([t0_s]),
+            np.zeros((1, 3)),
+            quaternions_xyzw=np.array([[0.0, 0.0, 0.0, 1.0]]),
         )
 
     @classmethod
@@ -135,7 +137,12 @@ class PoseSequence:
         if fault := first_matrix_fault(times, motions):
             raise InputError(fault[1], where=f"matrix {fault[0] + 1}")
         quaternions = Rotation.from_matrix(motions[:, :3, :3]).as_quat()
-        return cls(times, motions[:, :3, 3], quaternions, interpolation)
+        return cls(
+            times,
+            motions[:, :3, 3],
+            quaternions_xyzw=quaternions,
+            interpolation=interpolation,
+        )
 
     def after(self, first: ArrayLike | PoseSequence) -> PoseSequence:
         """Return the composition of these poses with a constant rigid motion that is applied first.

@@ -93,13 +93,13 @@ def animate(
         A run folder.
     file : str or Path, optional
         A file ending in .mp4, which needs ffmpeg, or .gif; by default <experiment>.gif in the run
-        folder.
+        folder. An existing file is replaced at the end.
     fps : float
         Frames per second.
     slowdown : float
         How many times slower than the recording the film is.
     experiment : str, optional
-        Name of the experiment; the first by default.
+        Name of the experiment; the first with a trajectory by default.
     progress : callable, optional
         Called with the share of frames written, from 0 to 1.
 
@@ -107,7 +107,7 @@ def animate(
     ------
     InputError
         If `run` is not a run folder or has no such experiment, for another kind of file, if ffmpeg
-        is missing, and for numbers out of range.
+        is missing, for numbers out of range, and if the film would have too many frames.
     """
     for name, value in (("--fps", fps), ("--slow", slowdown)):
         if not 0 < value < np.inf:
@@ -587,7 +587,9 @@ def _with_even_pixels(height_mm: float) -> float:
 
 
 def _frame_writer(fps: float, ffmpeg: str | None) -> AbstractMovieWriter:
-    """Return the writer of frames: for GIF if `ffmpeg` is None, else for H.264 by that program."""
+    """Return the writer of frames: for GIF if `ffmpeg` is None, else for H.264 by that program;
+    `fps` is the number of frames per second.
+    """
     if ffmpeg is None:
         return PillowWriter(fps=fps)  # type: ignore[arg-type]
     # What every browser plays.

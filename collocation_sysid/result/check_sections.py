@@ -219,15 +219,18 @@ def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
 
 
 def _air_description(density_kg_m3: float) -> str:
-    """Return how the model contains the surrounding air, of a density of zero in a vacuum."""
+    """Return how the model contains the surrounding air of a density [kg/m³], in words; zero stands
+    for a vacuum.
+    """
     if not density_kg_m3:
         return "none (as in a vacuum)"
     return f"{density_kg_m3:.4g} kg/m³ (buoyancy, added mass and drag)"
 
 
 def _marker_summary(recording: RecordingCheck) -> str:
-    """Return how many markers a recording has, how many samples are missing, the farthest marker,
-    and the other instruments, in words; without markers the instruments alone.
+    """Return how many markers a recording has, how many samples are missing, the marker farthest
+    from the body with its distance [mm], and the other instruments, in words; without markers the
+    instruments alone.
     """
     if not recording.markers:
         besides = "" if recording.test else ", no markers"

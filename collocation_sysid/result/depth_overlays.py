@@ -81,14 +81,16 @@ class DepthProjection:
     def image_points(self, camera_m: Array, world_m: Array) -> Array:
         """Return image coordinates u, v [pixels] and depth [m] of points, as (P, 3).
 
-        For a point cloud, u and v are millimetres in the parallel view.
+        For a point cloud, u and v are millimetres to the right and downwards in the parallel view,
+        and the depth is measured from the origin of the world away from the viewer; it may be
+        negative.
 
         Parameters
         ----------
         camera_m : (P, 3)
-            Points in the camera's frame.
+            Points in the camera's frame [m].
         world_m : (P, 3)
-            The same points in the world.
+            The same points in the world [m].
         """
         camera = self.view.depth.camera
         if camera.matrix is not None:
@@ -113,7 +115,7 @@ class DepthProjection:
         Parameters
         ----------
         shape_m : (n, 3)
-            Node positions.
+            Node positions [m].
         sample : int
             Index of the camera's sample, which defines its pose.
         """
@@ -154,16 +156,23 @@ class DepthProjection:
         distances_m : (P,)
             Distance behind the surface; NaN for points that do not count.
         """
-        world = self.view.to_world(self.phi, points_m, rays, sample)
+        world = self.view.to_world(self.phi, points_m, rays=rays, image=sample)
         t_s = np.full(len(points_m), self.view.depth.sample_times_s[sample])
         return np.column_stack(
             [t_s, self.image_points(points_m, world), distances_m, world]
         )
 
     def outline_rows(self, sample: int, shape_m: Array) -> Array:
-        """Return rows (k, 8) of `MotionRecord.visible_points` with the outlines of a shape (n, 3).
+        """Return rows (k, 8) of `MotionRecord.visible_points` with the outlines of a shape.
 
         The last row has the time alone, so that the sample is known also if no face is in view.
+
+        Parameters
+        ----------
+        sample : int
+            Index of the camera's sample.
+        shape_m : (n, 3)
+            Node positions [m].
         """
         drawn = np.vstack(
             [self.outlines(shape_m, sample), np.full((1, 2), np.nan)]
@@ -187,8 +196,8 @@ def surface_rows(surface: SurfaceComparison, up: Array) -> Array:
     Returns
     -------
     (k, 8) array
-        Rows of `MotionRecord.visible_points`, with outlines for at most
-        `MAX_OUTLINED_SAMPLES` samples.
+        Rows of `MotionRecord.visible_points`, with outlines for at most `MAX_OUTLINED_SAMPLES`
+        samples; no rows if no point of any sample is compared.
     """
     correspondences = surface.correspondences
     shapes_m = surface.shapes_m

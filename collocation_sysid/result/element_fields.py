@@ -110,10 +110,10 @@ class ElementFields:
             evaluate(
                 [x],
                 constants,
-                sums,
-                body.threads,
-                k > 0,
-                body.point_data(k, self.theta),
+                out=sums,
+                threads=body.threads,
+                add=k > 0,
+                data_of_points=body.point_data(k, self.theta),
             )
         means = (
             sums.reshape(len(x), -1, len(FIELD_NAMES)) / self._volumes[:, None]

@@ -80,6 +80,15 @@ def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
     Point data are averaged over the corners of a triangle; of vectors the norm is taken. Contact
     pressure and gap come from `replay` and need no frames.
 
+    Parameters
+    ----------
+    run : str or Path
+        The run folder.
+    replay : MotionRecord
+        Experiment of this run.
+    field : str
+        Point or cell data of the frames, or one of `CONTACT_FIELDS`.
+
     Raises
     ------
     InputError
@@ -232,6 +241,11 @@ class _FrameWindow:
         The experiment, for markers, grasped nodes and obstacles.
     off_screen : bool
         Draw without a window.
+
+    Raises
+    ------
+    InputError
+        If the frames have no such field.
     """
 
     def __init__(
@@ -274,7 +288,9 @@ class _FrameWindow:
             )
 
     def _value_range(self) -> tuple[float, float]:
-        """Return the limits of the colour scale, the same for all frames."""
+        """Return the limits of the colour scale, the same for all frames: the smallest and the
+        largest value of the field; NaN is ignored.
+        """
         values = [self._field_values(mesh) for mesh in self.meshes]
         return min(float(np.nanmin(v)) for v in values), max(
             float(np.nanmax(v)) for v in values

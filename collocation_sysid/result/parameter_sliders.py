@@ -18,7 +18,7 @@ from ..common.array_types import Array
 from ..common.display import number
 from ..errors import InputError, SimulationError, require_among
 from ..features.registry import FEATURES
-from ..fem.laws.constants import is_field_coefficient, symbol_with_unit
+from ..fem.laws.constants import symbol_with_unit
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.transcription import Transcription
@@ -190,7 +190,14 @@ class ParameterSliders:
     def from_run(
         cls, run: SolvedProblem, experiment: str | None = None
     ) -> ParameterSliders:
-        """Return the sliders of a run, see `Run.interactive`.
+        """Return the sliders of a run, see `Run.interactive`; the first simulation is made at once.
+
+        Parameters
+        ----------
+        run : SolvedProblem
+            Run with at least one estimated parameter.
+        experiment : str, optional
+            Name of the recording; the first of the problem by default.
 
         Raises
         ------
@@ -202,11 +209,7 @@ class ParameterSliders:
         by_name = {each.name: each for each in run.problem.experiments}
         name = next(iter(by_name)) if experiment is None else experiment
         require_among(name, by_name)
-        names = [
-            each.name
-            for each in run.start_parameters.free
-            if not is_field_coefficient(each.name)
-        ]
+        names = [each.name for each in run.start_parameters.free_scalars]
         if not names:
             raise InputError(
                 "no parameter was estimated; expected a run with one that is not fixed, because "
@@ -247,7 +250,9 @@ class ParameterSliders:
         return self._parameters.with_guess(chosen).guesses
 
     def reset(self, _: object = None) -> None:
-        """Set all sliders to the estimates, and simulate once."""
+        """Set all sliders to the estimates, and simulate once; the argument, the button that was
+        clicked, is not used.
+        """
         self._is_resetting = True
         try:
             for name, slider in self.sliders.items():
@@ -279,15 +284,17 @@ class ParameterSliders:
         self.picture.value = _png(self._figure(self.simulation))
 
     def _on_change(self, _: Mapping[str, Any]) -> None:
-        """Simulate again, unless all sliders are being reset."""
+        """Simulate again, unless all sliders are being reset; the argument, the change of a slider,
+        is not used.
+        """
         if not self._is_resetting:
             self.update()
 
     def _misfit_text(self, simulation: ForwardSimulation) -> str:
         """Return the RMS differences from the measurements in words, separated by semicolons.
 
-        They are of markers [mm], also the largest, and of all features; without any measurement the
-        text says so.
+        They are of markers [mm], also the largest, and of all features, those of custom sensors
+        without their unit; without any measurement the text says so.
         """
         texts = []
         if len(self._experiment.markers.names):
@@ -350,8 +357,16 @@ class ParameterSliders:
 
 
 def _slider(widgets: Any, name: str, values: SliderRange) -> Any:
-    """Return the slider of a parameter for a range, which reports its value when it is released;
-    `widgets` is the module ipywidgets.
+    """Return the slider of a parameter, which reports its value when it is released.
+
+    Parameters
+    ----------
+    widgets : module
+        The module ipywidgets.
+    name : str
+        Name of the parameter, for the label.
+    values : SliderRange
+        First value, ends and scale.
     """
     common = {
         "description": symbol_with_unit(name),

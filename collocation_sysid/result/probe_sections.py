@@ -89,7 +89,9 @@ def probe_lines(result: Result) -> list[str | Table]:
 
 
 def _size_and_gain(probe: Probe) -> str:
-    """Return the size of a relaxed assumption and the reduction of χ² by it, in words."""
+    """Return the size of a relaxed assumption with its standard error, and the reduction of χ² by
+    it, in words; a size or error that is None counts as zero.
+    """
     size = short(probe.size or 0.0)
     error = short(probe.size_error or 0.0)
     return f"{source_label(probe.name)} ({size} ± {error}, −Δχ² {probe.chi_squared:.1f})"
@@ -129,8 +131,8 @@ def _shown_estimates(result: Result) -> list[str]:
 
 
 def _change_with_ratios(move: EstimateChange | None, value: float) -> str:
-    """Return the change of an estimate with its ratios to the half widths of both intervals; "–"
-    for None.
+    """Return the change of an estimate with its ratios to the half widths of the statistical and of
+    the combined interval, of which unknown ones are left out; "–" for None.
 
     Parameters
     ----------

@@ -143,9 +143,23 @@ def write_pictures(
     say: Callable[[str], None],
 ) -> None:
     """Draw all pictures of a run, including the Jacobian's structure, and write them into its
-    folder.
+    folder; existing ones are replaced.
 
-    `say` is called with a sentence about what is being drawn.
+    Parameters
+    ----------
+    finished : SolvedProblem
+        The solved problem.
+    result : Result
+        Content of its ``result.json``.
+    folder : Path
+        The run folder.
+    say : callable
+        Called with a sentence about what is being drawn.
+
+    Raises
+    ------
+    InputError
+        If a picture cannot be written.
     """
     say("drawing the pictures")
     # matplotlib takes a while to import, and nothing else needs it.
@@ -178,9 +192,10 @@ def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
 
 
 def write_all_frames(finished: SolvedProblem, place: Path) -> None:
-    """Write the ParaView frames of every fitted experiment into the folder `place`.
+    """Write the ParaView frames of every fitted experiment into the folder `place`, which must
+    exist.
 
-    With several fitted experiments each has a subfolder of its name.
+    With several fitted experiments each has a subfolder of its name, which is made if missing.
     """
     for part in finished.solution.parts:
         segment = part.segment

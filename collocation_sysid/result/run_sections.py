@@ -39,6 +39,7 @@ from ..runs.result_content import Elapsed, Result
 from ..statistics.assessment import Assessment
 from ..statistics.budget.uncertainty_budget import main_sources, source_label
 from ..statistics.concerns import Concern, topics_of
+from ..statistics.remedies import remedy_for
 from .probe_sections import (
     DEEPER_CHECK_ADVICE,
     STIFFNESS_NAMES,
@@ -63,6 +64,8 @@ SHOWN_DIAGNOSES = 2
 SHOWN_BUDGETS = 3
 # Sources named for each of these estimates.
 SHOWN_SOURCES = 3
+# Sources whose remedy is named where they are the largest: one statement removes them.
+SHOWN_REMEDIES = ("platen_slip",)
 # Smallest share of a variance that is shown.
 SMALLEST_SHOWN_SHARE = 0.01
 # Ratio of combined to statistical standard uncertainty beyond which the sources are named.
@@ -349,7 +352,8 @@ def _largest_contributions(result: Result) -> list[str]:
     systematic, that is whose combined standard uncertainty exceeds `SYSTEMATIC_RATIO` times the
     statistical one.
 
-    There is one sentence for each of at most `SHOWN_BUDGETS` estimates, the most systematic first.
+    There is one sentence for each of at most `SHOWN_BUDGETS` estimates, the most systematic first,
+    then the remedies of the largest contributions that the user may remove by a statement.
     """
     ratios = {
         name: each.combined_std_error / each.statistical_std_error
@@ -364,10 +368,14 @@ def _largest_contributions(result: Result) -> list[str]:
         if ratio > SYSTEMATIC_RATIO
     }
     sentences = []
+    remedies = []
     for name in sorted(systematic, key=lambda name: -systematic[name])[
         :SHOWN_BUDGETS
     ]:
         shares = list(result.budget[name].items())[:SHOWN_SOURCES]
+        largest = shares[0][0]
+        if largest in SHOWN_REMEDIES and largest not in remedies:
+            remedies.append(largest)
         sources = ", ".join(
             f"{source_label(s)} {share:.0%}"
             for s, share in shares
@@ -376,7 +384,10 @@ def _largest_contributions(result: Result) -> list[str]:
         sentences.append(
             f"largest contributions to the combined uncertainty of {symbol_of(name)}: {sources}"
         )
-    return sentences
+    return sentences + [
+        f"to reduce the contribution of {source_label(source)}: {remedy_for(source)}"
+        for source in remedies
+    ]
 
 
 def budget_table(result: Result) -> Table:

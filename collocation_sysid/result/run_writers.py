@@ -162,17 +162,19 @@ def write_frames(
     fields: ElementFields | None = None,
     cell_data: Mapping[str, ArrayLike] | None = None,
 ) -> Path:
-    """Write a trajectory as frames/frame_0000.vtu, … and trajectory.pvd, and return the latter.
+    """Write a trajectory as frames/frame_0000.vtu, … and trajectory.pvd, and return the latter;
+    existing files of these names are replaced.
 
-    Every frame has `displacement_m` and `velocity_m_s` at the points, and the `fields` in the
-    cells. Of more than `max_frames` samples every second, third, … is written.
+    Every frame has `displacement_m` and `velocity_m_s` (finite differences; zero if there is only
+    one sample) at the points, and the `fields` in the cells. Of more than `max_frames` samples
+    every second, third, … is written.
 
     Parameters
     ----------
     folder : str or Path
         An existing folder.
     t_s : (T,)
-        Evenly spaced times.
+        Evenly spaced times [s].
     positions_m : (T, n, 3)
         Positions of the nodes.
     cells : (E, nodes per element)
@@ -189,6 +191,11 @@ def write_frames(
         Stress, energy density and det F of each element.
     cell_data : mapping of name to (E,), optional
         Further data of the cells, the same in every frame.
+
+    Raises
+    ------
+    InputError
+        For point or cell data of another length.
     """
     times = np.asarray(t_s, dtype=float)
     positions = np.asarray(positions_m, dtype=float)

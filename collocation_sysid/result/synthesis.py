@@ -167,7 +167,7 @@ def write_data(
         simulate(
             experiment,
             problem.parameters,
-            recipe.integrator,
+            integrator=recipe.integrator,
             timestep_s=recipe.timestep_s,
             # The grid of the problem is that of schemes; Newmark's step is stated in the recipe.
             substeps="auto"
@@ -348,13 +348,15 @@ def _write_specimen(
 
 
 def _wrench_layouts(section: ExperimentSection | None) -> list[WrenchSection]:
-    """Return the table layout of each force sensor in order; empty without a problem file."""
+    """Return the table layout of each force sensor, those of grasps before those of obstacles;
+    empty if `section` is None, for a problem without a file.
+    """
     moved = section.moved_sections if section is not None else []
     return [each.wrench for each in moved if each.wrench is not None]
 
 
 def _require_guesses(problem: Problem) -> None:
-    """Raise an InputError if a parameter has no guess."""
+    """Raise an `InputError`, naming the parameter and the remedy, if a parameter has no guess."""
     if names := problem.parameters.names_without_guess:
         key = f"parameters.{names[0]}"
         raise InputError(
@@ -473,7 +475,9 @@ def _table_names(
 
 
 def _numbered_key(kind: str, index: int) -> str:
-    """Return the key of a file of the grasp with this index, counted from 0: poses, poses_2, …"""
+    """Return the key of a file of a kind, such as "poses", for the grasp with this index from 0:
+    poses, poses_2, …
+    """
     return f"{kind}_{index + 1}" if index else kind
 
 

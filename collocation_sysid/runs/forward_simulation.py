@@ -89,10 +89,15 @@ def simulate_experiments(
     problem: Problem, solution: Solution
 ) -> dict[str, ForwardSimulation | str]:
     """Simulate all experiments of a problem, also those for validation, in parallel threads with
-    the estimates of a solution.
+    the estimates of a solution, and return the results by experiment name; text is the reason why a
+    simulation failed, see `simulate_experiment`.
 
-    Return the results by experiment name, see `simulate_experiment`. The progress is reported to
-    the counters of `counted_phase`.
+    The progress is reported to the counters of `counted_phase`.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If the fit of the nuisance parameters of a validation experiment is interrupted.
     """
     threads = solution.collocation.threads
 
@@ -257,7 +262,7 @@ def _simulate(
     return simulate(
         with_contact_energy(segment.corrected_experiment(phi)),
         segment.body.theta_from_values(parameters),
-        integrator,
+        integrator=integrator,
         timestep_s=_step_s(problem, segment),
         substeps=segment.substeps,
         progress=report,

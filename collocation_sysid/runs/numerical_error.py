@@ -32,7 +32,9 @@ TOLERANCE = 1e-6
 
 
 def finer_step(problem: Problem) -> Problem:
-    """Return the problem with half the time step."""
+    """Return a copy of the problem with half the time step, that is twice the substeps of its first
+    solve.
+    """
     return replace(problem, substeps=2 * problem.first_substeps)
 
 
@@ -67,15 +69,22 @@ def refine(
     levels: int = 2,
     report_progress: Callable[[str], None] | None = None,
 ) -> A:
-    """Return a converged run with its numerical error; nothing else of the run is changed or
-    computed again.
+    """Return a copy of a converged run with its numerical error; nothing else of the run is changed
+    or computed again.
 
     Parameters
     ----------
     run : SolvedProblem
-        Run that has converged.
-    levels, report_progress
-        See `solve_refined`, which also lists the errors that are raised.
+        Run that has converged; not modified.
+    levels : int
+        Number of discretisations of each kind, see `solve_refined`.
+    report_progress : callable, optional
+        Called with a progress message before each solve.
+
+    Raises
+    ------
+    InputError, KeyboardInterrupt
+        As in `solve_refined`.
     """
     answer = WarmStart.of(run.solution)
     problem = replace(run.problem, substeps=run.solution.collocation.substeps)
@@ -101,7 +110,8 @@ def solve_refined(
     solved_levels: Sequence[RefinementLevel] = (),
     save_progress: Callable[[Refinement], object] | None = None,
 ) -> Refinement:
-    """Solve again at finer discretisations, each from the previous solution.
+    """Solve again at finer discretisations, each from the previous solution, and return the
+    numerical errors of the estimates with the solved levels.
 
     The step and the mesh are refined separately: their errors add up to first order. Finer problems
     are solved by the reduced space, whatever method found the answer.
@@ -120,11 +130,12 @@ def solve_refined(
         Number of discretisations of each kind, that of `solution` included: 2, or 3 to observe the
         orders of convergence.
     report_progress : callable, optional
-        Called with a progress message.
+        Called with a progress message before each solve.
     solved_levels : sequence of RefinementLevel
-        Levels that were solved before.
+        Levels that were solved before, which are used instead of being solved again.
     save_progress : callable, optional
-        Called after each level with the refinement so far.
+        Called with the refinement so far after each level that is solved, but not after those of
+        `solved_levels`.
 
     Raises
     ------
@@ -203,12 +214,13 @@ def _errors_from_levels(
 def _solve_refined_problem(
     problem: Problem, start: WarmStart, what: str
 ) -> Solution:
-    """Solve a finer problem in reduced space from an earlier answer.
+    """Return the solution of a finer problem in reduced space, starting from an earlier answer.
 
     Raises
     ------
     InputError
-        If it is not solved; `what` names the problem in the message.
+        If the problem is refused or the search does not converge; then `what` names the problem in
+        the message.
     KeyboardInterrupt
         If the solve is interrupted.
     """

@@ -52,7 +52,15 @@ def instrument_misfits(
     """Return the RMS of (prediction − measurement) / σ of each instrument, with the stated σ, in
     the order of `FEATURES`.
 
-    The prediction must be at the samples of the experiment.
+    A kind without measurements is left out; values that are NaN, measured or predicted, do not
+    count.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Recording with the measurements.
+    predicted : InstrumentPrediction
+        Prediction at the same samples and for the same instruments, in the same order.
     """
     return [
         misfit

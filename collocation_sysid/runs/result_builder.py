@@ -23,7 +23,7 @@ from ..features.measurement_results import (
     SimulatedExperiment,
 )
 from ..features.registry import merged_fields
-from ..fem.laws.constants import GAMMA_R, is_field_coefficient
+from ..fem.laws.constants import GAMMA_R
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
@@ -50,7 +50,9 @@ from .solved_problem import SolvedProblem
 
 
 def build_result(answer: SolvedProblem) -> Result:
-    """Return the content of ``result.json`` for an answer."""
+    """Return the content of ``result.json`` for an answer, which is not modified; properties of the
+    answer that are not known yet, such as the natural modes, are computed.
+    """
     solution = answer.solution
     problem = answer.problem
     collocation = solution.collocation
@@ -66,7 +68,7 @@ def build_result(answer: SolvedProblem) -> Result:
         title=problem.title,
         parameters={
             item.name: values[item.name]
-            for item in answer.start_parameters.items
+            for item in answer.start_parameters.components
         },
         derived={name: values[name] for name in answer.derived},
         basis=tuple(_reference_sentences(problem)),
@@ -159,9 +161,7 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
     if known is None:
         return None
     reported = [
-        k
-        for k, name in enumerate(known.names)
-        if not is_field_coefficient(name)
+        k for k, name in enumerate(known.names) if name in known.estimates
     ]
     return copy_fields(
         UncertaintyResult,
@@ -226,7 +226,8 @@ def _recordings_agreement(
     answer: SolvedProblem,
 ) -> dict[str, RecordingsAgreement] | None:
     """Return the estimates from single recordings, to first order, and their agreement, by
-    parameter, without coefficients of fields; None if this was not evaluated.
+    scalar parameter; None if this was not evaluated. Values are NaN for recordings that do not
+    determine the parameter.
     """
     if (
         answer.uncertainty is None
@@ -235,9 +236,9 @@ def _recordings_agreement(
         return None
     q = answer.solution.q
     agreements = {}
-    for k, item in enumerate(answer.solution.collocation.parameters.free):
-        if is_field_coefficient(item.name):
-            continue
+    parameters = answer.solution.collocation.parameters
+    for k in parameters.scalar_coordinates:
+        item = parameters.free[k]
         away = q[k] + scatter.differences[:, k]
         values = [
             item.from_coordinate(float(x)) if np.isfinite(x) else np.nan
@@ -327,7 +328,9 @@ def _forward_results(answer: SolvedProblem) -> ForwardResult:
 def _forward_result(
     answer: SolvedProblem, experiment: Experiment
 ) -> SimulatedExperiment:
-    """Return the errors of the forward simulation of an experiment, or the reason why it failed."""
+    """Return the errors of the forward simulation of an experiment; if it failed, only the reason
+    and whether the experiment was fitted.
+    """
     fitted = experiment.name in answer.solution.rms_by_experiment_m
     simulated = answer.rollouts[experiment.name]
     if not isinstance(simulated, ForwardSimulation):

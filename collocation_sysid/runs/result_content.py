@@ -12,7 +12,7 @@ from ..common.files import RESULT_FILE, damage_refused, read_json
 from ..common.serialisation import optional, read
 from ..errors import InputError
 from ..features.measurement_results import FitResult, ForwardResult
-from ..fem.laws.constants import is_field_coefficient, symbol_of, unit_of
+from ..fem.laws.constants import field_coefficient, symbol_of, unit_of
 from ..fem.spatial_field import FieldResolution
 from ..fem.two_phase import PhaseSummary
 from ..methods.solution import Iteration, Timing
@@ -187,6 +187,20 @@ class FieldResult:
     likelier: Mapping[str, float]
     phases: PhaseSummary | None = None
 
+    def coefficient_names(self, name: str) -> list[str]:
+        """Return the names of the coefficients of a smooth field; none for a two-phase one.
+
+        Parameters
+        ----------
+        name : str
+            Name of the constant that varies, with its region.
+        """
+        region, dot, _ = name.rpartition(".")
+        count = self.shapes.modes if self.phases is None else 0
+        return [
+            f"{region}{dot}{field_coefficient(k).name}" for k in range(count)
+        ]
+
     def sentence(self, name: str) -> str:
         """Return a one-line summary of the field; `name` is the name of its constant."""
         least, most = self.range
@@ -326,8 +340,10 @@ class ScanResult:
     ----------
     reason : str
         Why a scan was needed.
-    young_pa, misfit : (k,) arrays
-        Young's moduli and their misfits.
+    young_pa : (k,) array
+        Young's moduli, ascending.
+    misfit : (k,) array
+        Their misfits in standard deviations; NaN where the body could not be simulated.
     best : int
         Index of the chosen one.
     samples : int
@@ -553,12 +569,17 @@ class Result:
 
     @property
     def values(self) -> dict[str, ReportedEstimate]:
-        """Parameters, then derived moduli, by name, without the coefficients of fields."""
+        """Scalar parameters, then derived moduli, by name."""
+        coefficients = {
+            coefficient
+            for name, field in self.fields.items()
+            for coefficient in field.coefficient_names(name)
+        }
         both = {**self.parameters, **self.derived}
         return {
             name: each
             for name, each in both.items()
-            if not is_field_coefficient(name)
+            if name not in coefficients
         }
 
     @property

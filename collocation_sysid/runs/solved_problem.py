@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, hint_at
-from ..fem.laws.constants import is_field_coefficient, unit_of
+from ..fem.laws.constants import unit_of
 from ..methods.solution import Solution
 from ..model.parameters import Parameters
 from ..problem import Problem
@@ -104,9 +104,9 @@ class SolvedProblem:
 
     def __repr__(self) -> str:
         solution = self.solution
-        free = [item.name for item in self.problem.parameters.free]
         values = ", ".join(
-            f"{name} = {_estimate_text(self.estimates[name])}" for name in free
+            f"{item.name} = {_estimate_text(self.estimates[item.name])}"
+            for item in self.problem.parameters.free_scalars
         )
         rms = f"{1e3 * solution.rms_m:.3g} mm RMS"
         summary = (
@@ -129,7 +129,7 @@ class SolvedProblem:
 
     @cached_property
     def derived(self) -> dict[str, float]:
-        """Moduli that follow from the parameters at the optimum, by name."""
+        """Moduli that follow from the parameters at the optimum, by name, in SI units."""
         constants = (
             segment.constants
             for segment in self.solution.collocation.transcriptions
@@ -143,9 +143,12 @@ class SolvedProblem:
         """Parameters, also fixed ones, coefficients of fields and derived moduli with their
         combined and statistical intervals, by name.
         """
+        values = self.solution.parameters | self.derived
         return {
-            name: self._report_estimate(name, each)
-            for name, each in self.optimum.items()
+            name: self._report_estimate(
+                name, self.optimum.get(name, Estimate(value))
+            )
+            for name, value in values.items()
         }
 
     def _report_estimate(
@@ -159,18 +162,19 @@ class SolvedProblem:
         name : str
             Name of a parameter or derived modulus.
         optimum : Estimate
-            Its estimate at the optimum of the discretised problem.
+            Its estimate at the optimum of the discretised problem; of a coefficient of a field its
+            value alone.
         """
         item = next(
-            (each for each in self.start_parameters.items if each.name == name),
+            (
+                each
+                for each in self.start_parameters.components
+                if each.name == name
+            ),
             None,
         )
         line = self.budget.get(name)
-        error = (
-            None
-            if is_field_coefficient(name)
-            else self.discretisation_errors.get(name)
-        )
+        error = self.discretisation_errors.get(name)
         linear, bounds = self.start_parameters.scale_and_bounds(name)
         systematic = None if line is None else line.systematic
         known_effect = 0.0 if line is None else line.known_effect
@@ -219,17 +223,17 @@ class SolvedProblem:
 
     @cached_property
     def optimum(self) -> dict[str, Estimate]:
-        """Parameters, also fixed ones, and derived moduli at the optimum of the discretised
+        """Scalar parameters, also fixed ones, and derived moduli at the optimum of the discretised
         problem, by name.
 
         They have statistical intervals where `uncertainty` has; the others have a value alone.
         """
         bars = self.uncertainty
         known = {} if bars is None else {**bars.estimates, **bars.derived}
-        values = self.solution.parameters | self.derived
+        values = self.start_parameters.scalar_values(self.solution.q)
         return {
             name: known.get(name, Estimate(value))
-            for name, value in values.items()
+            for name, value in (values | self.derived).items()
         }
 
     @cached_property
@@ -293,14 +297,13 @@ class SolvedProblem:
 
     @property
     def _discretisation_corrections(self) -> dict[str, float]:
-        """Ratio of the reported value to the optimum of each estimated parameter, without fields,
-        by name; 1 if the optimum is zero.
+        """Ratio of the reported value to the optimum of each estimated scalar parameter, by name; 1
+        if the optimum is zero.
         """
         return {
             item.name: each.value / each.optimum if each.optimum else 1.0
-            for item in self.start_parameters.free
-            if not is_field_coefficient(item.name)
-            and (each := self.estimates[item.name])
+            for item in self.start_parameters.free_scalars
+            if (each := self.estimates[item.name])
         }
 
     @cached_property
@@ -450,8 +453,8 @@ def _or_nan(value: float | None) -> float:
 
 
 def _estimate_text(estimate: ReportedEstimate) -> str:
-    """Return an estimate as text: the value, " ± " and the standard uncertainty, and the combined
-    interval in brackets, each only if it is known.
+    """Return an estimate as text without its unit: the value, then " ± " and the combined standard
+    uncertainty, and the combined interval in brackets, these two only if they are known.
     """
     error = (
         ""

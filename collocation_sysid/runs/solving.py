@@ -125,7 +125,12 @@ def _solve_with_likeliest_lengths(
     Returns
     -------
     Solution
-        The last solution.
+        The last solution; its history and times are those of the last solve alone.
+
+    Raises
+    ------
+    InputError
+        As in `solve_once`, and for two-phase fields that cannot be searched.
     """
     if any(not modes.has_phases for modes in problem.two_phase_fields.values()):
         return solve_two_phases(problem, start, solve_once=solve_once)
@@ -263,7 +268,8 @@ def _solve_once(
 
 def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:
     """Return the reduced-space method with workers that solve its experiments, as a
-    `functools.partial` of it; any other method, and any without workers, is returned unchanged.
+    `functools.partial` of it; any other method, and any method if `workers` is None, is returned
+    unchanged.
     """
     if workers is None or not isinstance(solver, ReducedSpace):
         return solver
@@ -311,7 +317,7 @@ def best_of_second_start(
     a note if that is the second one.
 
     Without a second start the first solution is returned; after an interrupt it is returned as
-    interrupted.
+    interrupted. The history of the first search is not part of the second solution.
 
     Parameters
     ----------
@@ -349,12 +355,13 @@ def solve_with_renewed_correspondences(
 
     These are the elements of markers, the points of depth cameras, and the sample intervals of
     clocks. There are at most `MOST_REREADINGS` repetitions, and none after a solve that does not
-    converge.
+    converge. The last solution is returned, also if it has not converged; its history, counts and
+    times are those of the last solve alone.
 
     Parameters
     ----------
     solver : Method
-        Method to use.
+        Method to use, whose exceptions are not caught.
     collocation : Collocation
         Program with guesses; not modified.
     watch : callable or None

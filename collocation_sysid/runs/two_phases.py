@@ -304,8 +304,8 @@ def _two_phase_search(problem: Problem) -> _PhaseSearch:
 
 
 def _likelier_phases(probability: Array) -> Array:
-    """Return the likelier phase (E,) of every element, 1 for an inclusion and 0 otherwise, from the
-    probability (E,) of an inclusion.
+    """Return the likelier phase (E,) of every element, 1.0 for an inclusion and 0.0 otherwise, from
+    the probability (E,) of an inclusion.
 
     Each phase has at least `FEWEST_ELEMENTS` elements: if necessary, those that are nearest to it
     in probability are added.
@@ -407,7 +407,8 @@ def _samples(
     search: _PhaseSearch,
     solution: Solution,
 ) -> PhaseSamples:
-    """Return draws of the phases as samples of the logarithms in the elements.
+    """Return draws of the phases as samples of the logarithms in the elements of the part with the
+    field.
 
     Parameters
     ----------

@@ -149,7 +149,7 @@ class WarmStart:
         if not known:
             raise InputError(
                 f"found {', '.join(self.values)}; expected at least one of the parameters that are "
-                f"estimated, {', '.join(item.name for item in free)}",
+                f"estimated, {', '.join(i.name for i in problem.parameters.free_scalars)}",
                 self.folder / RESULT_FILE,
             )
         guesses = {

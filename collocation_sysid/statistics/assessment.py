@@ -233,7 +233,10 @@ def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
         if scatter is None
         else np.flatnonzero(scatter.is_disagreeing).tolist()
     )
-    names = [display_name(uncertainty.names[k]) for k in disagreeing]
+    names = [
+        display_name(name, is_scalar=name in uncertainty.estimates)
+        for name in (uncertainty.names[k] for k in disagreeing)
+    ]
     return concern_if(
         bool(names), False, code="residuals/recordings", names=names
     )

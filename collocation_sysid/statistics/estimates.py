@@ -17,16 +17,15 @@ from numpy.typing import NDArray
 
 from ..common.array_types import Array
 from ..fem.laws.constants import (
-    MODE,
+    FIELD_COEFFICIENT,
     SHARE,
     TAU,
     constant_named,
     is_damping,
-    is_field_coefficient,
     without_region,
 )
 from ..model.parameters import Parameter, Parameters
-from .linearised import DerivedModuli, LinearisedFit
+from .linearised import DerivedModuli
 from .residuals.autocorrelation import Dependence
 from .residuals.noise_level import Noise, NoiseLevel
 from .residuals.recording_scatter import RecordingComparison
@@ -148,8 +147,7 @@ def user_estimates(
     at_bound: Mask,
     quantiles: Array,
 ) -> dict[str, Estimate]:
-    """Return the estimates of the user's parameters by name, except the mode coefficients of
-    fields.
+    """Return the estimates of the scalar parameters by name.
 
     Parameters
     ----------
@@ -167,7 +165,7 @@ def user_estimates(
     Returns
     -------
     dict of str to Estimate
-        In the order of `Parameters.values`. Fixed parameters have their value alone; those tied to
+        In the order of `Parameters.scalars`. Fixed parameters have their value alone; those tied to
         another its estimate times the ratio. An estimate has an interval but no standard error if
         the interval covers the range between its bounds, spans more than `WIDE_FACTOR` (of
         Poisson's ratio `WIDE_POISSON`), or if the correlation with another parameter exceeds
@@ -178,20 +176,18 @@ def user_estimates(
     Infinite or NaN variances in `covariance_q` mean that the data do not determine the parameter.
     The argument arrays are not modified.
     """
-    values = parameters.values(q).items()
     estimates = {
         name: Estimate(value)
-        for name, value in values
-        if not is_field_coefficient(name)
+        for name, value in parameters.scalar_values(q).items()
     }
-    partners = np.abs(np.nan_to_num(correlation_from_covariance(covariance_q)))
+    partners = np.zeros_like(covariance_q)
+    scalars = list(parameters.scalar_coordinates)
+    partners[:, scalars] = np.abs(
+        np.nan_to_num(correlation_from_covariance(covariance_q))
+    )[:, scalars]
     np.fill_diagonal(partners, 0.0)
-    partners[
-        :, [is_field_coefficient(item.name) for item in parameters.free]
-    ] = 0.0
-    for k, item in enumerate(parameters.free):
-        if item.name not in estimates:
-            continue
+    for k in scalars:
+        item = parameters.free[k]
         value = item.from_coordinate(float(q[k]))
         if at_bound[k]:
             estimates[item.name] = _estimate_at_bound(value)
@@ -230,7 +226,7 @@ def user_estimates(
                 value, None, statistical95=estimate.statistical95, reason=reason
             )
         estimates[item.name] = estimate
-    for item in parameters.items:
+    for item in parameters.scalars:
         if item.tied is not None:
             estimates[item.name] = _scaled_estimate(
                 estimates[item.tied.to], item.tied.ratio
@@ -242,14 +238,20 @@ def relative_derivatives(parameters: Parameters, q: Array) -> Array:
     """Return the derivative (nq,) of each free parameter by its q, over the parameter's absolute
     value: 1 for a logarithmic scale; for coefficients of fields the derivative itself.
     """
-    slopes = []
-    for item, coordinate in zip(parameters.free, q, strict=True):
-        value = item.from_coordinate(float(coordinate))
-        size = (
-            1.0 if is_field_coefficient(item.name) else max(abs(value), 1e-300)
-        )
-        slopes.append(item.value_derivative(value) / size)
-    return np.array(slopes)
+    values = np.array(
+        [
+            item.from_coordinate(float(coordinate))
+            for item, coordinate in zip(parameters.free, q, strict=True)
+        ]
+    )
+    sizes = np.ones(len(q))
+    scalars = list(parameters.scalar_coordinates)
+    sizes[scalars] = np.maximum(np.abs(values[scalars]), 1e-300)
+    slopes = (
+        item.value_derivative(value)
+        for item, value in zip(parameters.free, values.tolist(), strict=True)
+    )
+    return np.fromiter(slopes, dtype=float, count=len(q)) / sizes
 
 
 def derived_estimates(
@@ -629,27 +631,27 @@ def correlation_notes(
 
 
 def disagreement_notes(
-    fit: LinearisedFit, scatter: RecordingComparison | None
+    parameters: Parameters, scatter: RecordingComparison | None
 ) -> list[str]:
     """Return one note for each parameter on which the recordings disagree; empty without a
     comparison (None).
     """
     if scatter is None:
         return []
+    names = [
+        display_name(item.name, is_scalar=k in parameters.scalar_coordinates)
+        for k, item in enumerate(parameters.free)
+    ]
     return [
-        f"the recordings disagree on {display_name(fit.names[k])} (χ² "
+        f"the recordings disagree on {names[k]} (χ² "
         f"{scatter.chi_squared[k]:.3g} for {scatter.degrees_of_freedom[k]} degrees of "
         "freedom): model errors exceed the noise, and its interval includes the disagreement"
         for k in np.flatnonzero(scatter.is_disagreeing).tolist()
     ]
 
 
-def display_name(name: str) -> str:
-    """Return the name of an estimated parameter for messages: itself, or for a mode coefficient a
-    phrase with the name of its kind and its own name.
+def display_name(name: str, *, is_scalar: bool) -> str:
+    """Return the name of an estimated parameter for messages: itself, or for a component of a vector
+    a phrase with the name of its kind and its own name.
     """
-    return (
-        f"the {MODE.name} (share {name})"
-        if is_field_coefficient(name)
-        else name
-    )
+    return name if is_scalar else f"the {FIELD_COEFFICIENT.name} (share {name})"

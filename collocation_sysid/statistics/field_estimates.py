@@ -112,8 +112,8 @@ class FieldEstimate:
         Half width of the 95 % intervals in standard deviations.
     coefficients : (m,) array
         Mode coefficients a.
-    covariance : (m, m) array
-        Their covariance.
+    covariance : (f, f) array
+        Covariance of those that are estimated; fixed and tied ones are left out.
     declared_density_kg_m3 : float or None
         Stated density that the deviation refers to [kg/m³]; None for other constants.
     sampled_intervals : (lower, upper) or None
@@ -221,7 +221,7 @@ class FieldEstimate:
         """Return ln Z(D) − ln Z(I) for another correlation length [m], or for the amplitude times a
         factor.
 
-        0 for two-phase fields, and where error bars exceed the prior.
+        0 for two-phase fields, where error bars exceed the prior, and where a coefficient is fixed.
 
         Parameters
         ----------
@@ -234,9 +234,13 @@ class FieldEstimate:
         -----
         Positive values favour the other prior. A length equal to the present one counts as None.
         """
-        if self.phases is not None or self._is_wider_than_prior:
-            return 0.0
         size = len(self.coefficients)
+        if (
+            self.phases is not None
+            or len(self.covariance) < size
+            or self._is_wider_than_prior
+        ):
+            return 0.0
         prior = factor**2 * np.eye(size)
         if length_m is not None and length_m != self.modes.length_m:
             other = np.linalg.lstsq(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..common.array_types import Array
 from ..errors import listed
-from ..fem.laws.constants import is_field_coefficient, without_region
+from ..fem.laws.constants import without_region
 from ..fem.laws.moduli import ELASTIC
 from .estimates import CONFOUNDED, Estimate
 from .uncertainty import Uncertainty
@@ -90,14 +90,17 @@ def _combination_sentences(uncertainty: Uncertainty) -> list[str]:
     """Return sentences about confounded parameters, one for each eigenvector of their correlations
     with an eigenvalue up to 1 − `CONFOUNDED`.
 
-    Mode coefficients and parameters without a finite, positive variance are left out, and
+    Coefficients of fields and parameters without a finite, positive variance are left out, and
     combinations of three or more parameters that are all well determined.
     """
     deviations = np.sqrt(np.diag(uncertainty.covariance))
-    modes = np.array(
-        [is_field_coefficient(name) for name in uncertainty.names], dtype=bool
+    is_scalar = np.array(
+        [name in uncertainty.estimates for name in uncertainty.names],
+        dtype=bool,
     )
-    known = np.flatnonzero(np.isfinite(deviations) & (deviations > 0) & ~modes)
+    known = np.flatnonzero(
+        np.isfinite(deviations) & (deviations > 0) & is_scalar
+    )
     if len(known) < 2:
         return []
     correlation = uncertainty.correlation[np.ix_(known, known)]

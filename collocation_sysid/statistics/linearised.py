@@ -30,7 +30,7 @@ from ..program.collocation import Collocation, ExperimentIterate
 from ..program.least_squares import SquareRootInformation
 from ..program.linear_algebra.lapack import one_blas_thread
 from ..program.measurement_residual import huber_as_weights
-from ..program.observation import ObservableResponse
+from ..program.observable_response import ObservableResponse
 from ..program.sweep import Sweep
 from ..program.wrench.reaction_forces import GraspForces
 
@@ -96,7 +96,7 @@ def observable_responses(
         rows = Sweep(segment).sensitivities(
             iterate.x, iterate.equations, grasp_forces=grasp_forces
         )
-        return iterate.observation.response_of_rows(rows, grasp_forces)
+        return ObservableResponse.from_rows(iterate, rows, grasp_forces)
 
     return map_experiments(
         of, collocation.iterates(z), threads=collocation.threads
@@ -411,17 +411,13 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     """
     p = collocation.parameters_from(z)
     blocks = []
-    for part, response in zip(
-        collocation.iterates(z),
-        observable_responses(collocation, z),
-        strict=True,
-    ):
-        segment = part.segment
-        experiment = part.segment.experiment
+    for response in observable_responses(collocation, z):
+        segment = response.iterate.segment
+        experiment = segment.experiment
         relaxed = segment.body.has_memory and bool(
             np.isinf(experiment.loaded_since_s)
         )
-        linearised = part.observation.linearise(part.x, response)
+        linearised = response.linearise()
         for reading, (misfit, by_own) in zip(
             segment.residuals, linearised, strict=True
         ):

@@ -34,6 +34,9 @@ REMEDIES: Mapping[str, str] = {
     "machine_compliance_m_n": "press the platens against each other without a specimen and state "
     "the slope of displacement over force",
     "platen_friction": "lubricate the platens, or glue the specimen to them",
+    "platen_slip": "measure the bulge, by markers on the side or depth images; or state "
+    'platen_slip = "none" in [uncertainty.assumptions] if the faces are glued, or axes = "z" if '
+    "they slide",
     "contact_stiffness": "refine the mesh at the contact, or state a larger stiffness_pa_m and a "
     "smaller width_m of the obstacle",
     "buoyancy": "state the density of the air",

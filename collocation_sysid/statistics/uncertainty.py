@@ -151,7 +151,7 @@ class Uncertainty(ErrorBasis):
         Half widths of the 95 % intervals in standard deviations: 1.96, or Student's for an
         estimated variance.
     estimates : mapping of str to Estimate
-        All parameters of the user by name, except the mode coefficients of fields.
+        All scalar parameters by name.
     derived : mapping of str to Estimate
         Moduli of the other convention by name.
     nuisance : mapping of str to float
@@ -311,7 +311,7 @@ def uncertainty_from_fit(
             *correlation_notes(
                 error_model.errors, basis.errors, dependence=basis.dependence
             ),
-            *disagreement_notes(fit, scatter),
+            *disagreement_notes(parameters, scatter),
         ),
         scatter=scatter,
         widening=widened.factors,

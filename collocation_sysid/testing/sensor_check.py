@@ -294,7 +294,9 @@ def _check_prediction(
     (iterate,) = collocation.iterates_at(p, [x])
     (residual,) = transcription.custom_sensors
     found = residual.without_padding(
-        residual.predict_motion(iterate.motion, iterate.phi)
+        residual.predict_motion(
+            iterate.motion_for(residual.observable), iterate.phi
+        )
     )
     unknowns = iterate.phi * np.array(
         [*expression.sensor.unknowns.values()], dtype=float

@@ -120,7 +120,7 @@ def test_frames_one_by_one_say_what_the_batch_says(
     point = horizon.evaluate(
         p,
         [
-            each.x + each.tangent.step
+            each.x + each.step
             for each in horizon.evaluate(p, reached).trajectories
         ],
     )
@@ -748,7 +748,7 @@ def test_readings_of_ones_own_say_what_they_say_to_the_batch(monkeypatch):
     reached, _ = horizon.simulate(p)
     point = horizon.evaluate(p, reached)
     point = horizon.evaluate(
-        p, [each.x + each.tangent.step for each in point.trajectories]
+        p, [each.x + each.step for each in point.trajectories]
     )
     flat = live.model.transformed(p)
     rows = np.column_stack(

@@ -112,7 +112,7 @@ def test_load_cells_say_what_they_say_to_the_batch(
     )
     point = horizon.evaluate(p, horizon.simulate(p)[0])
     point = horizon.evaluate(
-        p, [each.x + each.tangent.step for each in point.trajectories]
+        p, [each.x + each.step for each in point.trajectories]
     )
     flat = live.model.transformed(p)
     rows = np.column_stack(

@@ -173,7 +173,7 @@ def load_n(experiment: Experiment) -> np.ndarray:
         collocation.transcriptions[0].dynamics.with_theta(as_theta(TRUTH)),
     )
     (part,) = collocation.iterates_at(np.zeros(0), [x])
-    return part.observation.predict_wrenches(x)[0][:, 2]
+    return part.predict_wrenches()[0][:, 2]
 
 
 @pytest.mark.long

@@ -93,7 +93,7 @@ def sensed(
         experiment, segment.dynamics.with_theta(as_theta(truth))
     )
     (part,) = collocation.iterates_at(np.zeros(collocation.nphi), [x])
-    return with_wrenches(made, part.observation.predict_wrenches(x))
+    return with_wrenches(made, part.predict_wrenches())
 
 
 def wristed_cube(

@@ -29,7 +29,7 @@ from collocation_sysid.program import sweep
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.stopwatch import Stopwatch
-from collocation_sysid.program.sweep import Sweep, Tangent
+from collocation_sysid.program.sweep import Sweep, SweepResult
 
 EXPERIMENTS = SMALL_EXPERIMENTS | {"bar-loaded": bar_loaded}
 LAYOUTS = {
@@ -76,7 +76,7 @@ def only_setting(collocation: Collocation) -> EquationsAtParameters:
 
 def forward(
     collocation: Collocation, positions: list[np.ndarray]
-) -> list[Tangent]:
+) -> list[SweepResult]:
     parts = collocation.iterates_at(some_parameters(collocation), positions)
     return [
         Sweep(part.segment).forward(part.x, part.equations) for part in parts

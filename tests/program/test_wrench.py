@@ -51,7 +51,7 @@ def at_truth(
 def total_on_grid(part: ExperimentIterate) -> tuple[np.ndarray, np.ndarray]:
     """Grid times and the wrenches (n, 6) of all grasps together."""
     forced, channels = (
-        part.motion.reactions,
+        part.reactions,
         [s.observable for s in part.segment.sensors],
     )
     return channels[0].known_rows, np.sum(
@@ -201,9 +201,9 @@ def test_samples_between_grid_times_are_read_to_the_third_order():
         slow = replace(cube, t_s=t_s, markers=replace(cube.markers, t_s=t_s))
         fine = np.linspace(0.03, 0.13, 87)
         part = at_truth(sensing(slow, fine))
-        (read,) = part.observation.predict_wrenches(part.x)
+        (read,) = part.predict_wrenches()
         dense = at_truth(sensing(slow, fine), substeps=8 // refinement)
-        (expected,) = dense.observation.predict_wrenches(dense.x)
+        (expected,) = dense.predict_wrenches()
         errors.append(relative_error(read[:, :3], expected[:, :3]))
     assert errors[1] < 0.4 * errors[0]
 
@@ -282,7 +282,7 @@ def test_a_frame_that_is_carried_along_is_off_as_the_poses_are(rng):
         rng.normal(size=(rows, dofs)), rng.normal(size=(rows, dofs))
     )
     motion, phi = (
-        ObservedMotion(np.zeros((rows, segment.dof_count)), lambda: forced),
+        ObservedMotion(np.zeros((rows, segment.dof_count)), forced),
         np.zeros(0),
     )
     shift, turn = rng.normal(size=(2, 3))

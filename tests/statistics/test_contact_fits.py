@@ -86,6 +86,9 @@ def test_stiffness_is_found_though_nobody_knows_where_the_surface_begins(
     low, high = finished.result.parameters["young_pa"].statistical95
     assert low < TRUTH["young_pa"] < high
     assert high - low < 0.1 * TRUTH["young_pa"]
+    lowest, highest = finished.estimates["young_pa"].combined95
+    assert lowest < TRUTH["young_pa"] < highest
+    assert highest - lowest < 0.5 * TRUTH["young_pa"]
     part = finished.solution.collocation.iterates(finished.solution.z)[0]
     place_m = float((part.phi * part.segment.nuisance.scales)[0])
     assert place_m == pytest.approx(-off_m, abs=1e-4)

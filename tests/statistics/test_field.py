@@ -502,6 +502,64 @@ def test_a_field_of_nothing_is_refused():
         bar(cs.Field(0.05), np.ones(144, dtype=bool))
 
 
+def test_a_field_is_one_parameter_with_a_slice_of_the_coordinates():
+    known = problem(modes=4)
+    parameters = known.parameters
+    assert len(parameters.items) == len(KNOWN) + 2
+    (field,) = parameters.fields
+    assert field.name == "field"
+    assert [each.name for each in field.components] == [
+        "field_1",
+        "field_2",
+        "field_3",
+        "field_4",
+    ]
+    assert {each.prior for each in field.components} == {(0.0, 1.0)}
+    assert [each.name for each in parameters.free_scalars] == ["young_pa"]
+    assert parameters.scalar_coordinates == (0,)
+    assert len(parameters.free) == 5
+    q = np.linspace(0.1, 0.5, 5)
+    assert parameters.scalar_values(q) == KNOWN | {"young_pa": np.exp(0.1)}
+    assert parameters.values(q)["field_4"] == 0.5
+    without = parameters.without({"field_2", "poisson"})
+    assert [each.name for each in without.fields[0].components] == [
+        "field_1",
+        "field_3",
+        "field_4",
+    ]
+    assert parameters.without(body_coefficients(known)).fields == ()
+
+
+def body_coefficients(known: cs.Problem) -> tuple[str, ...]:
+    (body,) = known.bodies
+    return body.field_coefficient_names
+
+
+def test_a_scalar_is_not_tied_to_a_component_of_a_field():
+    (seen,) = problem(modes=4).experiments
+    tied = {**KNOWN, "field_1": cs.Unknown(0.1)}
+    tied["young_pa"] = cs.Tied("field_1", 2.0)
+    with pytest.raises(
+        cs.InputError, match="young_pa: tied to 'field_1', expected a parameter"
+    ):
+        cs.Problem([seen], tied)
+
+
+def test_a_stated_coefficient_keeps_its_value_and_has_no_error_bar():
+    (seen,) = problem(2.0, modes=4).experiments
+    values = {**KNOWN, "field_2": 0.3, "young_pa": cs.Unknown(3e3)}
+    run = cs.run(cs.Problem([seen], values, substeps=1), seek_causes=False)
+    assert run.solution.status.converged
+    assert run.estimates["field_2"].value == 0.3
+    assert run.estimates["field_2"].fixed
+    field = run.fields["young_pa"]
+    assert field.coefficients[1] == 0.3
+    assert field.covariance.shape == (3, 3)
+    assert (np.diag(field.covariance) > 0).all()
+    assert field.log_evidence_ratio(factor=2.0) == 0.0
+    assert "field_" not in repr(run)
+
+
 def test_the_likeliest_of_several_lengths_is_taken():
     several = replace(problem(2.0), experiments=[_of_lengths(0.005, 0.05)])
     run = cs.run(several, seek_causes=False)
@@ -649,6 +707,12 @@ def test_a_file_states_fields_of_the_body_and_of_a_region(tiny: Path):
     assert sorted((share.guess, share.prior) for share in shares) == [
         (0.0, (0.0, 1.0))
     ] * 2 + [(0.4, (0.0, 1.0))]
+    assert [item.name for item in read.parameters.fields] == [
+        "field",
+        "core.field",
+    ]
+    (field,) = known.parameters.fields
+    assert [share.guess for share in field.components] == [0.0, 0.4, 0.0]
     wrong = "object.region.core.field.parameter=E"
     with pytest.raises(
         cs.InputError,

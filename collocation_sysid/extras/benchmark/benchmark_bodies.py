@@ -174,7 +174,8 @@ BODIES = {
 
 
 def chosen_bodies(name: str | None) -> tuple[BenchmarkBody, ...]:
-    """Return the body of this name, or all bodies whose data are on this computer.
+    """Return the body called `name`, also if its data are missing, or for None all bodies whose
+    data are on this computer, perhaps none.
 
     Raises
     ------

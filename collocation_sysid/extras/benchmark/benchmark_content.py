@@ -76,11 +76,17 @@ class BenchmarkContent:
             for body in bodies
             for recording in _read_recordings(folder, body)
         )
-        return cls(folder, bodies, recordings)
+        return cls(folder, bodies, recordings=recordings)
 
 
 def _unchanged(folder: Path, name: str) -> Path:
-    """Return a file of a benchmark folder; refuse it if it exists and was changed since."""
+    """Return the file called `name` in a benchmark folder; a file that does not exist is accepted.
+
+    Raises
+    ------
+    InputError
+        If the file exists and was changed since it was written.
+    """
     file = folder / name
     if file.exists() and not is_written_here(file, folder):
         raise InputError(
@@ -91,7 +97,13 @@ def _unchanged(folder: Path, name: str) -> Path:
 
 
 def _read_recordings(folder: Path, body: str) -> list[StoredRecording]:
-    """Return the recordings of a body of a benchmark folder."""
+    """Return the recordings of the body called `body` from a benchmark folder.
+
+    Raises
+    ------
+    InputError
+        If the folder of the body is missing or damaged, or one of its files was changed.
+    """
     file = _unchanged(folder, f"{body}/{BODY_FILE}")
     content = read_json(file, "the folder of a body of a benchmark")
     with damage_refused(file.parent, BODY_FILE, REMEDY):
@@ -109,7 +121,24 @@ def _read_recordings(folder: Path, body: str) -> list[StoredRecording]:
 def _read_signals(
     folder: Path, body: str, recording: Mapping[str, Any]
 ) -> RecordingSignals:
-    """Return the measured and predicted signals of a recording of a body."""
+    """Return the measured and predicted signals of a recording of a body.
+
+    Parameters
+    ----------
+    folder : Path
+        Benchmark folder.
+    body : str
+        Name of the body.
+    recording : mapping
+        Entry of "recordings" in body.json.
+
+    Raises
+    ------
+    InputError
+        If a table is missing, cannot be read, or was changed.
+    KeyError, ValueError
+        If the entry lacks a key, or a table has other columns.
+    """
     tables = {}
     for role in ("measured", "simulated", "undeformed"):
         file = _unchanged(folder, f"{body}/{recording['files'][role]}")
@@ -124,13 +153,13 @@ def _read_signals(
     measured = Signal(
         recording["quantity"],
         recording["key"],
-        tables["measured"][:, 0],
-        tuple(recording["columns"]),
-        tables["measured"][:, 1:],
+        keys=tables["measured"][:, 0],
+        columns=tuple(recording["columns"]),
+        values=tables["measured"][:, 1:],
     )
     return RecordingSignals(
         measured,
         np.array(recording["sigma"], dtype=np.float64),
-        measured.with_values(tables["simulated"][:, 1:]),
-        measured.with_values(tables["undeformed"][:, 1:]),
+        simulated=measured.with_values(tables["simulated"][:, 1:]),
+        undeformed=measured.with_values(tables["undeformed"][:, 1:]),
     )

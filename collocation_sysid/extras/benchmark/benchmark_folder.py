@@ -67,9 +67,22 @@ class BodyTask:
     def simulated(
         cls, body: BenchmarkBody, progress: Callable[[float], None] | None
     ) -> BodyTask:
-        """Return the task of a body, with simulations of its recordings.
+        """Return the task of a body, with simulations of its recordings at the constants of the
+        catalogue.
 
-        `progress` is called with the completed share of each simulation, from 0 to 1.
+        Parameters
+        ----------
+        body : BenchmarkBody
+            Body whose data are on this computer.
+        progress : callable or None
+            Called with the completed share of each simulation, from 0 to 1.
+
+        Raises
+        ------
+        InputError
+            If the data of the body are missing, or a parameter has no value.
+        SimulationError
+            If a simulation fails.
         """
         problem = body.read_problem()
         entry = catalogue_entry(body.entry)
@@ -85,7 +98,7 @@ class BodyTask:
             signals[experiment.name] = RecordingSignals.from_trajectory(
                 experiment, trajectory
             )
-        return cls(body, entry, problem, values, signals)
+        return cls(body, entry, problem=problem, values=values, signals=signals)
 
     @property
     def experiments(self) -> list[Experiment]:
@@ -145,7 +158,9 @@ def write_benchmark(
 
 
 def _recordings(problem: Problem, body: BenchmarkBody) -> list[Experiment]:
-    """Return the experiments of a problem that the benchmark asks to predict."""
+    """Return the experiments of a problem that the benchmark asks to predict, in the order of the
+    problem.
+    """
     return [
         each for each in problem.experiments if each.name in body.recordings
     ]
@@ -163,7 +178,7 @@ def _parameter_values(
     """
     identified = {each.name: each.value for each in entry.constants}
     values = {}
-    for item in problem.parameters.items:
+    for item in problem.parameters.components:
         value = identified.get(item.name, item.guess if item.is_fixed else None)
         if value is None:
             raise InputError(
@@ -217,11 +232,16 @@ def _mesh(experiment: Experiment) -> TetMesh:
     """Return the mesh of a body; a cube for a material test without a mesh."""
     if experiment.specimen is None:
         return experiment.body.mesh
-    return box_mesh((CELL_SIZE_M,) * 3, CUBE_DIVISIONS, (0.0, 0.0, 0.0))
+    return box_mesh(
+        (CELL_SIZE_M,) * 3, CUBE_DIVISIONS, origin_m=(0.0, 0.0, 0.0)
+    )
 
 
 def _body_content(task: BodyTask) -> dict[str, Any]:
-    """Return what is written about a body as JSON, without its recordings."""
+    """Return what is written about a body as JSON, without its recordings; quantities that do not
+    apply, such as the damping of static tests or the density of a specimen without a mesh, are
+    None. The body must have a single part.
+    """
     experiment = task.experiments[0]
     body = experiment.body
     theta = body.theta_from_values(task.values)
@@ -338,8 +358,9 @@ def _write_grasps(
 
 
 def _marker_table(experiment: Experiment) -> str:
-    """Return a CSV table of the markers: place on the undeformed body, element, and weights of its
-    corners.
+    """Return a CSV table of the markers, with a header: place on the undeformed body [m], index of
+    the nearest tetrahedron from 0, and weights of its corners, which may be negative for places
+    outside.
     """
     body = experiment.body
     places_m = experiment.markers.predict_positions(body.nodes_m)

@@ -65,12 +65,16 @@ Then `collocation-sysid benchmark FOLDER` prints the scores; `--body NAME` score
 
 
 def law_description(name: str) -> str:
-    """Return the energy density of a material law of the benchmark."""
+    """Return the energy density of a material law as a formula; `KeyError` for laws that no body of
+    the benchmark has.
+    """
     return LAWS[name]
 
 
 def damping_description(name: str) -> str:
-    """Return the stress or force of a damping law of the benchmark."""
+    """Return the stress or force of a damping law as a formula; `KeyError` for laws that no body of
+    the benchmark has.
+    """
     return DAMPING_LAWS[name]
 
 

@@ -102,7 +102,7 @@ def catalogue_entry(name: str) -> CatalogueEntry:
         If the catalogue is not part of the installation, or has no such entry.
     """
     entries = _catalogue()
-    require_among(name, entries, CATALOGUE_FILE)
+    require_among(name, entries, source=CATALOGUE_FILE)
     entry = entries[name]
     constants = tuple(
         IdentifiedConstant(

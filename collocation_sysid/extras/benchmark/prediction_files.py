@@ -128,7 +128,26 @@ def _read_table(file: Path, measured: Signal) -> tuple[Array, Array]:
 def _number(
     file: Path, line: int, *, row: list[str], place: int, name: str
 ) -> float:
-    """Return the finite number in a cell; `line` is counted from 1, `place` from 0."""
+    """Return the finite number in a cell of a table.
+
+    Parameters
+    ----------
+    file : Path
+        The table, for the message.
+    line : int
+        Number of the line, counted from 1, for the message.
+    row : list of str
+        Cells of the line, which may be too few.
+    place : int
+        Index of the cell.
+    name : str
+        Name of the column, for the message.
+
+    Raises
+    ------
+    InputError
+        If the cell is missing, or has no finite number.
+    """
     text = row[place] if place < len(row) else ""
     try:
         number = float(text)
@@ -185,7 +204,22 @@ def _read_archive(file: Path, measured: Signal) -> tuple[Array, Array]:
 
 
 def _real_numbers(file: Path, name: str, array: Array) -> Array:
-    """Return an array of an archive as floats; refuse other types and values that are not finite."""
+    """Return an array of an archive as floats.
+
+    Parameters
+    ----------
+    file : Path
+        The archive, for the message.
+    name : str
+        Name of the array, for the message.
+    array : array
+        Array of any type and shape.
+
+    Raises
+    ------
+    InputError
+        For other types than integers and floats, and for values that are not finite.
+    """
     if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
         raise InputError(
             "found an array with values that are not finite numbers; expected real, finite numbers",

@@ -95,7 +95,7 @@ def score_benchmark(folder: str | Path, body: str | None = None) -> list[Score]:
     content = BenchmarkContent.read(Path(folder))
     names = content.bodies
     if body is not None:
-        require_among(body, names, content.folder, where="--body")
+        require_among(body, names, source=content.folder, where="--body")
         names = (body,)
     recordings = [each for each in content.recordings if each.body in names]
     files = _prediction_files(content.folder, recordings)
@@ -117,7 +117,21 @@ def score_benchmark(folder: str | Path, body: str | None = None) -> list[Score]:
 def _prediction_files(
     folder: Path, recordings: list[StoredRecording]
 ) -> list[Path]:
-    """Return the prediction file of each recording; refuse a folder without one of them."""
+    """Return the prediction file of each recording, in the same order.
+
+    Parameters
+    ----------
+    folder : Path
+        Benchmark folder.
+    recordings : list of StoredRecording
+        Recordings of its bodies.
+
+    Raises
+    ------
+    InputError
+        If a prediction is missing, naming all missing ones, or present as CSV table and as NPZ
+        archive.
+    """
     files = []
     missing = []
     for recording in recordings:
@@ -137,7 +151,17 @@ def _prediction_files(
 
 
 def score(recording: StoredRecording, source: str, predicted: Signal) -> Score:
-    """Return the score of a prediction of a recording; `source` states who predicted it."""
+    """Return the score of a prediction of a recording.
+
+    Parameters
+    ----------
+    recording : StoredRecording
+        Recording with at least one measured value.
+    source : str
+        Who predicted it, see `Score`.
+    predicted : Signal
+        Prediction at the samples of the measured signal, with the same columns.
+    """
     signals = recording.signals
     measured = signals.measured
     errors = _errors(predicted, measured)
@@ -164,12 +188,16 @@ def score(recording: StoredRecording, source: str, predicted: Signal) -> Score:
 
 
 def _errors(predicted: Signal, measured: Signal) -> Array:
-    """Return predicted minus measured values (T, C); NaN where nothing was measured."""
+    """Return predicted minus measured values (T, C) in the unit of the signals; NaN where nothing
+    was measured.
+    """
     return predicted.values - measured.values
 
 
 def _distances(errors: Array, measured: Signal) -> Array:
-    """Return the known distances of markers, or the known magnitudes of the differences of loads."""
+    """Return the distances (k,) of markers, or the magnitudes of the differences of loads, from
+    errors (T, C); those that are NaN are left out.
+    """
     sizes = np.abs(errors)
     if measured.quantity == "markers":
         sizes = np.linalg.norm(

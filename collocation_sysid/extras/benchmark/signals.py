@@ -86,7 +86,15 @@ class RecordingSignals:
         """Return the signals of an experiment that was simulated.
 
         An experiment with markers has their positions; a material test without a mesh has its
-        stresses; another experiment has the forces of its grasps.
+        stresses; another experiment has the forces of its grasps, of which at least one must be
+        measured.
+
+        Parameters
+        ----------
+        experiment : Experiment
+            Experiment with its measurements.
+        trajectory : Trajectory
+            Its simulation at the samples.
         """
         if experiment.markers.names:
             return _marker_signals(experiment, trajectory)
@@ -96,7 +104,9 @@ class RecordingSignals:
 
 
 def stress_columns(deformation: HomogeneousDeformation) -> tuple[str, ...]:
-    """Return the names of the columns of the nominal stresses of a material test."""
+    """Return the names of the columns of the nominal stresses [Pa] of a material test, one for each
+    measured direction.
+    """
     components = (deformation.first_stress, deformation.second_stress)
     return tuple(f"stress_{each}_pa" for each in components if each)
 
@@ -104,7 +114,9 @@ def stress_columns(deformation: HomogeneousDeformation) -> tuple[str, ...]:
 def _marker_signals(
     experiment: Experiment, trajectory: Trajectory
 ) -> RecordingSignals:
-    """Return the positions of the markers."""
+    """Return the positions of the markers [m], three columns each, at the times of the experiment;
+    measured ones are NaN where missing.
+    """
     markers = experiment.markers
     count = len(experiment.t_s)
     present_m = np.where(
@@ -113,9 +125,11 @@ def _marker_signals(
     measured = Signal(
         "markers",
         TIME_KEY,
-        experiment.t_s,
-        tuple(f"{name}_{axis}" for name in markers.names for axis in AXES),
-        present_m.reshape(count, -1),
+        keys=experiment.t_s,
+        columns=tuple(
+            f"{name}_{axis}" for name in markers.names for axis in AXES
+        ),
+        values=present_m.reshape(count, -1),
     )
     rigid_m = markers.predict_positions(
         experiment.rigid_positions(experiment.t_s)
@@ -123,15 +137,17 @@ def _marker_signals(
     return RecordingSignals(
         measured,
         np.repeat(markers.sigma_m, len(AXES)),
-        measured.with_values(trajectory.markers_m.reshape(count, -1)),
-        measured.with_values(rigid_m.reshape(count, -1)),
+        simulated=measured.with_values(trajectory.markers_m.reshape(count, -1)),
+        undeformed=measured.with_values(rigid_m.reshape(count, -1)),
     )
 
 
 def _stress_signals(
     experiment: Experiment, trajectory: Trajectory
 ) -> RecordingSignals:
-    """Return the nominal stresses of a material test without a mesh."""
+    """Return the nominal stresses [Pa] of a material test without a mesh by the number of the
+    sample; the undeformed body has none.
+    """
     assert experiment.specimen is not None
     names = stress_columns(experiment.specimen)
     # The first sensors are of stresses, a further one of the lateral stretch.
@@ -140,22 +156,28 @@ def _stress_signals(
     measured = Signal(
         "stresses",
         SAMPLE_KEY,
-        np.arange(1.0, len(experiment.t_s) + 1),
-        names[: len(sensors)],
-        np.column_stack([sensor.measured_values[:, 0] for sensor in sensors]),
+        keys=np.arange(1.0, len(experiment.t_s) + 1),
+        columns=names[: len(sensors)],
+        values=np.column_stack(
+            [sensor.measured_values[:, 0] for sensor in sensors]
+        ),
     )
     return RecordingSignals(
         measured,
         np.array([np.ravel(sensor.sigma)[0] for sensor in sensors]),
-        measured.with_values(np.column_stack([v[:, 0] for v in simulated])),
-        measured.with_values(np.zeros(measured.values.shape)),
+        simulated=measured.with_values(
+            np.column_stack([v[:, 0] for v in simulated])
+        ),
+        undeformed=measured.with_values(np.zeros(measured.values.shape)),
     )
 
 
 def _force_signals(
     experiment: Experiment, trajectory: Trajectory
 ) -> RecordingSignals:
-    """Return the measured forces of the grasps on the complete specimen."""
+    """Return the measured components of the forces [N] of the grasps on the complete specimen, at
+    the times of the first sensor, which all sensors must have; the undeformed body has none.
+    """
     columns: list[str] = []
     measured: list[Array] = []
     simulated: list[Array] = []

@@ -16,7 +16,6 @@ import tomli_w
 from scipy.spatial.transform import RigidTransform
 
 from ...common.serialisation import as_json, content
-from ...fem.laws.constants import is_field_coefficient
 from ...problem.gripper_transforms import gripper_transforms
 from ...problem.recording_schema import MovedSection
 from ...problem.schema import with_experiment_defaults
@@ -211,7 +210,7 @@ def _gripper_poses(design: Design) -> PoseSequence:
     """
     recording = design.recording
     (body_in_gripper,) = gripper_transforms(
-        recording.problem, recording.template.name, [0]
+        recording.problem, recording.template.name, grasps=[0]
     )
     if body_in_gripper is None:
         return design.poses
@@ -250,9 +249,7 @@ def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
         *(tables if design.added else []),
         _designed_table(new),
     ]
-    for item in recording.problem.parameters.free:
-        if is_field_coefficient(item.name):
-            continue
+    for item in recording.problem.parameters.free_scalars:
         section = problem_table["parameters"].get(item.name)
         guess = {"guess": design.after.values[item.name]}
         problem_table["parameters"][item.name] = (

@@ -74,14 +74,18 @@ def _error_table(design: Design) -> Table:
 
 
 def _percent(share: float) -> str:
-    """Return a relative error as text in percent; empty for NaN, "not determined" from 1000 % on."""
+    """Return a relative error `share` as text in percent; empty for NaN, "not determined" from 1000
+    % on.
+    """
     if np.isnan(share):
         return ""
     return f"{100 * share:.3g} %" if share < 10 else "not determined"
 
 
 def _column_note(design: Design) -> str:
-    """Return a sentence that says which recordings the columns "before" and "after" refer to."""
+    """Return a sentence that says which recordings the columns "before" and "after" refer to;
+    without error bars before the design it is on "after" alone.
+    """
     duration = f"{design.experiment.duration_s:.4g} s"
     after = f"after: the designed motion of {duration}"
     if design.added:

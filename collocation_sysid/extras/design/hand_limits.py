@@ -231,10 +231,14 @@ class HandBounds:
         """Return the largest translation, speed and acceleration as shares of their limits, by name
         of the limit.
 
+        The share of the translation is the largest along any axis, relative to the distance of the
+        initial position from that side of the workspace; the others are norms.
+
         Parameters
         ----------
         course : TimeDerivatives of (T, 6) arrays
-            Coordinates of a motion, in SI units.
+            Coordinates of a motion and their derivatives, in SI units; the first three columns are
+            the translation.
         """
         shift, rate, curvature = (each[:, :3] for each in course)
         limits = self.limits
@@ -254,7 +258,8 @@ class HandBounds:
         Parameters
         ----------
         course : TimeDerivatives of (T, 6) arrays
-            Coordinates of a motion, in SI units.
+            Coordinates of a motion and their derivatives, in SI units; the last three columns are
+            the rotation vector.
         """
         turn, rate, curvature = (each[:, 3:] for each in course)
         velocity, acceleration = angular_motion(turn, rate, curvature=curvature)

@@ -436,7 +436,10 @@ def _evaluate_design(
     problem = recording.problem
     values = problem.parameters.values(judge.draws[0])
     predicted = simulate(
-        experiment, values, problem.scheme, substeps=problem.first_substeps
+        experiment,
+        values,
+        integrator=problem.scheme,
+        substeps=problem.first_substeps,
     )
     return Design(
         recording,

@@ -31,7 +31,6 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array
 from ...errors import InputError, require_among
-from ...fem.laws.constants import is_field_coefficient
 from ...model.parameters import Parameters, ThetaMap
 from ...problem import Problem
 from ...program.collocation import Collocation
@@ -177,12 +176,10 @@ class PredictedErrors:
         covariance = units[:, None] * np.linalg.inv(scaled) * units
         values = dict[str, float]()
         slopes = dict[str, Array]()
-        for item, c, slope in zip(
-            parameters.free, q, np.diag(sizes), strict=True
-        ):
-            if not is_field_coefficient(item.name):
-                values[item.name] = item.from_coordinate(float(c))
-                slopes[item.name] = slope
+        for k in parameters.scalar_coordinates:
+            item = parameters.free[k]
+            values[item.name] = item.from_coordinate(float(q[k]))
+            slopes[item.name] = np.diag(sizes)[k]
         estimated_count = len(values)
         derived = DerivedModuli.from_bodies([constants], q)
         varying = {
@@ -619,15 +616,19 @@ class LinearRecording:
 
     def information(self, motion: HandMotion) -> Array:
         """Return the information (nq, nq) of a motion about the shared parameters, to first order
-        in the motion, see `shared_information`. s         course =
-        motion.derivatives(recording.since_start_s)[0] ==>         course =
-        motion.derivatives(recording.since_start_s).value s         # What was simulated is highest
-        at a sample before which a motion from rest is nothing yet. ==>         # The pulses are
-        highest at sample CENTRE; before it a motion from rest is negligible.
+        in the motion, see `shared_information`.
+
+        The coordinates at the first `CENTRE` samples are neglected: a motion from rest is small
+        there.
+
+        Parameters
+        ----------
+        motion : HandMotion
+            Motion with the duration of the recording.
         """
         recording = self.recording
         course = motion.derivatives(recording.since_start_s)[0]
-        # What was simulated is highest at a sample before which a motion from rest is nothing yet.
+        # The pulses are highest at sample CENTRE; before it a motion from rest is negligible.
         of_course = np.fft.rfft(course[CENTRE:], self.length, axis=0)
         transform = np.einsum("fk,kfcp->fcp", of_course, self.responses)
         (rest,) = self.rest.blocks

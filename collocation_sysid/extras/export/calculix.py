@@ -54,7 +54,9 @@ FOAM_LIMITATION = (
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the input deck with what CalculiX cannot express; damping is not exported."""
+    """Return the input deck, with one step for each sample of a static recording and else for the
+    first sample alone, and what CalculiX cannot express; damping is not exported.
+    """
     static = body.experiment.is_static
     limits = replace(
         CAPABILITIES, has_moving_grasps=static, has_moving_obstacles=static
@@ -163,8 +165,8 @@ def _step_card(
     t_s: float,
     is_linear: bool,
 ) -> str:
-    """Return one step: prescribed nodes and obstacles at their places at `t_s`, gravity, and node
-    loads.
+    """Return one step: prescribed nodes and obstacles at their places at `t_s`, gravity, and the
+    node loads of the first sample.
 
     Parameters
     ----------
@@ -172,7 +174,7 @@ def _step_card(
     obstacles : sequence of FacetedObstacle
         The obstacles.
     t_s : float
-        Time of the sample.
+        Time of the sample [s].
     is_linear : bool
         Whether the analysis is geometrically linear.
     """

@@ -216,8 +216,9 @@ def _mesh_xml(
 
 
 def _prescribed_displacement_xml(body: IdentifiedBody) -> str:
-    """Return the XML of the prescribed displacements along each axis, which grow with the load
-    curve: zero, or the displacement to where a second grasp holds the nodes.
+    """Return the XML of the prescribed displacements along each axis that has any, which grow with
+    the load curve: zero, or the displacement to where a second grasp holds the nodes. It refers to
+    node sets and data of `_mesh_xml`.
     """
     conditions = ""
     for axis, is_prescribed, displacement in zip(

@@ -267,7 +267,7 @@ class IdentifiedBody:
         with damaged_run_refused(folder):
             values = {
                 item.name: result.parameters[item.name].value
-                for item in problem.parameters.items
+                for item in problem.parameters.components
             }
         phi = answer.apply_to_nuisance(collocation)[0][
             segment.nuisance_indices.indices

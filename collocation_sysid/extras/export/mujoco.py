@@ -160,7 +160,9 @@ def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
 
 
 def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
-    """Return position (3,) [m] and quaternion (w, x, y, z) of a grasp or obstacle at a time."""
+    """Return position (3,) [m] and quaternion (w, x, y, z) of a grasp or obstacle at a time `t_s`
+    [s].
+    """
     rotations, positions = grasp.poses.at([t_s])
     return positions[0], np.roll(
         Rotation.from_matrix(rotations[0]).as_quat(), 1
@@ -220,7 +222,7 @@ def _flex_xml(body: IdentifiedBody) -> str:
 
 
 def _mean_edge_m(body: IdentifiedBody) -> float:
-    """Return the mean edge length of the undeformed mesh [m]."""
+    """Return the mean length of the edges between corners of the undeformed tetrahedra [m]."""
     ends = body.body.nodes_m[body.body.mesh.edges]
     return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
 
@@ -254,7 +256,7 @@ def _stable_step_s(body: IdentifiedBody) -> float:
     the undeformed body without grasps, with the largest γ_r of all regions.
     """
     state = body.body.nodes_m.reshape(1, -1)
-    at = body.body.linearise(state, np.zeros_like(state), body.theta)
+    at = body.body.linearise(state, np.zeros_like(state), theta=body.theta)
     stiffness = body.body.pattern.matrix(-at.by_position[0])
     root = 1 / np.sqrt(np.repeat(body.node_mass_kg, 3))
     scaled = sp.diags_array(root) @ stiffness @ sp.diags_array(root)

@@ -330,7 +330,9 @@ class FacetedObstacle:
     faces: Index
 
     def points_at_m(self, t_s: float) -> Array:
-        """Return the points of the facets (p, 3) in the world at a time."""
+        """Return the points of the facets (p, 3) [m] in the world at a time [s], moved with the
+        obstacle.
+        """
         (rotation,), (place,) = self.obstacle.poses.at([t_s])
         return self.facets.points_m @ rotation.T + place
 

@@ -109,8 +109,9 @@ def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
 
 
 def _limits(stresses: Sequence[Array | None]) -> tuple[float, float]:
-    """Return the smallest and largest value as ends of the colour scale, the same for all
-    experiments; 0 and 1 if nothing is known.
+    """Return the smallest and largest stress [Pa] of all experiments as ends of their common colour
+    scale; 0 and 1 if none is known. Entries of `stresses` are (T, F) arrays, or None; NaN does not
+    count.
     """
     known = [
         each
@@ -248,16 +249,18 @@ class _Recording:
         stress: Array | None,
         limits: tuple[float, float],
     ) -> None:
-        """Write an experiment.
+        """Write the motion of an experiment into the recording: the deforming surface, grasped
+        nodes, markers (measured, fitted, simulated), points of depth cameras, obstacles, residuals
+        and wrenches, each if it exists.
 
         Parameters
         ----------
         replay : MotionRecord
-            It has shapes.
+            Experiment with a fitted or simulated trajectory.
         stress : (T, F) array or None
-            Von Mises stress on the surface [Pa].
+            Von Mises stress on the surface [Pa], which colours it; None for a grey surface.
         limits : (low, high)
-            Ends of the colour scale [Pa].
+            Ends of the colour scale [Pa]; not used without stress.
         """
         name = replay.name
         self.stream.log(self._path(name), self._up_axis(replay.up), static=True)
@@ -434,8 +437,8 @@ class _Recording:
             self._write_curve(path, replay.t_s, values=values)
 
     def _write_wrenches(self, replay: MotionRecord) -> None:
-        """Write each component of forces and torques as measured, fitted and simulated; grasps with
-        a sensor are numbered from 1.
+        """Write each component of forces and torques as measured, fitted and simulated, as far as
+        they are finite; grasps with a sensor are numbered from 1.
         """
         for k, columns in enumerate(replay.wrenches, start=1):
             t_s = columns[:, 0]

@@ -108,8 +108,9 @@ def _contact_xml(body: IdentifiedBody) -> str:
     """Return the XML of contact penalties on the nodes, proportional to the penetration; empty
     without obstacles. Shapes other than planes and spheres are left out.
 
-    The surface of the obstacle is moved outwards by half the width δ of the pressure law, so that
-    the force is about the same at a given gap.
+    Obstacles stay at their poses at the start of the recording. The surface of the obstacle is
+    moved outwards by half the width δ of the pressure law, so that the force is about the same at a
+    given gap.
     """
     lines = ""
     for wall in faceted_obstacles(body):

@@ -263,7 +263,12 @@ def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
 def _add_material(
     pxr: Any, stage: Any, region: IdentifiedRegion, name: str
 ) -> Any:
-    """Add the material of a region to the stage under `name`, and return it."""
+    """Add the material of a region to the stage under /World/Materials/`name`, in place, and return
+    it.
+
+    Elastic constants and density are in the attributes of the schemas, all other constants and the
+    damping in custom attributes. `pxr` are the modules of `_import_usd`.
+    """
     material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{name}")
     prim = material.GetPrim()
     prim.AddAppliedSchema("PhysicsVolumeDeformableMaterialAPI")

@@ -25,7 +25,6 @@ from numpy.typing import ArrayLike, NDArray
 from ...common.array_types import Array
 from ...common.validated_types import AtLeastOne, Options, Positive
 from ...errors import InputError, SimulationError
-from ...fem.laws.constants import is_field_coefficient
 from ...pipeline import Run
 from ...problem import Problem
 from ...program.streaming import (
@@ -899,14 +898,10 @@ class LiveEstimator:
             code = "solve/seeking"
         grave = concern_if(bool(code), True, code=code)
         if self.first_pass is None or self.first_pass.has_failed:
-            values = self.model.collocation.parameters.values(
+            values = self.model.collocation.parameters.scalar_values(
                 self.p[: self.model.collocation.nq]
             )
-            estimates_only = {
-                name: Estimate(v)
-                for name, v in values.items()
-                if not is_field_coefficient(name)
-            }
+            estimates_only = {name: Estimate(v) for name, v in values.items()}
             return estimates_only, Assessment.from_concerns(grave)
         if self.counts["looked"] % SCATTER_INTERVAL_FRAMES == 0:
             self.scatter = self._combined.scatter(

@@ -124,7 +124,8 @@ def require_gif(file: Path) -> None:
 def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
     """Write the estimates with their statistical intervals as a growing plot in a GIF.
 
-    The film runs in real time, at most `FRAMES_A_SECOND`; an existing file is replaced.
+    The film runs in real time, at most `FRAMES_A_SECOND`; an existing file is replaced, and missing
+    folders are made.
 
     Parameters
     ----------
@@ -141,7 +142,7 @@ def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
     Raises
     ------
     InputError
-        If the name of the file does not end in .gif.
+        If the name of the file does not end in .gif, or it cannot be written.
     """
     path = Path(file)
     require_gif(path)

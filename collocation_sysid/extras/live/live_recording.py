@@ -91,14 +91,17 @@ class LiveRecording:
     def write(
         self, frame: Frame, update: LiveUpdate, positions_m: Array | None
     ) -> None:
-        """Write a frame and what was estimated after it.
+        """Write a frame and what was estimated after it, at the time of the update.
 
         Parameters
         ----------
         frame : Frame
+            Frame with the measured markers.
         update : LiveUpdate
+            Its result.
         positions_m : (n, 3) array or None
-            Node positions at the estimate; None, without a surface, if they are unknown.
+            Node positions at the estimate [m]; None if they are unknown. The surface is then left
+            out, as it is if a position is not finite.
         """
         rr = self._rr
         self._stream.set_time(TIMELINE, duration=update.t_s)
@@ -144,7 +147,9 @@ class LiveRecording:
             self._stream.log("notes", rr.TextLog(note))
 
     def _write_number(self, value: float, *path: str) -> None:
-        """Write a number at the present time; nothing if it is not finite."""
+        """Write a number at the present time under the entity whose path has these parts; nothing
+        if it is not finite.
+        """
         if np.isfinite(value):
             entity = self._rr.new_entity_path(list(path))
             self._stream.log(entity, self._rr.Scalars(value))

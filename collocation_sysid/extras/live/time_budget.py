@@ -42,8 +42,8 @@ class TimeBudget:
 
     @classmethod
     def from_times(cls, one_s: float, many_s: float, many: int) -> TimeBudget:
-        """Return the budget from the times [s] of one time step and of `many` that are computed
-        together.
+        """Return the budget from the times of one time step, `one_s`, and of `many` that are
+        computed together, `many_s` [s].
 
         The time of a further step is limited to values from 0 to `one_s`, since measurements
         scatter; it is `one_s` if `many` is 1.

@@ -243,7 +243,8 @@ class WindowPass:
     def repeat_rows(self, rows: Sequence[LoggedRow]) -> None:
         """Compute the first of the logged rows, at most `repeatable_rows`, and add their samples.
 
-        The rows after them are ignored; `rows` tells how many were computed.
+        The rows after them are ignored; the attribute `rows` increases by the number of rows that
+        were computed.
 
         Raises
         ------
@@ -291,7 +292,8 @@ class WindowPass:
         ]
 
     def _initial_guesses(self, known: Sequence[StoredRow]) -> list[Array]:
-        """Return initial guesses of positions, (3n,) each, from rows of the pass that is repeated.
+        """Return an initial guess of the positions, (3n,) [m], for each of the rows `known` of the
+        pass that is repeated.
 
         Each is extrapolated to p with the sensitivities of its row; the error of this prediction at
         the last two rows is extrapolated linearly and added. If the error is known at one row only,

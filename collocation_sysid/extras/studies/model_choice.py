@@ -354,7 +354,9 @@ def _comparison(chosen: Row, rival: Row) -> str:
 
 
 def _prediction_text(row: Row) -> str:
-    """Return the prediction error of a model, which must be known, as text with its unit."""
+    """Return the prediction error of a model (a row of `model_rows`), which must be known, as text
+    with its unit for display.
+    """
     factor, unit = display_unit(row["unit"])
     return f"{factor * row['held_out_rms']:.3g} {unit}"
 
@@ -499,7 +501,9 @@ def evidence_from_fit(fit: LinearisedFit) -> Evidence:
 def _independent_measurements(
     block: ResidualBlock, process: ErrorProcess
 ) -> float:
-    """Return the equivalent number of independent measurements in one block of residuals."""
+    """Return the equivalent number of independent measurements in one block of residuals, at most
+    the number of measurements, from the correlation of its errors in time and between channels.
+    """
     lags = np.arange(1, len(process.autocorrelation))
     in_time = 1 + 2 * float(
         (1 - lags / len(block.t_s)) @ process.autocorrelation[1:]

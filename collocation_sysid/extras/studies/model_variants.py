@@ -535,8 +535,8 @@ def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
 
 
 def _starting_guess(name: str, shear_pa: float | None) -> dict[str, Any]:
-    """Return the table of a constant: with a guess that gives the shear modulus `shear_pa` [Pa], or
-    empty, for a scan, if that is None or the constant has no usual value.
+    """Return the table of the constant `name`: with a guess that gives the shear modulus `shear_pa`
+    [Pa], or empty, for a scan, if that is None or the constant has no usual value.
 
     A constant whose usual value is zero also gets a typical size, `LESS` times the shear modulus.
     """

@@ -106,6 +106,15 @@ def _attempt(
     After a time limit it is the record with the best iterate, if the process wrote one, with the
     outcome `TIMEOUT`; an error that the process reported stays an error. Without a record of the
     process the outcome is `TIMEOUT`, `STOPPED` or `CRASHED`.
+
+    Parameters
+    ----------
+    planned : dict
+        A `PlannedRun` as a dictionary.
+    time_limit_s : float or None
+        Time limit [s]; None for no limit.
+    stopped : callable
+        Function that is called now and then; the process is killed once it returns true.
     """
     with tempfile.TemporaryDirectory(prefix="collocation-sysid-") as place:
         file = Path(place) / "record.json"
@@ -154,6 +163,17 @@ def _watch(
 
     At the time limit the process is asked to end and waited for, at most `GRACE_S`. A process that
     is to be stopped is left running; the caller kills it.
+
+    Parameters
+    ----------
+    process : Popen
+        Process of `run_worker`, whose stdin is closed at the end.
+    planned : dict
+        A `PlannedRun` as a dictionary.
+    time_limit_s : float or None
+        Time limit [s]; None for no limit.
+    is_stopped : callable
+        Function that is called now and then, and returns whether to stop.
 
     Returns
     -------
@@ -271,7 +291,7 @@ class RunStore:
         return record
 
     def _file(self, key: str) -> Path:
-        """Return the file of a record."""
+        """Return the file of the record with this key, which need not exist."""
         return self.folder / f"{key}.json"
 
 

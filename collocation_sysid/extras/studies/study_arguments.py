@@ -92,8 +92,8 @@ def read_truth(
 def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
     """Return the file, and its values by name, of a source of true values.
 
-    A text with "=" is read as name=value pairs, separated by commas, with values as text; the file
-    is then None.
+    A text `item` with "=" is read as name=value pairs, separated by commas, with values as text;
+    the file is then None. Any other text is the path of a TOML file.
 
     Raises
     ------
@@ -131,8 +131,21 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
 
 
 def _positive_value(name: str, value: Any, source: Path | None) -> float:
-    """Return a value, a number or text, as a positive float; raise `InputError` otherwise. `name`
-    and `source` are for the message.
+    """Return a value as a positive, finite float.
+
+    Parameters
+    ----------
+    name : str
+        Name of the parameter, for the message.
+    value : Any
+        A number, or text of one.
+    source : Path or None
+        File of the value, for the message; None for the command line.
+
+    Raises
+    ------
+    InputError
+        If the value is not a positive, finite number.
     """
     try:
         number = float(value)

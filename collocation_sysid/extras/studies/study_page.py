@@ -256,7 +256,12 @@ def write_report(report: StudyReport, folder: Path) -> None:
     """Write ``runs.csv``, ``summary.json``, ``summary.md`` and the plots of a study into a folder.
 
     A comparison of methods has also ``summary.csv``; a comparison of models has no plots. Earlier
-    files are replaced.
+    files are replaced, and a missing folder is made.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
     """
     rows = report.rows
     write_text_file(folder / "runs.csv", as_csv(rows))
@@ -282,7 +287,7 @@ def write_report(report: StudyReport, folder: Path) -> None:
 
 
 def report_json(report: StudyReport) -> dict[str, Any]:
-    """Return the content of summary.json."""
+    """Return the content of summary.json, with tables and dataclasses that `as_json` converts."""
     rows = report.rows
     first = report.planned[0]
     content: dict[str, Any] = {
@@ -349,8 +354,13 @@ Cell = Callable[[Row], str]
 
 
 def comparison_views(summaries: Sequence[Row]) -> list[Table]:
-    """Return tables of success, quality and cost of every method from the rows of `method_rows`;
-    the column of evaluations is left out if no method counts them.
+    """Return tables of success, quality and cost of every method, with short headings; the column
+    of evaluations is left out if no method counts them.
+
+    Parameters
+    ----------
+    summaries : sequence of Row
+        Rows of `method_rows`, at least one.
     """
     success: dict[str, Cell] = {
         "runs": lambda row: str(row["runs"]),
@@ -400,7 +410,9 @@ def comparison_views(summaries: Sequence[Row]) -> list[Table]:
 
 
 def run_view(rows: Sequence[Row]) -> Table:
-    """Return a table of every run of a comparison."""
+    """Return a table of every run of a comparison, ordered by start, with headings in words; the
+    rows are those of `run_row`, at least one.
+    """
     names = {"start": _text_cell("start"), "method": _text_cell("method")}
     cells: dict[str, Cell] = {
         "ended": _text_cell("status"),
@@ -415,7 +427,9 @@ def run_view(rows: Sequence[Row]) -> Table:
 
 
 def _method_sentence(row: Row) -> str:
-    """Return how often, how accurately and how fast a method found the solution, in words."""
+    """Return how often, how accurately and how fast a method found the solution, in words; `row` is
+    a row of `method_rows`.
+    """
     low = 100 * row["success_low"]
     high = 100 * row["success_high"]
     sentence = (
@@ -431,7 +445,14 @@ def _method_sentence(row: Row) -> str:
 
 
 def sweep_sentences(rows: Sequence[Row]) -> list[str]:
-    """Return how many runs converged, and how much each estimate varies between them, in words."""
+    """Return how many runs converged, and how much each estimate varies between them, in words;
+    estimates of fewer than two runs are left out.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row`, at least one.
+    """
     converged = [row for row in rows if row["converged"]]
     sentences = [f"{len(converged)} of {len(rows)} runs converged."]
     for name in parameters_in(rows):
@@ -490,7 +511,14 @@ def sweep_views(rows: Sequence[Row], varied_keys: Sequence[str]) -> list[Table]:
 
 
 def model_views(rows: Sequence[Row]) -> list[Table]:
-    """Return tables of fit, prediction and small-strain moduli of every model."""
+    """Return tables of fit, prediction and parameters of every model, and with several held-out
+    recordings a table of the predictions of each.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `model_rows`, at least one; errors are in the unit of the first one, for display.
+    """
     factor, unit = display_unit(rows[0]["unit"])
     number_columns: dict[str, Cell] = {
         "free": _number_cell("free", 1, form="d"),
@@ -662,8 +690,8 @@ def _column_cell(name: str) -> Cell:
 
 
 def _estimate_cell(name: str) -> Cell:
-    """Return the cell of an estimate, with its combined standard error if that is known; "–"
-    without an estimate.
+    """Return the cell of the estimate of the parameter `name`, with its combined standard error if
+    that is known; "–" without an estimate.
     """
 
     def cell(row: Row) -> str:

@@ -455,7 +455,7 @@ def _axis_positions(values: Sequence[str]) -> tuple[Array, dict[float, str]]:
 
 
 def _shortened(value: str) -> str:
-    """Return a value as text, with numbers shortened."""
+    """Return a value as text; a number is shortened to four digits."""
     try:
         return f"{float(value):.4g}"
     except ValueError:

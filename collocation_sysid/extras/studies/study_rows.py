@@ -237,8 +237,16 @@ def run_row(
 def _parameter_columns(
     run: PlannedRun, result: Result | None, truth: Mapping[str, float]
 ) -> Row:
-    """Return the columns of the estimated parameters of a run, see `run_row`; a guess that the run
-    lacks is that of its result.
+    """Return the columns of the estimated parameters of a run, see `run_row`.
+
+    Parameters
+    ----------
+    run : PlannedRun
+        Run with its guesses; one that is None is replaced by that of the result.
+    result : Result or None
+        Its result; None leaves all values None.
+    truth : mapping of str to float
+        True values by name.
     """
     row: Row = {}
     estimates = {} if result is None else result.parameters
@@ -280,7 +288,9 @@ def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
 
 
 def method_rows(rows: Sequence[Row]) -> list[Row]:
-    """Return a summary of each method, in the order of their first runs."""
+    """Return a summary of each method, in the order of their first runs, see `_method_summary`;
+    `rows` are those of `run_row`.
+    """
     methods = dict.fromkeys(row["method"] for row in rows)
     return [
         _method_summary(

@@ -203,7 +203,9 @@ def _object_code(code: NativeCode, machine: llvm.TargetMachine) -> bytes:
     )
     code_bytes = load_object(cache_key)
     if code_bytes is None:
-        code_bytes = compile_module(code.build(), machine, code.is_unoptimised)
+        code_bytes = compile_module(
+            code.build(), machine, quickly=code.is_unoptimised
+        )
         store_object(cache_key, code_bytes)
     return code_bytes
 

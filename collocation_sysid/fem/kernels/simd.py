@@ -250,12 +250,12 @@ class _KernelEmitter:
         self.sums = [
             at
             for phase, k in shared
-            for at in phase.output_offsets(k, "none", 1)
+            for at in phase.output_offsets(k, "none", step=1)
         ]
         self.vectors = [
             at
             for phase, k in shared
-            for at in phase.output_offsets(k, "nodes", self.size)
+            for at in phase.output_offsets(k, "nodes", step=self.size)
         ]
         self.coupling = kernel.coupling
         self.module = ir.Module()
@@ -311,9 +311,9 @@ class _KernelEmitter:
                 address = b.gep(
                     nodes, [b.mul(block, I64(self.size // 3 * self.lanes))]
                 )
-                self._gather(rows, address, gathered)
+                self._gather(rows, address, gathered=gathered)
                 with for_range(b, I64(0), stop=I64(total), name="zero") as k:
-                    self._store(self.vector(None), totals, k)
+                    self._store(self.vector(None), totals, entry=k)
                 first = b.mul(block, I64(self.points))
                 for phase in phases:
                     with for_range(
@@ -443,7 +443,9 @@ class _KernelEmitter:
                         scalar = b.load(b.gep(row, [b.add(entry, I64(axis))]))
                         value = b.insert_element(value, scalar, I32(lane))
                     self._store(
-                        value, buffer, b.add(b.mul(node, I64(3)), I64(axis))
+                        value,
+                        buffer,
+                        entry=b.add(b.mul(node, I64(3)), I64(axis)),
                     )
 
     def _scatter(
@@ -521,7 +523,7 @@ class _KernelEmitter:
         for piece, entry, value in emit_function(
             self.builder, phase.sx, vector=self.vector, read=read
         ):
-            self._store(value, pieces, I64(phase.pieces[piece] + entry))
+            self._store(value, pieces, entry=I64(phase.pieces[piece] + entry))
 
     def _contract(
         self,
@@ -794,5 +796,5 @@ class _KernelEmitter:
     def _accumulate(self, value: Value, base: Value, entry: Value) -> None:
         """Add a vector to that at the index `entry` of a buffer that begins at `base`."""
         self._store(
-            self.builder.fadd(self._load(base, entry), value), base, entry
+            self.builder.fadd(self._load(base, entry), value), base, entry=entry
         )

@@ -51,6 +51,8 @@ class Constant:
         Upper limit of admissible values, exclusive.
     at_least : float
         Smallest admissible value of a linear constant; not used for a logarithmic one.
+    prior : (mean, deviation) or None
+        Normal prior of an estimate if the problem states none; None for no prior.
     """
 
     name: str
@@ -62,6 +64,7 @@ class Constant:
     usual: float | None = None
     below: float = float("inf")
     at_least: float = -float("inf")
+    prior: tuple[float, float] | None = None
 
     @property
     def lower_limit(self) -> float:
@@ -224,7 +227,7 @@ FRICTION = Constant(
     at_least=0.0,
 )
 # Coefficient of a shape of a field, see `spatial_field`; names are field_1, field_2, ….
-MODE = Constant(
+FIELD_COEFFICIENT = Constant(
     "field",
     "",
     meaning="coefficient of a shape",
@@ -232,6 +235,7 @@ MODE = Constant(
     scale="linear",
     typical=1.0,
     usual=0.0,
+    prior=(0.0, 1.0),
 )
 # Contrast of a field with prior "two-phase", see `two_phase`; 1 in a body of one material.
 CONTRAST = Constant(
@@ -319,24 +323,17 @@ def constant_named(name: str) -> Constant:
         return replace(
             FRICTION, name=bare_name, symbol=bare_name.replace("_", " ")
         )
-    return (
-        replace(MODE, name=bare_name)
-        if is_field_coefficient(bare_name)
-        else KNOWN.get(bare_name, Constant(bare_name))
-    )
+    word, _, number = bare_name.rpartition("_")
+    if word == FIELD_COEFFICIENT.name and number.isdigit():
+        return replace(FIELD_COEFFICIENT, name=bare_name)
+    return KNOWN.get(bare_name, Constant(bare_name))
 
 
 def field_coefficient(number: int) -> Constant:
     """Return the constant for the coefficient of a shape of a field, by the shape's index."""
-    return replace(MODE, name=f"{MODE.name}_{number + 1}")
-
-
-def is_field_coefficient(name: str) -> bool:
-    """Return whether a constant is the coefficient of a shape of a field: ``field_`` and a number,
-    with or without a region.
-    """
-    word, _, number = without_region(name).rpartition("_")
-    return word == MODE.name and number.isdigit()
+    return replace(
+        FIELD_COEFFICIENT, name=f"{FIELD_COEFFICIENT.name}_{number + 1}"
+    )
 
 
 def is_modulus(name: str) -> bool:

@@ -55,7 +55,9 @@ class PowerLawEnergy:
         first, second, ratio = ca.vertsplit(reduced_invariants(F))
         traces = PowerTraces(first, second)
         return self.density(
-            ratio, lambda alpha: traces.scaled_excess(alpha)(()), constants
+            ratio,
+            lambda alpha: traces.scaled_excess(alpha)(()),
+            constants,
         )
 
     def symbolic(self, F: ca.SX, values: ca.SX) -> SymbolicFunction:

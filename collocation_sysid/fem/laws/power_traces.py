@@ -132,7 +132,8 @@ class PowerTraces:
                 argument for argument in index if argument == EXPONENT
             )
             return ca.dot(
-                chosen(by_exponent), self.functions(parity, first, second)
+                chosen(by_exponent),
+                self.functions(parity, first, second_order=second),
             )
 
         return cache(partial)

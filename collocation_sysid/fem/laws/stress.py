@@ -413,10 +413,10 @@ class StressEvaluator:
         self._evaluators[key](
             [np.ascontiguousarray(field) for field in fields],
             values,
-            out,
-            threads,
-            add,
-            None
+            out=out,
+            threads=threads,
+            add=add,
+            data_of_points=None
             if part_point_data is None
             else np.ascontiguousarray(part_point_data),
         )

@@ -120,8 +120,8 @@ def refine_body(body: Body) -> Body:
     finer = type(body)(
         mesh,
         rest.material,
-        rest.density_kg_m3,
-        body.element.name,
+        density_kg_m3=rest.density_kg_m3,
+        element=body.element.name,
         damping=rest.damping,
         regions=regions,
         prony=rest.prony,

@@ -270,9 +270,17 @@ def _judge(
 def _hessian_values(
     collocation: Collocation, hessian: Hessian
 ) -> HessianValues:
-    """Return the function (z, weight, multipliers, out) that overwrites `out`, with the values of
-    the Hessian of weight · f + multipliers · g at z; of weight · f in the Gauss–Newton
-    approximation, without multipliers, if `hessian` is "gauss-newton".
+    """Return the function (z, weight, multipliers, out) that overwrites `out` with the values of
+    the upper triangle of the Hessian of weight · f + multipliers · g at z, in the order of
+    `hessian_structure`.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Program that is passed to the solver.
+    hessian : {"gauss-newton", "exact"}
+        For "gauss-newton" the values are those of weight · f in the Gauss–Newton approximation, and
+        the multipliers are not used.
     """
 
     def values(z: Array, weight: float, multipliers: Array, out: Array) -> None:

@@ -70,6 +70,8 @@ def minimise_merit(
     ------
     InputError
         If the factor of "levenberg-marquardt" needs too much memory.
+    SimulationError
+        If the body has no stress-free shape at the parameters of a trial.
     """
     if inner == "levenberg-marquardt":
         return levenberg_marquardt(
@@ -164,7 +166,7 @@ class _ConvergenceCheck:
         tolerance.
 
         `converged` and the replacement value of the scaled problem are updated. Exceptions of
-        `report` are not caught.
+        `report` and of the merit function are not caught.
         """
         point = self.scaled.evaluate_at(s)
         self.scaled.replacement_value = STEEP * abs(point.value) + 1e-300
@@ -272,7 +274,8 @@ class _ScaledMerit:
 
     def evaluate_at(self, s: Array) -> _MeritEvaluation:
         """Return the merit function at s (free,); a call with the same s as the last one does not
-        evaluate again.
+        evaluate again. See `MeritFunction.value_and_gradient` for inverted elements and the
+        exceptions.
         """
         if self._last is None or not np.array_equal(self._last[0], s):
             z = self.to_variables(s)
@@ -283,19 +286,21 @@ class _ScaledMerit:
 
     def value(self, s: Array) -> float:
         """Return the merit function m at s (free,), without its gradient; infinite if an element is
-        inverted.
+        inverted. See `MeritFunction.value` for the exceptions.
         """
         return self.merit.value(self.to_variables(s))
 
     def value_and_gradient(self, s: Array) -> tuple[float, Array]:
-        """Return m and ∂m/∂s (free,) at s."""
+        """Return m and ∂m/∂s (free,) at s (free,); infinite and NaN if an element is inverted. See
+        `MeritFunction.value_and_gradient` for the exceptions.
+        """
         point = self.evaluate_at(s)
         scale = self.unit * self._slopes(s)
         return point.value, point.gradient[self.free] * scale
 
     def finite_value_and_gradient(self, s: Array) -> tuple[float, Array]:
-        """Return m and ∂m/∂s (free,) at s; `replacement_value` and zeros if the merit is
-        infinite.
+        """Return m and ∂m/∂s (free,) at s (free,); `replacement_value` and zeros if the merit is
+        infinite. See `MeritFunction.value_and_gradient` for the exceptions.
         """
         value, gradient = self.value_and_gradient(s)
         return (

@@ -60,7 +60,7 @@ def minimise_levenberg_marquardt(
     merit : MeritFunction
         Merit function.
     z : (variables,) array
-        Initial variables; not modified.
+        Initial variables, at which no element is inverted; not modified.
     tolerance : float
         Largest entry of the projected gradient at the end.
     max_iterations : int
@@ -72,13 +72,15 @@ def minimise_levenberg_marquardt(
     Returns
     -------
     bool
-        Whether the tolerance was reached; false after `max_iterations` steps, or if rounding
-        prevents it.
+        Whether the tolerance was reached; false after `max_iterations` steps, if rounding prevents
+        it, or if no step decreases the merit at the largest damping.
 
     Raises
     ------
     InputError
         If the factor needs more memory than `MOST_MEMORY`.
+    SimulationError
+        If the body has no stress-free shape at the parameters of a trial.
     """
     damping = DAMPING
     growth = 2.0
@@ -166,7 +168,13 @@ class _MeritPoint:
         """Return the merit function, the constraints and their Jacobian, and ∂m/∂z at z
         (variables,).
 
+        Elements are not checked: if one is inverted, the value may be infinite and derivatives NaN.
         The Jacobian of the point that was evaluated before is overwritten.
+
+        Raises
+        ------
+        SimulationError
+            If the body has no stress-free shape at these parameters.
         """
         rows, jacobian = merit.problem.constraints_and_jacobian(z)
         gradient = merit.gradient(z, rows, jacobian=jacobian)
@@ -174,10 +182,10 @@ class _MeritPoint:
         return cls(
             z,
             merit.value_from_constraints(z, rows),
-            rows,
-            jacobian,
-            gradient,
-            projected,
+            rows=rows,
+            jacobian=jacobian,
+            gradient=gradient,
+            projected=projected,
         )
 
     @property

@@ -105,8 +105,15 @@ class PenaltyProblem:
         return True
 
     def project_gradient(self, z: Array, slope: Array) -> Array:
-        """Return a gradient (variables,) at z with zeros for constant variables, and at bounds
-        across which the objective would decrease; the given gradient is unchanged.
+        """Return a gradient with zeros for constant variables, and at bounds across which the
+        objective would decrease.
+
+        Parameters
+        ----------
+        z : (variables,) array
+            Variables.
+        slope : (variables,) array
+            Gradient of the objective at z; not modified.
         """
         slope = np.where(self.is_free, slope, 0.0)
         slope[(z <= self.lower) & (slope > 0)] = 0
@@ -116,12 +123,12 @@ class PenaltyProblem:
     # Conversion to and from the given problem -------------------------------------------------
 
     def from_original(self, z: Array) -> Array:
-        """Return the variables of `nlp` from those of the given problem."""
+        """Return the variables of `nlp` (variables,) from variables z of the given problem."""
         return convert_variables(z, self.original, target=self.nlp)
 
     def to_original(self, z: Array) -> Array:
-        """Return variables of the given problem from z, with grasped nodes at their prescribed
-        positions.
+        """Return variables of the given problem from the variables z (variables,) of `nlp`, with
+        grasped nodes at their prescribed positions.
 
         Grasped nodes stay where they are if that would invert elements.
         """
@@ -138,8 +145,9 @@ class PenaltyProblem:
         )
 
     def to_original_multipliers(self, multipliers: Array) -> Array:
-        """Return multipliers of the given problem from those of all constraints (constraints,);
-        those of prescribed displacements are left out if the given problem has no such constraints.
+        """Return the multipliers of the given problem from those of all constraints of `nlp`
+        (constraints,); those of prescribed displacements are left out if the given problem has no
+        such constraints.
         """
         pairs = zip(
             self.original.transcriptions, self.nlp.transcriptions, strict=True
@@ -214,7 +222,9 @@ class MeritFunction:
         return np.where(self.problem.is_free, slope, 0.0)
 
     def multiplier_estimate(self, rows: Array) -> Array:
-        """Return the multipliers y + ρ g, with which the Lagrangian is stationary where m is."""
+        """Return the multipliers y + ρ g (constraints,), with which the Lagrangian is stationary
+        where m is, from the constraints g (`rows`).
+        """
         return self.multipliers + self.rho * rows
 
     def value_from_constraints(self, z: Array, rows: Array) -> float:

@@ -395,6 +395,8 @@ class _PenaltySolve:
             iterate.
         InputError
             If the factor of the inner solver needs too much memory.
+        SimulationError
+            If the body has no stress-free shape at the parameters of a trial.
         """
         options = self.options
         previous_violation = ConstraintViolation()
@@ -446,6 +448,8 @@ class _PenaltySolve:
         ------
         SearchEnded
             If the limit of the iterations of all stages, or that of the time, is reached.
+        InputError, SimulationError
+            As in `minimise_merit`.
         """
         stage = self.stage
         options = self.options
@@ -458,7 +462,7 @@ class _PenaltySolve:
 
         def report(z: Array, value: float, projected: Array) -> None:
             """Store an iterate z with its projected gradient, add it to the history now and then,
-            and check the limits; its merit `value` is not used.
+            and raise `SearchEnded` if a limit is reached; its merit `value` is not used.
             """
             nonlocal done
             self.variables = z

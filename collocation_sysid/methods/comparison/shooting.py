@@ -186,8 +186,19 @@ class _SimulatedPoint:
 class _ShootingSearch:
     """Search by SciPy's optimisers, which counts and records simulations.
 
+    Parameters
+    ----------
+    options : Shooting
+        Options of the method.
+    recorder : Recorder
+        Record of the solve, with the problem.
+    start : (variables,) array or None
+        Variables whose parameters, clipped to their bounds, are the first; None for the guess.
+
     Attributes
     ----------
+    first : (np,) array
+        Parameters of the first simulation, within their bounds.
     simulations, failures : int
         Numbers of all and of failed simulations.
     last, best : _SimulatedPoint or None
@@ -274,7 +285,7 @@ class _ShootingSearch:
 
     def _residual_slope(self, step: Array) -> Array:
         """Return the derivatives (m, np) of the residuals after a step (np,) from the first
-        parameters, at which the simulation must succeed.
+        parameters, at which the simulation must succeed. See `_try` for the exceptions.
         """
         shot = self._try(self.first + step)
         assert shot is not None  # SciPy asks where the residuals were finite

@@ -361,4 +361,7 @@ class StepContact:
                     )
                     self._candidates_of_contacts.append((each, candidates))
         for contact, candidates in self._candidates_of_contacts:
-            yield candidates, *candidates.inputs(contact, xi, nu, self._theta)
+            yield (
+                candidates,
+                *candidates.inputs(contact, xi, nu=nu, theta=self._theta),
+            )

@@ -177,7 +177,7 @@ class DepthCameraModel:
             Index of the image.
         """
         return self.to_world(
-            phi, self.depth.points_m[image], self.rays[image], image
+            phi, self.depth.points_m[image], rays=self.rays[image], image=image
         )
 
     def to_world(
@@ -215,7 +215,9 @@ class DepthCameraModel:
         `sample` [m]: the inverse of `to_world` without bias of the depth, but with its scale.
         """
         basis = np.vstack([np.zeros(3), np.eye(3)])
-        corner, *axes = self.to_world(phi, basis, np.zeros((4, 3)), sample)
+        corner, *axes = self.to_world(
+            phi, basis, rays=np.zeros((4, 3)), image=sample
+        )
         return np.linalg.solve((axes - corner).T, (points_m - corner).T).T
 
     def parameter_values(self, phi: Array) -> dict[str, float]:
@@ -242,7 +244,9 @@ class DepthCameraModel:
         """
         if self.depth.camera.matrix is None:
             return None
-        return self.to_world(phi, np.zeros((1, 3)), np.zeros((1, 3)), sample)[0]
+        return self.to_world(
+            phi, np.zeros((1, 3)), rays=np.zeros((1, 3)), image=sample
+        )[0]
 
     def prior_weights(self, row: NuisanceRow) -> Array:
         """Return one over the prior standard deviations (3,) of the camera's rotation [1/rad] or

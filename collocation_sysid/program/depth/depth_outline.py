@@ -299,7 +299,7 @@ def _outline_points(
     at_second = corners[edge] == ends[edge, 1:]
     shares = at_first * (1 - share)[:, None] + at_second * share[:, None]
     faces, places = surface.to_faces(front_triangle[edge], shares)
-    surface_points = surface.evaluate(shape_m, faces, places)
+    surface_points = surface.evaluate(shape_m, faces, barycentric=places)
     weights = surface_points.weights
     points_m = surface_points.points_m
     pixels = camera.distorted_pixels(own_m)
@@ -564,9 +564,13 @@ def _planes(
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     pixel = np.sum(normals * (outside - at), axis=1)
     normals *= np.sign(pixel)[:, None]
-    corner = camera_in.to_world(phi, np.zeros((1, 3)), np.zeros((1, 3)), sample)
+    corner = camera_in.to_world(
+        phi, np.zeros((1, 3)), rays=np.zeros((1, 3)), image=sample
+    )
     ways = (
-        camera_in.to_world(phi, normals, np.zeros_like(normals), sample)
+        camera_in.to_world(
+            phi, normals, rays=np.zeros_like(normals), image=sample
+        )
         - corner
     )
     return {

@@ -84,7 +84,7 @@ class OutlineResidual(DepthResidual):
         as last datum.
         """
         count = data.numel() - 1
-        outside_m = super().expression(values, phi, data[:count])
+        outside_m = super().expression(values, phi, data=data[:count])
         inside_px = self.nuisance.values_by_row(
             phi, self.own_parameters[0]
         ).get(DEPTH_EDGE, 0)

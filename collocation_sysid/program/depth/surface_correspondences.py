@@ -181,7 +181,7 @@ class SurfaceCorrespondences:
             "has_converged": settled,
         }
         own["outline"] = Outline.from_shapes(
-            camera, skin, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
+            camera, skin, body=body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
         )
         return cls(camera, body, surface=skin, **own, **arrays)
 
@@ -222,9 +222,11 @@ class SurfaceCorrespondences:
             camera, depth=replace(camera.depth, clouds=clouds, images_m=())
         )
         gate_m = cls.from_shapes(
-            thinned_view, body, shapes_m, phi, gate_m
+            thinned_view, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
         ).next_gate_m(shapes_m, phi)
-        return cls.from_shapes(camera, body, shapes_m, phi, gate_m)
+        return cls.from_shapes(
+            camera, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
+        )
 
     def updated(self, shapes_m: Array, phi: Array) -> SurfaceCorrespondences:
         """Return the correspondences of other shapes and camera poses.
@@ -316,7 +318,7 @@ class SurfaceCorrespondences:
         for k, x in enumerate(shapes_m):
             surface = np.einsum("ea,eai->ei", self.weights[k], x[self.nodes[k]])
             measured = self.camera.to_world(
-                phi, self.points[k], self.rays[k], k
+                phi, self.points[k], rays=self.rays[k], image=k
             )
             behind_m = np.sum(self.normals[k] * (surface - measured), axis=1)
             distances_m[k] = np.where(self.is_compared[k], behind_m, np.nan)
@@ -387,7 +389,7 @@ def _match_image(
     nearest = _nearest_facing(world, surface, x=x, eye_m=eye_m, gate_m=gate_m)
     indices = nearest.indices
     faces = nearest.faces
-    surface_points = surface.evaluate(x, faces, nearest.barycentric)
+    surface_points = surface.evaluate(x, faces, barycentric=nearest.barycentric)
     weights = surface_points.weights
     feet = surface_points.points_m
     normals = surface_points.normals
@@ -493,7 +495,9 @@ def initial_correspondences(
     nuisance = NuisanceMap.from_experiment(experiment)
     sightings = []
     for number, depth in enumerate(experiment.depths):
-        view = DepthCameraModel.from_experiment(experiment, number, nuisance)
+        view = DepthCameraModel.from_experiment(
+            experiment, number, nuisance=nuisance
+        )
         nodes = VisibleSurface.from_body(experiment.body, depth).nodes
         shapes_m = experiment.rigid_positions(depth.sample_times_s)[:, nodes]
         nothing = np.zeros(nuisance.size)

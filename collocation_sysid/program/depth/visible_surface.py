@@ -214,7 +214,9 @@ class VisibleSurface:
         places = np.stack([1 - of_b - of_c, of_b, of_c], axis=-1).reshape(-1, 3)
         faces = np.repeat(np.arange(len(self.faces)), len(places))
         barycentric = np.tile(places, (len(self.faces), 1))
-        return self.evaluate(x, faces, barycentric).points_m.reshape(-1, 3, 3)
+        return self.evaluate(
+            x, faces, barycentric=barycentric
+        ).points_m.reshape(-1, 3, 3)
 
     def is_facing(
         self, x: Array, eye_m: Array | None, minimum_cosine: float = 0.0

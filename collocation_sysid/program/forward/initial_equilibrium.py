@@ -59,7 +59,7 @@ def equilibrium(
     """
     at_s = float(experiment.t_s[0] if time_s is None else time_s)
     goals_m = experiment.prescribed_displacements([at_s])[1].ravel()
-    forces = Forces.from_experiment(experiment, at_s, theta)
+    forces = Forces.from_experiment(experiment, at_s, theta=theta)
     return _solve_equilibrium(
         experiment,
         forces,
@@ -132,7 +132,7 @@ def _solve_equilibrium(
         return solver.solve(
             x,
             residual,
-            linearise,
+            linearise=linearise,
             keep_definite=True,
             prescribed_m=goal[solver.is_prescribed],
         )

@@ -176,7 +176,7 @@ def find_stability_loss(
     ArpackError, RuntimeError, numpy.linalg.LinAlgError
         If the eigenvalues cannot be computed.
     """
-    forces = Forces.from_experiment(experiment, time_s, theta)
+    forces = Forces.from_experiment(experiment, time_s, theta=theta)
     is_prescribed = experiment.is_prescribed([time_s])[0].ravel()
     free = np.flatnonzero(~is_prescribed)
     reference, _ = _lowest(

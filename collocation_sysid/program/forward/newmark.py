@@ -377,7 +377,7 @@ class _Stepper:
                     if step >= target_s - state.t_s
                     else state.t_s + step
                 )
-                state = self._step(solver, state, end_s, target_s)
+                state = self._step(solver, state, end_s=end_s, load_s=target_s)
             except NewtonFailure as failure:
                 step /= 2
                 if step < smallest:
@@ -413,7 +413,7 @@ class _Stepper:
         step of `step_s` [s], or evaluated at the state if that is zero.
         """
         return Forces.from_experiment(
-            self.experiment, load_s, self.theta, step_s=step_s
+            self.experiment, load_s, theta=self.theta, step_s=step_s
         )
 
     def _contact_n(

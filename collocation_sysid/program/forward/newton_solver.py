@@ -211,7 +211,7 @@ class NewtonSolver:
             if done:
                 return improved
         at = self.timed(linearise, x)
-        factor = self.factorise(at, x, keep_definite)
+        factor = self.factorise(at, x, keep_definite=keep_definite)
         iterate = _Iterate(x, factor, step=self.step(factor, at.residual))
         for _ in range(self.options.max_iterations):
             if self._is_last(iterate.step):
@@ -258,7 +258,7 @@ class NewtonSolver:
             )
             if done:
                 return improved
-        return self.solve(x, equations.residual, equations.linearise)
+        return self.solve(x, equations.residual, linearise=equations.linearise)
 
     def _simplified_newton(
         self, x: Array, iteration: ChordIteration
@@ -395,7 +395,9 @@ class NewtonSolver:
                     if at is None:
                         at = self.timed(linearise, trial)
                     try:
-                        own = self.factorise(at, trial, keep_definite)
+                        own = self.factorise(
+                            at, trial, keep_definite=keep_definite
+                        )
                         return _Iterate(
                             trial, own, step=self.step(own, at.residual)
                         )

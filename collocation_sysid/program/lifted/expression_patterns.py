@@ -174,8 +174,8 @@ class ExpressionPattern:
         return cls.from_arrays(
             GeneratedFunction(gap, size, data_size=recursion.data_size),
             data,
-            parts,
-            rows,
+            inputs=parts,
+            rows=rows,
         )
 
     def _input_values(self, z: Array) -> Array:
@@ -242,7 +242,7 @@ class ExpressionPattern:
         unit = self.inputs.unit
         weights = multipliers[self.rows.indices] / self.rows.unit
         curvature = self.expression.weighted_hessian(
-            self._input_values(z), self.data, weights
+            self._input_values(z), self.data, weights=weights
         )
         return (curvature[i, j] * unit[i] * unit[j])[is_upper]
 

@@ -98,7 +98,7 @@ class LiftedReactions(LiftedVariables):
         """Return the scaled reaction forces (count,) that follow from the positions and parameters
         of the iterate.
         """
-        return self._scaled(iterate.motion.reactions.reaction)
+        return self._scaled(iterate.reactions.reaction)
 
     def _scaled(self, newtons: Array) -> Array:
         """Return forces (N, …) [N] as scaled values, without the rows before the first
@@ -151,7 +151,10 @@ class LiftedReactions(LiftedVariables):
         first = setting.dynamics.first_row
         by_x = np.empty(motion.structure.nnz)
         motion.fill(
-            by_x, iterate.forces, dynamics, setting.mass_depends_on_parameters
+            by_x,
+            iterate.forces,
+            dynamics=dynamics,
+            has_variable_mass=setting.mass_depends_on_parameters,
         )
         by_p = np.zeros(
             (

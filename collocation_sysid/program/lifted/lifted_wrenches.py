@@ -118,9 +118,7 @@ class LiftedWrench(LiftedVariables):
         motion.
         """
         own = [
-            self.observable.evaluate_unfiltered(
-                iterate.motion.reactions, iterate.phi
-            )
+            self.observable.evaluate_unfiltered(iterate.reactions, iterate.phi)
         ]
         if evolution := self.observable.filter_wrench(own[0], iterate.phi):
             own += [*evolution.states]
@@ -140,7 +138,10 @@ class LiftedWrench(LiftedVariables):
         own = PatternIndices(of_wrench, -minus)
         terms = [
             ExpressionPattern.from_arrays(
-                ITSELF, np.zeros((0, 1)), [PatternIndices(wrench, unit)], own
+                ITSELF,
+                np.zeros((0, 1)),
+                inputs=[PatternIndices(wrench, unit)],
+                rows=own,
             )
         ]
         reaction_columns = self.reactions.columns_of(
@@ -161,7 +162,10 @@ class LiftedWrench(LiftedVariables):
         )
         terms.append(
             ExpressionPattern.from_arrays(
-                MOMENT, channel.moment_data, observed, reaction_indices
+                MOMENT,
+                channel.moment_data,
+                inputs=observed,
+                rows=reaction_indices,
             )
         )
         if len(tool := channel.tool_parameters):
@@ -173,8 +177,8 @@ class LiftedWrench(LiftedVariables):
                 ExpressionPattern.from_arrays(
                     channel.tool,
                     data,
-                    [by_phi],
-                    PatternIndices(of_wrench, minus),
+                    inputs=[by_phi],
+                    rows=PatternIndices(of_wrench, minus),
                 )
             )
         if len(lag := channel.low_pass_parameters):
@@ -263,7 +267,11 @@ class LiftedWrench(LiftedVariables):
         `LiftedVariables.hessian_values`.
         """
         of_equations = super().hessian_values(
-            iterate, z, loss_weight, multipliers, weights
+            iterate,
+            z,
+            loss_weight=loss_weight,
+            multipliers=multipliers,
+            weights=weights,
         )
         rows, columns = self._loss_entries
         size = self._wrench_size + len(iterate.phi)
@@ -271,8 +279,8 @@ class LiftedWrench(LiftedVariables):
         of_loss = self.residual.hessian(
             observables,
             iterate.phi,
-            self._unit_derivatives,
-            iterate.has_observation_curvature,
+            derivatives=self._unit_derivatives,
+            has_observation_curvature=iterate.has_observation_curvature,
         )
         positions = np.searchsorted(
             columns * size + rows, of_loss.columns * size + of_loss.rows

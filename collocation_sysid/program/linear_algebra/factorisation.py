@@ -145,7 +145,9 @@ class _SkylineFactor:
         first = self.sides[-transposed]
         second = self.sides[transposed - 1]
         rows = np.atleast_2d(right.take(self.order, axis=0).T)
-        solved = self.skyline.solve(first, self.pivots, second, rows)
+        solved = self.skyline.solve(
+            first, self.pivots, second=second, right=rows
+        )
         return solved.T.take(self.rank, axis=0).reshape(right.shape)
 
 
@@ -534,7 +536,7 @@ class Factoriser:
             return None
         count = 2 if skew.size else 1
         buffer = buffer or skyline.allocate(count)
-        pivots, growth = skyline.factorise(buffer, values, skew)
+        pivots, growth = skyline.factorise(buffer, values, skew=skew)
         # An entry of the matrix that is not finite makes a pivot infinite or NaN.
         if not (
             pivots.min() > 0 and pivots.max() < np.inf and growth.max() < GROWTH

@@ -194,7 +194,9 @@ class ModalResponse:
         body = experiment.body
         markers = experiment.markers
         forces = Forces.from_experiment(
-            experiment, experiment.t_s[:1], body.theta_from_values(constants)
+            experiment,
+            experiment.t_s[:1],
+            theta=body.theta_from_values(constants),
         ).only_loads()
         modes = natural_modes(
             forces, body.nodes_m, free_dofs=experiment.free_dofs, count=MODES

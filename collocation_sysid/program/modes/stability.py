@@ -88,7 +88,7 @@ def _instability(iterate: ExperimentIterate) -> Instability | None:
     growths = np.array(
         [
             growth_rate_1_s(
-                Forces.from_experiment(experiment, time, theta),
+                Forces.from_experiment(experiment, time, theta=theta),
                 x,
                 free_dofs=np.flatnonzero(~there),
             )

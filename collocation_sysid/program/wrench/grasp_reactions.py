@@ -131,7 +131,7 @@ class GraspReactions:
         moved = np.zeros((rows, dofs, columns))
         rotations = np.zeros((rows, grasps, 3, 3))
         return cls(
-            GraspForces.zeros(rows, dofs, columns),
+            GraspForces.zeros(rows, dofs, columns=columns),
             moved,
             rotations=rotations,
             shifts=rotations[..., 0].copy(),

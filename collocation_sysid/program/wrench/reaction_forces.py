@@ -12,6 +12,9 @@ rows g of G = ∂F/∂ξ and C = ∂F/∂ν:
 A row belongs to the time in the middle of its stencil: with the midpoint rule row t is the balance
 of momentum about t − 1. Rows of the start know the acceleration to first order only and are left
 out.
+
+Use `reactions_at` for values, `linearised_reactions` for changes along the equations of motion, and
+`reaction_vjp` for gradients.
 """
 
 from __future__ import annotations
@@ -24,7 +27,10 @@ from numpy.typing import NDArray
 
 from ...common.array_types import Array, Index
 from ...model.dynamics import Dynamics
+from ...model.equations_at_parameters import EquationsAtParameters
 from ...model.internal_variables import AnyHistory
+from ..linear_algebra.block_band import Submatrix
+from ..observables import ReactionForces
 
 
 def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:
@@ -82,6 +88,25 @@ class GraspForces:
         self.changes[:done] = known.changes
 
 
+@dataclass(frozen=True, eq=False)
+class ReactionGradient:
+    """Derivatives of a weighted sum of reaction forces, with history variables kept constant.
+
+    Attributes
+    ----------
+    by_x : (N, 3n) array
+        Derivatives by the positions [1/m].
+    by_parameters : (m,) array
+        Derivatives by the parameters that change the motion.
+    force_weights : (N, 3n) array
+        Weights of the forces at the evaluations [1/N], by which history variables contribute.
+    """
+
+    by_x: Array
+    by_parameters: Array
+    force_weights: Array
+
+
 def forces_on_dofs(
     dynamics: Dynamics,
     x: Array,
@@ -110,6 +135,157 @@ def forces_on_dofs(
     force = np.zeros((len(x), len(dofs)))
     force[dynamics.first_row :] = dynamics.force(x, histories)[:, dofs]
     return force
+
+
+def reactions_at(
+    dynamics: Dynamics,
+    x: Array,
+    dofs: Index,
+    histories: Sequence[AnyHistory] = (),
+) -> ReactionForces:
+    """Return the reaction forces on selected dofs (g,) of a motion, without changes.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Equations of motion; rows after those of x are not used.
+    x : (rows, 3n) array
+        Positions [m].
+    dofs : (g,) array
+        Selected dofs.
+    histories : sequence of histories
+        History variables at x; computed from x if it is empty.
+    """
+    dynamics = dynamics.truncated_to(len(x))
+    reaction = reaction_forces(
+        dynamics,
+        dynamics.mass.inertia_kg[:, dofs],
+        force=forces_on_dofs(dynamics, x, dofs=dofs, histories=histories),
+        acceleration=dynamics.acceleration(x)[:, dofs],
+    )
+    return ReactionForces(reaction, x[:, dofs])
+
+
+def linearised_reactions(
+    equations: EquationsAtParameters,
+    x: Array,
+    grasp_forces: GraspForces,
+    position_changes: Array,
+    dofs: Index,
+    step: Array | None = None,
+    is_by_parameters: bool = True,
+) -> ReactionForces:
+    """Return the reaction forces on selected dofs with their changes along the equations of motion.
+
+    Parameters
+    ----------
+    equations : EquationsAtParameters
+        Equations of motion at the parameters.
+    x : (rows, 3n) array
+        Positions [m].
+    grasp_forces : GraspForces
+        Forces on the dofs at x, with their changes.
+    position_changes : (rows, g, c) array
+        Changes of the positions of the dofs [m].
+    dofs : (g,) array
+        Selected dofs.
+    step : (rows, 3n) array, optional
+        Step of the positions [m]. If given, values are those after the step, to first order, and
+        column 0 of the forces must belong to it; it has no column in the result.
+    is_by_parameters : bool
+        Whether the columns are derivatives by the parameters that change the motion, which also
+        change the masses.
+    """
+    dynamics = equations.dynamics.truncated_to(len(x))
+    if step is not None:
+        position_changes = np.concatenate(
+            [step[:, dofs, None], position_changes], axis=2
+        )
+    acceleration = dynamics.acceleration(x)[:, dofs]
+    mass_kg = dynamics.mass.inertia_kg[:, dofs]
+    reaction = reaction_forces(
+        dynamics, mass_kg, force=grasp_forces.force, acceleration=acceleration
+    )
+    by = reaction_changes(
+        dynamics,
+        mass_kg,
+        force_changes=grasp_forces.changes,
+        position_changes=position_changes,
+    )
+    if is_by_parameters:
+        first = 0 if step is None else 1
+        by[..., first:] += equations.inertia_derivatives(
+            slice(len(x)), acceleration, dofs=dofs
+        )
+    if step is None:
+        return ReactionForces(
+            reaction,
+            x[:, dofs],
+            reaction_by=by,
+            position_by=position_changes,
+        )
+    return ReactionForces(
+        reaction + by[..., 0],
+        x[:, dofs] + position_changes[..., 0],
+        reaction_by=by[..., 1:],
+        position_by=position_changes[..., 1:],
+    )
+
+
+def reaction_vjp(
+    equations: EquationsAtParameters,
+    x: Array,
+    weights: Array,
+    dofs: Index,
+    buffer: Array,
+) -> ReactionGradient:
+    """Vector–Jacobian product of the reaction forces R on selected dofs, with history variables
+    kept constant.
+
+    Parameters
+    ----------
+    equations : EquationsAtParameters
+        Equations of motion at the parameters.
+    x : (N, 3n) array
+        Positions [m].
+    weights : (N, g) array
+        Weights of the reaction forces [1/N].
+    dofs : (g,) array
+        Selected dofs.
+    buffer : array
+        Work space of `Dynamics.linearise`, overwritten.
+    """
+    dynamics = equations.dynamics
+    t = dynamics.tables
+    first = dynamics.first_row
+    force_weights = np.zeros_like(x)
+    force_weights[:, dofs] = -dynamics.combine_transposed(t.w, weights)
+    at = dynamics.linearise(x, buffer)
+    slopes = equations.force_derivatives(slice(first, None), at.by_theta)
+    by_p = np.einsum("tg,tgp->p", force_weights[first:, dofs], slopes[:, dofs])
+    if equations.mass_depends_on_parameters:
+        acceleration = dynamics.acceleration(x)[:, dofs]
+        own = equations.inertia_derivatives(
+            slice(None), acceleration, dofs=dofs
+        )
+        by_p += np.einsum("tg,tgp->p", weights, own)
+    rows = Submatrix(dynamics.pattern, dofs)
+    state = np.zeros_like(x)
+    rate = np.zeros_like(x)
+    for k, weight in enumerate(force_weights[first:, dofs]):
+        if weight.any():
+            skew = at.by_position_skew[k]
+            state[first + k] = rows.extract(at.by_position[k], skew).T @ weight
+            rate[first + k] = (
+                rows.extract(at.by_velocity[k], at.by_velocity_skew[k]).T
+                @ weight
+            )
+    by_x = dynamics.combine_transposed(t.p, state)
+    by_x += dynamics.combine_transposed(t.q, rate) / dynamics.step_s
+    mass_kg = dynamics.mass.inertia_kg[:, dofs]
+    inertia = dynamics.combine_transposed(t.s, mass_kg * weights)
+    by_x[:, dofs] += inertia / dynamics.step_s**2
+    return ReactionGradient(by_x, by_p, force_weights=force_weights)
 
 
 def reaction_forces(

@@ -140,6 +140,8 @@ class GraspWrench:
         Number of vectors, 2.
     local : None
         The observable depends on many positions, see `observables`.
+    measures_reactions : bool
+        Whether values depend on reaction forces; True.
     """
 
     sensor_index: int
@@ -155,6 +157,7 @@ class GraspWrench:
 
     vector_count = 2
     local = None
+    measures_reactions = True
 
     @property
     def delay_steps(self) -> int:
@@ -457,7 +460,7 @@ class GraspWrench:
         """Return the measured wrench Y = L W (n, 2, 3), force [N] and torque [N m], of a motion at
         φ, at the n times whose reaction forces the motion covers.
         """
-        value = self.evaluate_unfiltered(motion.reactions, phi)
+        value = self.evaluate_unfiltered(_reactions_of(motion), phi)
         evolution = self.filter_wrench(value, phi)
         return (evolution.states[0] if evolution else value).reshape(-1, 2, 3)
 
@@ -478,7 +481,7 @@ class GraspWrench:
         size : int
             Number of all parameters.
         """
-        forced = motion.reactions
+        forced = _reactions_of(motion)
         first = size - len(phi)
         assert forced.reaction_by is not None
         assert forced.position_by is not None
@@ -528,7 +531,7 @@ class GraspWrench:
         by_values : (n, 2, 3) array
             Derivatives of the scalar by Y.
         """
-        forced = motion.reactions
+        forced = _reactions_of(motion)
         by_phi = np.zeros(len(phi))
         by_x = np.zeros_like(motion.x)
         by_reaction = np.zeros_like(forced.reaction)
@@ -581,7 +584,7 @@ class GraspWrench:
         """
         if grasp is not self.grasp or self.frame != "grasp":
             return 0.0
-        value = self.evaluate_without_tool(motion.reactions)
+        value = self.evaluate_without_tool(_reactions_of(motion))
         axes = self.frames[0][: len(value)]
         data = [
             axes.reshape(-1, 9),
@@ -608,6 +611,19 @@ def sensed_dofs(experiment: Experiment) -> Index:
         for k in experiment.instrumented_grasps
     ]
     return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *grasp_dofs]))
+
+
+def _reactions_of(motion: ObservedMotion) -> ReactionForces:
+    """Return the reaction forces of a motion.
+
+    Raises
+    ------
+    ValueError
+        If the motion has none.
+    """
+    if motion.reactions is None:
+        raise ValueError("a wrench needs the reaction forces of the motion")
+    return motion.reactions
 
 
 def _moment(u: ca.SX, data: ca.SX) -> ca.SX:

@@ -181,11 +181,7 @@ class WrenchResidual(MeasurementResidual):
         """Return the prediction (S, 6) [N, N m] at φ (k,) from reaction forces at the observable's
         times; NaN for samples outside these times.
         """
-
-        def reactions() -> ReactionForces:
-            return known_reactions
-
-        motion = ObservedMotion(np.zeros((0, 0)), reactions)
+        motion = ObservedMotion(np.zeros((0, 0)), known_reactions)
         values = self.observable.evaluate(motion, phi)
         if not len(values):
             return np.full(self.wrench.values.shape, np.nan)
@@ -266,7 +262,11 @@ def wrench_residuals(
             nuisance=nuisance,
             number=number,
         )
-        models.append(WrenchResidual.from_sensor(channel, wrench, label, huber))
+        models.append(
+            WrenchResidual.from_sensor(
+                channel, wrench, label=label, huber=huber
+            )
+        )
     return tuple(models)
 
 

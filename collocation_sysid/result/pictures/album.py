@@ -173,8 +173,8 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
 
 
 def _infinities_as_nan(markers_m: Array | None) -> Array | None:
-    """Return markers with NaN in place of infinities, where a method or simulation diverged; None
-    for None.
+    """Return a copy of markers (T, M, 3) with NaN in place of infinities, where a method or
+    simulation diverged; None for None.
     """
     return (
         None
@@ -188,16 +188,21 @@ def save_pictures(
     pictures: Mapping[str, Figure],
     say: Callable[[str], None] | None = None,
 ) -> list[Path]:
-    """Write each picture as <name>.png and return the files.
+    """Write each picture as <name>.png and return the files; existing ones are replaced.
 
     Parameters
     ----------
     folder : str or Path
-        An existing folder.
+        Folder to write into; it is made if missing.
     pictures : mapping of name to Figure
         Characters that a file name cannot have become underscores.
     say : callable, optional
         Called before each picture with a sentence that has its number, counted from 1.
+
+    Raises
+    ------
+    InputError
+        If a picture cannot be written.
     """
     files = []
     with counted_phase(StepUnit.PICTURE, len(pictures)):
@@ -223,12 +228,19 @@ def redraw_pictures(
     """Write the pictures of a run folder into `folder`, all but that of the Jacobian, and return
     the files.
 
-    `say` is as in `save_pictures`.
+    Parameters
+    ----------
+    run : str or Path
+        The run folder.
+    folder : str or Path
+        Folder to write into, made if missing; existing pictures are replaced.
+    say : callable, optional
+        See `save_pictures`.
 
     Raises
     ------
     InputError
-        If `run` is not a run folder.
+        If `run` is not a run folder or a damaged one, or a picture cannot be written.
     """
     result, replays = read_run(run)
     with damaged_run_refused(Path(run)):

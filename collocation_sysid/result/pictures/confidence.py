@@ -218,7 +218,9 @@ class _DeviationAxis:
 
     @classmethod
     def from_reach(cls, reach: float) -> _DeviationAxis:
-        """Return an axis with round numbers within ± `reach`: percent, or factors if it is wide."""
+        """Return an axis with round numbers within ± `reach`, a deviation of a logarithm above
+        zero: in percent, or as factors if it is wider than `FACTOR_THRESHOLD`.
+        """
         if reach > FACTOR_THRESHOLD:
             factor = round_length(np.exp(0.9 * reach))
             size = float(np.log(factor))

@@ -107,7 +107,7 @@ def depth_picture(rows: Array) -> Figure:
 
 
 def _sentence_figure(text: str) -> Figure:
-    """Return a small figure that has only a sentence."""
+    """Return a small figure that has only the sentence `text`."""
     figure = Figure(
         figsize=(MAX_PANEL_SHARE * PAGE_MM / MM_PER_INCH, TITLE_HEIGHT_INCH),
         layout="constrained",

@@ -111,9 +111,18 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
 def _first_steps(
     collocation: Collocation, z: Array
 ) -> tuple[Collocation, Array]:
-    """Return collocation and variables of the first timesteps alone, without nuisance parameters.
+    """Return the problem of all fitted experiments on their first samples, which contain at least
+    `SHOWN_STEPS` time steps if the recordings do, and its variables.
 
-    The complete Jacobian may need gigabytes.
+    The complete Jacobian may need gigabytes. Positions and shared parameters are those of z;
+    nuisance parameters are at their guesses, and measurements are associated with the body again.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Complete problem; not modified.
+    z : (variables,) array
+        Its variables.
     """
     count = -(-SHOWN_STEPS // collocation.substeps) + SPARE_SAMPLES
     few = [

@@ -264,6 +264,15 @@ def _worst_markers(
 
     Residuals are those of the first model; without a model, or if there are not more markers, the
     first markers are returned.
+
+    Parameters
+    ----------
+    measured_m : (T, M, 3)
+        Measured markers, NaN where missing.
+    models_m : sequence of (T, M, 3)
+        Markers of each model.
+    count : int
+        Largest number of markers.
     """
     if measured_m.shape[1] <= count or not models_m:
         return list(range(min(count, measured_m.shape[1])))

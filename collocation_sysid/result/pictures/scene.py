@@ -238,22 +238,23 @@ class BodyDrawing:
         """Update the drawing.
 
         Markers hidden by the body are drawn as rings. Grasped nodes on faces turned away are left
-        out, and so are points of depth cameras that the body hides.
+        out, and so are points of depth cameras that the body hides. A drawing with an `edge_colour`
+        shows the edges alone, and uses only the positions.
 
         Parameters
         ----------
         positions_m : (n, 3)
-            Positions of the nodes.
+            Positions of the nodes [m].
         is_grasped : (n,) bool
             Whether a node is grasped.
         markers_m : (M, 3)
-            Markers, NaN where missing.
+            Markers [m], NaN where missing.
         colours : (F, 3), optional
-            Colours of the triangles; those of their parts by default.
+            Colours of the triangles, from 0 to 1; those of their parts by default.
         outlines_m : (o, 3), optional
-            Outlines of obstacles, NaN between lines; unchanged by default.
+            Outlines of obstacles [m], NaN between lines; unchanged by default.
         depth_points_m : (P, 3), optional
-            Points of depth cameras; unchanged by default.
+            Points of depth cameras [m]; unchanged by default.
         """
         camera = self.view.camera
         visible_faces = camera.visible_faces(positions_m, self.surface)

@@ -85,9 +85,9 @@ def shapes_picture(
     Parameters
     ----------
     replay : MotionRecord
-        An experiment with at least one trajectory.
+        An experiment with shapes, at least one of which is finite, see `MotionRecord.has_shapes`.
     count : int
-        Number of samples.
+        Number of samples; fewer are shown if there are not as many.
     field : SurfaceField, optional
         Colours of the body; those of its parts by default.
     camera : ParallelCamera, optional
@@ -174,11 +174,11 @@ def shapes_picture(
 
 
 def _draw_colour_bar(axes: Axes, field: SurfaceField, samples: Index) -> Array:
-    """Draw the colour bar of a field into `axes`, and return the colours (k, F, 3) at samples with
-    indices (k,).
+    """Draw the colour bar of a field into `axes`, and return the colours (k, F, 3), from 0 to 1, at
+    samples with indices (k,); grey where the field is NaN.
 
     The scale begins at zero if the smallest value is small relative to the largest, and is the same
-    for all samples.
+    for all samples; NaN does not count.
     """
     values = field.values_at(samples)
     low = np.nanmin(values)
@@ -207,7 +207,7 @@ def contact_pictures(replay: MotionRecord) -> dict[str, Figure]:
     "pressure" and "gap".
 
     The viewing direction is the one from which most of the pressure is visible. Empty without
-    obstacles.
+    obstacles or without shapes.
     """
     positions_m = replay.shapes_m
     gaps_m = replay.gaps_m

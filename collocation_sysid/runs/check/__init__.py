@@ -551,7 +551,9 @@ def _concerns(
 
 
 def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
-    """Return the finding of each body, with the names of its experiments."""
+    """Return the finding of each body at the guess, with the names of its experiments; every
+    parameter must have a guess.
+    """
     guesses = problem.parameters.guesses
     names = [
         tuple(e.name for e in problem.experiments if e.body is b)

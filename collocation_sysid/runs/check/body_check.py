@@ -10,7 +10,6 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...fem.body import Body
-from ...fem.laws.constants import is_field_coefficient
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.mesh import TetMesh
 from ...fem.meshes.mesh_checks import edge_lengths, mean_ratios
@@ -82,7 +81,9 @@ class Slenderness:
 
 
 def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
-    """Return the `count` elements of lowest quality, worst first; all of them if there are fewer."""
+    """Return the shapes of the `count` elements of lowest quality, worst first; all of them if
+    there are fewer.
+    """
     corners = mesh.points_m[mesh.tetrahedra]
     areas = [_areas(corners[:, face]) for face in _FACES]
     heights = 3 * mesh.volumes_m3 / np.max(areas, axis=0)
@@ -329,7 +330,7 @@ def _rest_shape(body: Body) -> str | None:
 
 def _rest_shape_change_m(body: Body, theta: Array) -> float:
     """Return the largest distance of the mesh of a body from its stress-free shape [m]: 0 if the
-    mesh is that shape, NaN if none can be computed at the constants θ (k,).
+    mesh is that shape, NaN if none can be computed at the constants `theta` (k,).
     """
     if body.inverse_equilibrium is None:
         return 0.0
@@ -351,8 +352,9 @@ def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
 
 
 def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
-    """Return E and ν at small strain of each part, then the constants θ of the body without
-    coefficients of fields, by name with the region; stated moduli replace computed ones.
+    """Return E [Pa] and ν at small strain of each part, then the constants of the body without
+    coefficients of fields, by name with the region; stated moduli replace computed ones. `theta`
+    (k,) are the constants.
     """
     moduli = {}
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
@@ -362,10 +364,9 @@ def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
             part.full_name("poisson"): poisson,
         }
     constants = zip(body.constants, theta.tolist(), strict=True)
+    coefficients = body.field_coefficient_names
     return moduli | {
-        name: value
-        for name, value in constants
-        if not is_field_coefficient(name)
+        name: value for name, value in constants if name not in coefficients
     }
 
 
@@ -481,7 +482,9 @@ def _check_grasp(
 
 
 def grasp_sentence(grasp_check: GraspCheck) -> str:
-    """Return number, share, bounding box [mm] and axes of the grasped nodes as text."""
+    """Return number and share of the grasped nodes, size and lower corner of their bounding box
+    [mm], and the axes along which they are held unless these are all, as text.
+    """
     size = " × ".join(
         f"{1e3 * (b - a):.4g}"
         for a, b in zip(grasp_check.low_m, grasp_check.high_m, strict=True)

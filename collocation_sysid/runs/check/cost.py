@@ -77,17 +77,20 @@ def require_memory(
 
 
 def interior_point_mb(entries: int) -> float:
-    """Return the memory of IPOPT [MB] for so many nonzeros of Jacobian and Hessian."""
+    """Return the memory of IPOPT [MB] for a number `entries` of nonzeros of Jacobian and Hessian
+    together.
+    """
     return BYTES_PER_NONZERO * entries / 1e6
 
 
 def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
-    """Return the numbers of nonzeros of the Jacobian and the Hessian of the lifted program,
-    extrapolated linearly from a few samples of each experiment.
+    """Return the numbers of nonzeros of the Jacobian and of the Hessian's upper triangle of the
+    lifted program, extrapolated linearly from a few samples of each experiment.
 
     Parameters
     ----------
     problem : Problem
+        Problem with a guess of every parameter.
     lifted : Collocation
         Program of the problem with lifted variables, as interior point needs it.
     """
@@ -112,7 +115,9 @@ def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
 
 
 def _count_nonzeros(problem: Problem) -> NDArray[np.int64]:
-    """Return the nonzeros of Jacobian and Hessian as (2,) int array, by laying them out."""
+    """Return the nonzeros of the Jacobian and of the Hessian's upper triangle of a problem as (2,)
+    int array, by laying them out.
+    """
     collocation = problem.collocation()
     structures = (collocation.jacobian_structure, collocation.hessian_structure)
     return np.array([len(indices) for _, indices in structures])
@@ -239,7 +244,15 @@ def cost_concerns(
     chosen: MethodCost, others: Sequence[MethodCost]
 ) -> list[Concern]:
     """Return a concern if the chosen method needs at least the memory that this machine has, with
-    another method that fits as remedy; none if the machine's memory is unknown.
+    another method that fits as remedy, or else a shorter recording; none if the machine's memory is
+    unknown.
+
+    Parameters
+    ----------
+    chosen : MethodCost
+        Cost of the chosen method.
+    others : sequence of MethodCost
+        Costs of all methods; the chosen one may be among them.
     """
     available = machine_memory_mb()
     if available is None or chosen.memory_mb < available:

@@ -52,14 +52,14 @@ def derivative_errors(
     """Return the largest relative errors of the first and the second derivatives.
 
     Exact derivatives along a random direction are compared with fourth-order central differences at
-    a disturbed start.
+    a disturbed start; the random numbers are the same in every call.
 
     Parameters
     ----------
     collocation : Collocation
         Program without lifted variables.
     z : (variables,) array
-        Start.
+        Start; not modified.
 
     Returns
     -------
@@ -98,7 +98,7 @@ def derivative_errors(
             collocation.gradient(at) + collocation.jacobian(at).T @ multipliers
         )
 
-    hessian = collocation.hessian(point, 1.0, multipliers)
+    hessian = collocation.hessian(point, 1.0, multipliers=multipliers)
     slope = collocation.jacobian(point) @ direction
     first = _deviation(
         collocation.constraint_values,
@@ -168,8 +168,19 @@ def _slope_error(
 def _deviation(
     function, exact: Array, point: Array, direction: Array, step: float
 ) -> float:
-    """Return the largest deviation of `exact` from fourth-order central differences of `function`
-    along `direction` at `point`, relative to the largest entry of `exact`.
+    """Return the largest deviation of an exact derivative from fourth-order central differences,
+    relative to the largest entry of `exact`.
+
+    Parameters
+    ----------
+    function : callable
+        Function of the variables, which returns a number or an array.
+    exact : array
+        Its derivative along `direction` at `point`.
+    point, direction : (variables,) arrays
+        Where and along which the function is differentiated.
+    step : float
+        Step of the differences.
     """
     after, before, two_after, two_before = (
         function(point + k * step * direction) for k in (1, -1, 2, -2)

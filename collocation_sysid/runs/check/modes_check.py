@@ -259,8 +259,10 @@ def _damping_limit(mode: ModeCheck) -> float:
 
 
 def mode_concerns(motion: ModesCheck) -> list[Concern]:
-    """Return concerns about too few steps or samples per period of the first mode, or a recording
-    shorter than its period; none without a mode.
+    """Return concerns about the time grid and the recording at the first mode; none without a mode.
+
+    There is at most one about the grid (numerical damping, or too few steps per period), one if the
+    period has too few samples, and one if the recording is shorter than the period.
     """
     mode = motion.first_mode
     if mode is None:
@@ -324,7 +326,12 @@ def _first_mode_data(motion: ModesCheck, mode: ModeCheck) -> dict[str, Any]:
 
 
 def mode_notes(motion: ModesCheck) -> list[str]:
-    """Return notes on rigid modes, overdamped modes and the lengthening of the first period."""
+    """Return notes on the modes of a recording; empty if there is nothing to note.
+
+    There may be one on rigid modes, one if the first mode is overdamped at the guess, and one if
+    the scheme lengthens the first period by more than `PERIOD_ERROR`, unless a concern about the
+    grid says more.
+    """
     notes = []
     mode = motion.first_mode
     name = motion.experiment

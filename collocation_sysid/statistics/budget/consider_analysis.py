@@ -19,7 +19,8 @@ from ...fem.body import Linearisation
 from ...program.collocation import Collocation, ExperimentIterate
 from ...program.linear_algebra.lapack import one_blas_thread
 from ...program.measurement_residual import MeasurementResidual
-from ...program.observables import ObservedMotion, ReactionForces
+from ...program.observable_response import ObservableResponse
+from ...program.observables import ObservedMotion
 from ...program.sweep import (
     ForwardSubstitution,
     PrescribedColumns,
@@ -369,21 +370,20 @@ def propagate_columns(
     sensed = GraspForces.zeros(
         len(x), len(segment.sensed_dofs), columns=columns.count
     )
-    response = iterate.observation.response_of_rows(
+    response = ObservableResponse.from_rows(
+        iterate,
         ForwardSubstitution(solver, columns, grasp_forces=sensed).iterate_rows(
             x
         ),
-        sensed,
+        grasp_forces=sensed,
     )
     columns_numbered = np.arange(columns.count)
     size = columns.count + len(phi)
-    motions = iterate.observation.linearised_motions(
-        x, response, is_by_parameters=False
-    )
+    motions = response.motions(is_by_parameters=False)
     for reading, motion in zip(segment.residuals, motions, strict=True):
         motion = _without_row_changes(motion, inertia_n)
         values, slopes = reading.observable.linearise(
-            motion, phi, columns_numbered, size
+            motion, phi, columns=columns_numbered, size=size
         )
         yield ColumnResponse(
             reading,
@@ -397,13 +397,11 @@ def _without_row_changes(
     motion: ObservedMotion, inertia_n: Array | float
 ) -> ObservedMotion:
     """Return the motion with `inertia_n` (N, g, c) [N], or a number, subtracted from the changes of
-    its reaction forces when these are evaluated; `motion` is not modified.
+    its reaction forces; a motion without reaction forces is returned as it is.
     """
-
-    def forced() -> ReactionForces:
-        """Return the reaction forces of the motion with changed derivatives by the columns."""
-        lacking = motion.reactions
-        assert lacking.reaction_by is not None  # along columns
-        return replace(lacking, reaction_by=lacking.reaction_by - inertia_n)
-
-    return ObservedMotion(motion.x, forced, changes=motion.changes)
+    reactions = motion.reactions
+    if reactions is None:
+        return motion
+    assert reactions.reaction_by is not None  # along columns
+    changed = replace(reactions, reaction_by=reactions.reaction_by - inertia_n)
+    return replace(motion, reactions=changed)

@@ -232,7 +232,7 @@ def sag_m(body: Body, theta: Array, support_dofs: Index, axis: int) -> Array:
     """
     own = body.nodes.points_m.size
     x = np.asarray(body.nodes_m, dtype=float)
-    stiffness = -body.linearise(x, np.zeros_like(x), theta).by_position[0]
+    stiffness = -body.linearise(x, np.zeros_like(x), theta=theta).by_position[0]
     free = np.setdiff1d(np.arange(own), support_dofs)
     matrix = sp.csc_array(body.pattern.matrix(stiffness)[free][:, free])
     weight_n = np.zeros(own)

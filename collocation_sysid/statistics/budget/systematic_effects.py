@@ -39,6 +39,7 @@ from ...recording.homogeneous_deformation import (
     HomogeneousDeformation,
 )
 from ...recording.nuisance import DEGREE
+from .platen_slip import slip_displacements_m
 from .shape_error import (
     CORRELATION,
     SURFACE_MODES,
@@ -192,7 +193,7 @@ class ExperimentAtAnswer:
             evaluated.force(
                 xi / length_factor,
                 nu / (length_factor * time_factor),
-                undamped,
+                theta=undamped,
                 memory_input=histories,
             )
         )
@@ -576,7 +577,7 @@ def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of a larger Poisson's ratio, per unit, where it is stated (fixed, or tied
     to a fixed one), in all such parts together; None if there is none.
     """
-    items = {item.name: item for item in at.parameters.items}
+    items = {item.name: item for item in at.parameters.components}
     constants = {
         name
         for name, item in items.items()
@@ -711,6 +712,18 @@ def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect(force) if platens else None
 
 
+def _platen_slip(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of faces that slide freely on platens instead of sticking; None if other
+    measurements than loads show the grip, or no face may slide, see `slip_displacements_m`.
+    """
+    displacement_m = slip_displacements_m(
+        at.iterate, at.theta, reactions_n=at.grasp_force_n
+    )
+    if displacement_m is None:
+        return None
+    return Effect(displacement_m=displacement_m)
+
+
 def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of rigid contact in place of the pressure law, to first order; None without
     contact that has an energy (with complementarity contact is rigid already).
@@ -793,7 +806,7 @@ def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
         at.dynamics.histories(at.iterate.x)
     ).memory_state
     forces_n = (
-        each.force(xi, nu, at.theta, memory_input=histories)
+        each.force(xi, nu, theta=at.theta, memory_input=histories)
         for each in (body.with_parts(parts), body)
     )
     return Effect(at.pad_rows(next(forces_n) - next(forces_n)))
@@ -959,6 +972,14 @@ ASSUMPTIONS = (
         effect=_platen_friction,
     ),
     Assumption(
+        "platen_slip",
+        "1",
+        sigma=1.0,
+        description="slip of faces that are pressed by platens and held along all axes, as a fraction of "
+        "that without friction, if only loads are measured",
+        effect=_platen_slip,
+    ),
+    Assumption(
         "contact_stiffness",
         "1",
         sigma=1.0,
@@ -1050,6 +1071,9 @@ class Assumptions(Options):
         Compliance of the test bench [m/N].
     platen_friction
         Coefficient of friction of platens between which nodes slide [1].
+    platen_slip
+        Slip of faces that are pressed by platens and held along all axes, as a fraction of that
+        without friction, if only loads are measured [1].
     contact_stiffness
         Compliance of the contact with obstacles, as a fraction of that of the pressure law [1].
     buoyancy
@@ -1149,6 +1173,7 @@ class Assumptions(Options):
     grip_layer_m: KnownDeviation = 0.0002
     machine_compliance_m_n: KnownDeviation = 1e-06
     platen_friction: Deviation = 0.1
+    platen_slip: Deviation = 1.0
     contact_stiffness: Deviation = 1.0
     buoyancy: Deviation = AIR_DENSITY_DEVIATION
     added_mass: Deviation = AIR_COEFFICIENT_DEVIATION

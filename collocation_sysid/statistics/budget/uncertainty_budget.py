@@ -380,8 +380,8 @@ def _line(
     combined = combine(
         name,
         estimate,
-        error,
-        systematic,
+        error=error,
+        systematic=systematic,
         known_effect=known_effect,
         linear=linear,
         bounds=bounds,
@@ -447,7 +447,7 @@ def _estimate_derivatives(
     slopes = {name: np.zeros(len(q)) for name in values}
     for k, item in enumerate(parameters.free):
         slopes[item.name][k] = item.value_derivative(values[item.name])
-    for item in parameters.items:
+    for item in parameters.components:
         if item.tied is not None:
             slopes[item.name] = item.tied.ratio * slopes[item.tied.to]
     return slopes | dict(fit.derived.derivatives)

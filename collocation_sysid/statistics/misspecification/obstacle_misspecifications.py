@@ -263,7 +263,7 @@ def _load_without_contact(
     forces_n = wrench.values[samples, :3]
     load_n = np.sqrt(np.nansum(forces_n**2, axis=1))
     is_measured = np.isfinite(forces_n).any(axis=1)
-    gaps_m = _smallest_gaps_m(experiment, obstacle, wrench.t_s[samples])
+    gaps_m = _smallest_gaps_m(experiment, obstacle, times_s=wrench.t_s[samples])
     limit_n = _noise_n(experiment, obstacle)
     far_m = PLACE * _diagonal_m(experiment)
     loaded = is_measured & (load_n > limit_n)

@@ -166,7 +166,9 @@ def _misfit(parts: Sequence[ExperimentIterate]) -> float:
         squares += float(np.sum(part.phi**2))
         for sensor in part.segment.custom_sensors:
             predicted = sensor.without_padding(
-                sensor.predict_motion(part.motion, part.phi)
+                sensor.predict_motion(
+                    part.motion_for(sensor.observable), part.phi
+                )
             )
             residuals = (
                 predicted - sensor.sensor.measured_values

@@ -219,7 +219,7 @@ def _of_parts(parts: Sequence[ExperimentIterate]) -> list[Hypothesis]:
     """
     hypotheses: list[Hypothesis] = []
     for part in parts:
-        forced = part.motion.reactions
+        forced = part.reactions
         for sensor in part.segment.sensors:
             hypotheses += _OneSensor(part, sensor, forced=forced).causes()
     return hypotheses

@@ -260,8 +260,9 @@ def profile_of_solution(
     parameters = solution.collocation.parameters
     free = [item.name for item in parameters.free]
     if name not in free:
+        scalars = ", ".join(item.name for item in parameters.free_scalars)
         raise InputError(
-            f"found {name!r}; expected one of the estimated parameters {', '.join(free)}",
+            f"found {name!r}; expected one of the estimated parameters {scalars}",
             None,
             where="uncertainty.profile",
         )

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from ...common.array_types import Array
-from ...fem.laws.constants import is_field_coefficient, is_modulus
+from ...fem.laws.constants import is_modulus
 from ...program.collocation import Collocation, ExperimentIterate
 from ..budget.consider_analysis import ResidualChanges, changes_of_assumptions
 from ..budget.systematic_effects import ExperimentAtAnswer
@@ -385,7 +385,7 @@ def relevance(fit: SolvedFit, probe: Probe) -> float:
     """
     shares = [0.0]
     for name, move in probe.moves.items():
-        if move.of_statistical95 is None or is_field_coefficient(name):
+        if move.of_statistical95 is None:
             continue
         shares.append(abs(move.of_statistical95))
         interval = fit.statistical[name].statistical95

@@ -1,0 +1,235 @@
+"""Displacements of a specimen's faces on platens if they slide instead of sticking.
+
+The load of a compression test depends on whether the end faces stick to the platens, and the load
+alone does not show which is the case. The displacements are of first order: those at which the
+tangential reactions of the faces vanish, linearised about the equilibrium with sticking faces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.linalg import splu
+
+from ...common.array_types import Array, Index
+from ...program.experiment_iterate import ExperimentIterate
+from ...recording.experiment import Experiment
+from ...recording.grasp import Grasp
+
+# Relative tolerance of the flatness of a face, and of a node that lies in a plane: rounding of mesh
+# files in single precision, over the longest extent of the body.
+FLATNESS = 1e-4
+# Largest tensile reaction of a face over its largest compressive one for which it may slide: above,
+# the face is bonded, since a platen does not pull. Errors of the zero remain below.
+LARGEST_TENSION = 0.2
+# Singular values of the prescribed components of rigid motions, relative to the largest, below
+# which a rigid motion is free: rounding.
+SMALLEST_SINGULAR_VALUE = 1e-6
+
+
+def slip_displacements_m(
+    iterate: ExperimentIterate,
+    theta: Array,
+    reactions_n: Array,
+) -> Array | None:
+    """Return the displacements (N, g) [m] of the g prescribed dofs if faces that stick to platens
+    slide freely; zero for dofs that remain held.
+
+    Material memory is neglected: the displacements are those of the relaxed material, and so are
+    other loads than the grasps.
+
+    Parameters
+    ----------
+    iterate : ExperimentIterate
+        The experiment at the answer.
+    theta : (k,) array
+        Constants of the body.
+    reactions_n : (N, g) array
+        Reaction forces on the prescribed dofs [N], zero while they are free.
+
+    Returns
+    -------
+    (N, g) array or None
+        None if no face may slide (see `sliding_faces`), if obstacles touch the body, whose contact
+        stiffness these equations lack, or if the linearised equations are singular.
+    """
+    experiment = iterate.segment.experiment
+    prescribed = iterate.equations.prescribed
+    axis = pressed_axis(prescribed.dofs, prescribed.positions_m)
+    if axis is None or experiment.obstacles or not is_load_only(experiment):
+        return None
+    faces = sliding_faces(
+        experiment, prescribed.dofs, reactions_n=reactions_n, axis=axis
+    )
+    released = _released_dofs(experiment, faces, axis=axis)
+    if not len(released):
+        return None
+    body = experiment.body
+    x = iterate.x
+    at = body.linearise(x, np.zeros_like(x), theta=theta)
+    kept = np.setdiff1d(prescribed.dofs, released)
+    displacements_m = np.zeros_like(reactions_n)
+    columns = np.searchsorted(prescribed.dofs, released)
+    for row, positions_m in enumerate(x):
+        unbalanced_n = np.zeros(positions_m.size)
+        unbalanced_n[released] = at.force[row, released]
+        try:
+            moved_m = _relaxed(
+                body.pattern.matrix(-at.by_position[row]),
+                unbalanced_n,
+                kept=kept,
+                positions_m=positions_m,
+            )
+        except RuntimeError:  # SuperLU: exactly singular
+            return None
+        displacements_m[row, columns] = moved_m[released]
+    return displacements_m
+
+
+def is_load_only(experiment: Experiment) -> bool:
+    """Return whether a static experiment measures wrenches only, so that no measurement shows the
+    shape of the body between the faces.
+    """
+    return bool(
+        experiment.is_static
+        and experiment.wrenches
+        and not experiment.markers.sample_count
+        and not experiment.depths
+        and not experiment.readings
+    )
+
+
+def pressed_axis(dofs: Index, positions_m: Array) -> int | None:
+    """Return the only axis (0, 1, 2) along which prescribed displacements change; None if they
+    change along several axes or none.
+
+    Parameters
+    ----------
+    dofs : (g,) int array
+        Prescribed dofs.
+    positions_m : (N, g) array
+        Their positions [m]; NaN while a dof is free.
+    """
+    changing = np.nanmax(positions_m, axis=0) > np.nanmin(positions_m, axis=0)
+    axes = np.unique(dofs[changing] % 3)
+    return int(axes[0]) if len(axes) == 1 else None
+
+
+def sliding_faces(
+    experiment: Experiment, dofs: Index, reactions_n: Array, axis: int
+) -> list[Grasp]:
+    """Return the grasps of flat end faces that are pressed and held along all axes, so that it is
+    only an assumption that they stick.
+
+    A face that is pulled by more than `LARGEST_TENSION` of its largest compression is bonded.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    dofs : (g,) int array
+        Prescribed dofs.
+    reactions_n : (N, g) array
+        Reaction forces on them [N].
+    axis : int
+        Loading axis, 0 to 2.
+    """
+    nodes_m = experiment.body.nodes.points_m
+    tolerance_m = FLATNESS * float(np.ptp(nodes_m, axis=0).max())
+    middle_m = (nodes_m[:, axis].min() + nodes_m[:, axis].max()) / 2
+    faces = []
+    for grasp in experiment.body_grasps:
+        heights_m = nodes_m[grasp.nodes, axis]
+        if len(grasp.axes) < 3 or np.ptp(heights_m) > tolerance_m:
+            continue
+        normal = np.isin(dofs, 3 * grasp.nodes + axis)
+        outward_n = reactions_n[:, normal].sum(axis=1) * np.sign(
+            heights_m.mean() - middle_m
+        )
+        compression_n = -outward_n.min()
+        if (
+            compression_n > 0
+            and outward_n.max() <= LARGEST_TENSION * compression_n
+        ):
+            faces.append(grasp)
+    return faces
+
+
+def _released_dofs(
+    experiment: Experiment, faces: list[Grasp], axis: int
+) -> Index:
+    """Return the tangential dofs (s,) of the faces, ascending, without those that a plane of
+    symmetry holds.
+
+    A plane of symmetry is a resting grasp of coplanar nodes along the normal of their plane; nodes
+    of the faces that lie in that plane remain held along this normal.
+    """
+    nodes_m = experiment.body.nodes.points_m
+    tolerance_m = FLATNESS * float(np.ptp(nodes_m, axis=0).max())
+    released = {
+        int(3 * node + other)
+        for face in faces
+        for node in face.nodes
+        for other in range(3)
+        if other != axis
+    }
+    for grasp in experiment.body_grasps:
+        if len(grasp.axes) > 1 or grasp.axis_indices[0] == axis:
+            continue
+        normal = int(grasp.axis_indices[0])
+        heights_m = nodes_m[grasp.nodes, normal]
+        if np.ptp(heights_m) > tolerance_m:
+            continue
+        in_plane = np.abs(nodes_m[:, normal] - heights_m.mean()) <= tolerance_m
+        released -= set((3 * np.flatnonzero(in_plane) + normal).tolist())
+    return np.array(sorted(released), dtype=np.int64)
+
+
+def _relaxed(
+    stiffness: sp.csc_array, force_n: Array, kept: Index, positions_m: Array
+) -> Array:
+    """Return the displacements (3n,) [m] that balance forces (3n,) [N] to first order, without the
+    rigid motions that the kept dofs leave free.
+
+    Raises
+    ------
+    RuntimeError
+        If the equations are singular.
+    """
+    moving = np.setdiff1d(np.arange(len(force_n)), kept)
+    modes = np.array(list(_free_rigid_motions(positions_m, kept))).reshape(
+        -1, len(force_n)
+    )[:, moving]
+    # Units of the border: a stiffness, so that pivots are comparable.
+    scale = float(np.abs(stiffness.diagonal()).mean())
+    border = sp.csc_array(scale * modes)
+    matrix = sp.block_array(
+        [[stiffness[moving][:, moving], border.T], [border, None]],
+        format="csc",
+    )
+    right = np.concatenate([force_n[moving], np.zeros(len(modes))])
+    moved_m = np.zeros(len(force_n))
+    moved_m[moving] = splu(matrix).solve(right)[: len(moving)]
+    return moved_m
+
+
+def _free_rigid_motions(positions_m: Array, kept: Index) -> Iterator[Array]:
+    """Yield rigid motions (3n,) of unit length that do not move the kept dofs, to first order about
+    the positions (3n,) [m].
+    """
+    points_m = positions_m.reshape(-1, 3)
+    arms_m = points_m - points_m.mean(axis=0)
+    size_m = float(np.abs(arms_m).max())
+    translations = np.tile(np.eye(3), (len(points_m), 1))
+    rotations = np.stack(
+        [np.cross(axis, arms_m / size_m).ravel() for axis in np.eye(3)], axis=1
+    )
+    modes = np.concatenate([translations, rotations], axis=1)
+    _, values, directions = np.linalg.svd(modes[kept])
+    is_held: NDArray[np.bool_] = np.zeros(6, dtype=bool)
+    is_held[: len(values)] = values > SMALLEST_SINGULAR_VALUE * values.max()
+    for direction in directions[~is_held]:
+        mode = modes @ direction
+        yield mode / np.linalg.norm(mode)
