@@ -4,15 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from math import inf
 from typing import Any
 
+import numpy as np
+
+from ..common.array_types import Array
 from ..common.display import short
+from ..methods.complementarity import with_contact_energy
 from ..methods.solution import Solution
+from ..model.contact import contact_terms
 from ..program.collocation import ExperimentIterate
 from ..program.contact.contact_summary import (
     ContactSummary,
     contact_summaries_of_parts,
     friction_summaries,
+    surface_gaps_and_pressures,
 )
 from ..recording.experiment import Experiment
 from ..statistics.concerns import Concern, concern_if
@@ -22,10 +29,13 @@ from ..statistics.misspecification.obstacle_misspecifications import (
 )
 from ..statistics.misspecification.placement_causes import placement_mistakes
 from .feature import Feature
-from .measurement_results import FittedExperiment
+from .measurement_results import FittedExperiment, InstrumentPrediction
 
 # Number of faces below which the mesh determines the width of a contact.
 FEWEST_FACES = 4.0
+# Largest step of differences, relative to the gap over which the pressure rises: it must stay
+# within.
+STEP_PER_WIDTH = 1e-3
 AT_THE_GUESS = ", at the guess"
 
 
@@ -34,6 +44,12 @@ def hypotheses(experiment: Experiment) -> tuple[Hypothesis, ...]:
     return tuple(placement_mistakes(experiment)) or tuple(
         obstacle_hypotheses(experiment)
     )
+
+
+def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
+    """Yield likely errors in the obstacles of the fitted experiments and their loads."""
+    for segment in solution.collocation.transcriptions:
+        yield from obstacle_hypotheses(segment.experiment)
 
 
 def guess_concerns(
@@ -125,6 +141,39 @@ def contact_concerns(
     ]
 
 
+def recorded(
+    experiment: Experiment,
+    solution: Solution,
+    _: InstrumentPrediction | None,
+    positions_m: Array,
+) -> dict[str, Any]:
+    """Return gap [m] and pressure [Pa] on the boundary triangles at the estimates, (T, F) each;
+    nothing without obstacles.
+
+    Poses are corrected by the nuisance parameters if the experiment was fitted.
+    """
+    if not experiment.obstacles:
+        return {}
+    if (part := solution.part_of(experiment.name)) is not None:
+        experiment = part.segment.corrected_experiment(part.phi)
+    theta = experiment.body.theta_from_values(solution.parameters)
+    gaps_m, pressures_pa = surface_gaps_and_pressures(
+        experiment, np.array(theta), x=positions_m.reshape(len(positions_m), -1)
+    )
+    return {"gaps_m": gaps_m, "pressures_pa": pressures_pa}
+
+
+def largest_difference_step(experiment: Experiment) -> float:
+    """Return a small share of the narrowest gap range over which a pressure rises; infinity without
+    obstacles.
+    """
+    widths_m = (
+        term.law_of_contact.largest_width_m
+        for term in contact_terms(experiment)
+    )
+    return STEP_PER_WIDTH * min(widths_m, default=inf)
+
+
 def fit_fields(part: ExperimentIterate, _: Solution) -> dict[str, Any]:
     """Return the friction with each obstacle; None without friction."""
     friction = friction_summaries(
@@ -149,8 +198,12 @@ def fit_lines(
 CONTACT = Feature(
     "contact",
     hypotheses=hypotheses,
+    fit_hypotheses=fit_hypotheses,
     guess_concerns=guess_concerns,
     concerns=concerns,
+    for_simulation=with_contact_energy,
+    largest_difference_step=largest_difference_step,
+    recorded=recorded,
     fit_fields=fit_fields,
     fit_lines=fit_lines,
 )

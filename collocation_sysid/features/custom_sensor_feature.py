@@ -23,6 +23,7 @@ from .measurement_results import (
     InstrumentMisfit,
     InstrumentPrediction,
     PredictionErrors,
+    comparison_columns,
     misfit,
 )
 
@@ -157,6 +158,31 @@ def _predict_sensors(
     return [gauge.predict_motion(motion, phi) for gauge in gauges]
 
 
+def recorded(
+    experiment: Experiment,
+    solution: Solution,
+    predicted: InstrumentPrediction | None,
+    _: Array,
+) -> dict[str, Any]:
+    """Return an array (S, 1 + 3m) for each sensor, by name.
+
+    The columns are the time [s], and its m numbers as measured, fitted and simulated; NaN where the
+    experiment was not fitted or not simulated.
+    """
+    fitted = solution.readings.get(experiment.name, {})
+    simulated = {} if predicted is None else predicted.readings
+    return {
+        "readings": {
+            gauge.name: comparison_columns(
+                gauge.sample_times_s,
+                gauge.measured_values,
+                *(each.get(gauge.name) for each in (fitted, simulated)),
+            )
+            for gauge in experiment.readings
+        }
+    }
+
+
 def units_by_name(experiment: Experiment) -> dict[str, str] | None:
     """Return the units of the custom sensors that state one, by name; None if none does."""
     return {
@@ -216,6 +242,7 @@ CUSTOM_SENSORS = Feature(
     errors=errors,
     misfits=misfits,
     step_differences=step_differences,
+    recorded=recorded,
     fit_fields=fit_fields,
     fit_lines=fit_lines,
     error_texts=error_texts,

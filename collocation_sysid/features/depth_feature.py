@@ -50,6 +50,9 @@ LARGEST_CAMERA_OFFSET = 2.0
 LARGEST_OUTLINE_DISTANCE_PX = 3.0
 # Share of outline points that may be farther.
 OUTLINE_SHARE = 0.1
+# RMS distance of depth points in standard deviations up to which there is nothing to explain: noise
+# along the normal is rarely known better.
+LARGEST_NOISE = 1.5
 # Most nodes of a body whose equilibria for many stiffnesses take seconds.
 NODES = 2000
 
@@ -208,6 +211,31 @@ def depth_image_hypotheses(
         for cause in camera_image_hypotheses(e, constants)
     )
     return rank((*clocks, *shapes))
+
+
+def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
+    """Yield hypotheses about the cameras of those experiments that do not fit."""
+    for part in solution.parts:
+        if not any(
+            _misses_surface(
+                reading.signed_distances_m(observation, part.phi)
+                / reading.correspondences.camera.depth.sigma_m
+            )
+            for reading, observation in part.depth_residuals
+        ):
+            continue
+        experiment = part.segment.experiment
+        yield from camera_hypotheses(experiment)
+        yield from camera_clock_hypotheses(part)
+        yield from camera_image_hypotheses(experiment, solution.parameters)
+
+
+def _misses_surface(distances: Array) -> bool:
+    """Whether the distances of points from the surface, in standard deviations, are larger than
+    noise; also if none is compared (all NaN).
+    """
+    compared = distances[np.isfinite(distances)]
+    return not len(compared) or root_mean(compared**2) > LARGEST_NOISE
 
 
 # Concerns -----------------------------------------------------------------------------------------
@@ -435,6 +463,7 @@ DEPTH = Feature(
     step_differences=step_differences,
     hypotheses=camera_hypotheses,
     simulated_hypotheses=simulated_hypotheses,
+    fit_hypotheses=fit_hypotheses,
     part_concerns=part_concerns,
     simulation_concerns=simulation_concerns,
     validation_concerns=validation_concerns,

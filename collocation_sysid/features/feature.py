@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Any
 
 from ..common.array_types import Array
+from ..common.declarations import identity
 from ..methods.solution import Solution
 from ..problem import Problem
 from ..program.collocation import Collocation, ExperimentIterate
@@ -105,6 +107,15 @@ class Feature:
     reason_against_copy : callable
         ``reason_against_copy(experiment, other)``: why measurements of another recording cannot be
         compared; "" if they can.
+    for_simulation : callable
+        ``for_simulation(experiment)``: the experiment as forward simulations need it.
+    largest_difference_step : callable
+        ``largest_difference_step(experiment)``: largest scaled step of differences at the guess
+        with which a check tests derivatives.
+    recorded : callable
+        ``recorded(experiment, solution, predicted, positions_m)``: fields of `MotionRecord` for
+        pictures and films, of a recording that was fitted, simulated (`predicted` is not None), or
+        both; `positions_m` are the shown positions (T, n, 3).
     errors : callable
         ``errors(experiment, predicted)``: fields of `PredictionErrors`.
     misfits : callable
@@ -117,6 +128,8 @@ class Feature:
         ``hypotheses(experiment)``: likely errors in the description, without a simulation.
     simulated_hypotheses : callable
         ``simulated_hypotheses(check)``: the same by comparison with a simulation, and notes.
+    fit_hypotheses : callable
+        ``fit_hypotheses(solution)``: the same by the residuals of a fit.
     guess_concerns : callable
         ``guess_concerns(parts, is_complete)``: concerns about the simulation at the guess, of which
         `is_complete` is false if it ends before the recordings.
@@ -154,6 +167,11 @@ class Feature:
         [Experiment, Experiment], Iterable[tuple[Array, Array]]
     ] = _nothing
     reason_against_copy: Callable[[Experiment, Experiment], str] = _no_reason
+    for_simulation: Callable[[Experiment], Experiment] = identity
+    largest_difference_step: Callable[[Experiment], float] = lambda _: inf
+    recorded: Callable[
+        [Experiment, Solution, InstrumentPrediction | None, Array], Fields
+    ] = _no_fields
     errors: Callable[[Experiment, InstrumentPrediction], Fields] = _no_fields
     misfits: Callable[
         [Experiment, InstrumentPrediction], Iterable[InstrumentMisfit]
@@ -166,6 +184,7 @@ class Feature:
     simulated_hypotheses: Callable[
         [SimulatedCheck], tuple[Sequence[Hypothesis], Sequence[str]]
     ] = lambda _: ((), ())
+    fit_hypotheses: Callable[[Solution], Iterable[Hypothesis]] = _nothing
     guess_concerns: Callable[
         [Sequence[ExperimentIterate], bool], Iterable[Concern]
     ] = _nothing

@@ -286,3 +286,19 @@ def main_error(error: PredictionErrors) -> float:
     [N]; infinity if neither is compared.
     """
     return error.rms_m or error.wrench_rms_n or float("inf")
+
+
+def comparison_columns(
+    t_s: Array, measured: Array, *models: Array | None
+) -> Array:
+    """Return the columns time, measured values and the values of each model, as one array (S, 1 + m
+    (1 + number of models)).
+
+    `t_s` is (S,), `measured` and each of `models` (S, m); the columns of a model that is None are
+    NaN.
+    """
+    columns = (
+        np.full_like(measured, np.nan) if each is None else each
+        for each in models
+    )
+    return np.column_stack([t_s, measured, *columns])

@@ -20,8 +20,10 @@ from ..statistics.misspecification.misspecification_hypothesis import (
     Hypothesis,
     rank,
 )
+from ..statistics.misspecification.plausibility import load_sign_hypotheses
 from ..statistics.misspecification.wrench_causes import (
     CHECKED_SAMPLES,
+    wrench_causes,
     wrench_mistakes,
 )
 from .feature import Feature, SimulatedCheck, Units
@@ -30,6 +32,7 @@ from .measurement_results import (
     InstrumentMisfit,
     InstrumentPrediction,
     PredictionErrors,
+    comparison_columns,
     misfit,
 )
 
@@ -138,6 +141,41 @@ def simulated_hypotheses(
     return rank(wrench_mistakes(check.collocation)), ()
 
 
+def fit_hypotheses(solution: Solution) -> list[Hypothesis]:
+    """Return likely errors of wrenches, by the residuals of a fit and by the signs of loads."""
+    return [
+        *wrench_causes(solution),
+        *(
+            hypothesis
+            for segment in solution.collocation.transcriptions
+            for hypothesis in load_sign_hypotheses(segment.experiment)
+        ),
+    ]
+
+
+def recorded(
+    experiment: Experiment,
+    solution: Solution,
+    predicted: InstrumentPrediction | None,
+    _: Array,
+) -> dict[str, Any]:
+    """Return an array (S, 19) for each sensor: time, and the wrench measured, fitted and simulated.
+
+    The wrenches are those of the whole specimen also where symmetry reduces the model to a part of
+    it. NaN where the experiment was not fitted or not simulated.
+    """
+    sensors = experiment.wrenches
+    unknown = [None] * len(sensors)
+    fitted = solution.wrenches.get(experiment.name, unknown)
+    simulated = unknown if predicted is None else predicted.wrenches
+    series = []
+    for sensor, *models in zip(sensors, fitted, simulated, strict=True):
+        columns = comparison_columns(sensor.t_s, sensor.values, *models)
+        columns[:, 1:] *= sensor.symmetry
+        series.append(columns)
+    return {"wrenches": series}
+
+
 def validation_concerns(
     name: str, error: PredictionErrors, solution: Solution
 ) -> list[Concern]:
@@ -219,7 +257,9 @@ WRENCH = Feature(
     misfits=misfits,
     step_differences=step_differences,
     simulated_hypotheses=simulated_hypotheses,
+    fit_hypotheses=fit_hypotheses,
     validation_concerns=validation_concerns,
+    recorded=recorded,
     fit_fields=fit_fields,
     pooled_fields=pooled_fields,
     fit_lines=fit_lines,

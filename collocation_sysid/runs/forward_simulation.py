@@ -18,7 +18,6 @@ from ..features.measurement_results import (
 )
 from ..features.registry import FEATURES, merged_fields
 from ..fem.kernels import map_experiments
-from ..methods.complementarity import with_contact_energy
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..model.schemes import MOST_STEPS, as_scheme
@@ -259,8 +258,11 @@ def _simulate(
     integrator = (
         problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
     )
+    experiment = segment.corrected_experiment(phi)
+    for feature in FEATURES:
+        experiment = feature.for_simulation(experiment)
     return simulate(
-        with_contact_energy(segment.corrected_experiment(phi)),
+        experiment,
         segment.body.theta_from_values(parameters),
         integrator=integrator,
         timestep_s=_step_s(problem, segment),

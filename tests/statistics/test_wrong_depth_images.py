@@ -20,6 +20,7 @@ from collocation_sysid.runs.check import (
     check_problem,
     misspecification_hypotheses,
 )
+from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.runs.solving import solve
 from collocation_sysid.statistics.misspecification.camera_clock_misspecifications import (
     camera_clock_hypotheses,
@@ -27,9 +28,6 @@ from collocation_sysid.statistics.misspecification.camera_clock_misspecification
 from collocation_sysid.statistics.misspecification.camera_image_misspecifications import (
     camera_image_hypotheses,
     equilibrium_shapes_m,
-)
-from collocation_sysid.statistics.misspecification.fit_misspecifications import (
-    find_misspecifications,
 )
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
     Hypothesis,

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from ...common.array_types import Array
-from ...model.contact import contact_terms
+from ...features.registry import FEATURES
 from ...problem import Problem
 from ...program.collocation import Collocation, convert_variables
 from ...recording.experiment import Experiment
@@ -22,8 +22,6 @@ SAMPLES = 12
 STATIC_SAMPLES = 3
 # Step of the differences, which balances truncation and rounding of fourth-order differences.
 STEP = 1e-5
-# Largest step in contact, relative to the gap over which the pressure rises: it must stay within.
-STEP_PER_CONTACT_WIDTH = 1e-3
 # Huber threshold of the check [σ]: differences must not cross the kink of the second derivative.
 LARGE_HUBER = 1e9
 # Most nonzeros of lifted variables for which the whole program is laid out and checked.
@@ -118,20 +116,14 @@ def derivative_errors(
 
 
 def _difference_step(collocation: Collocation) -> float:
-    """Return the step of the differences: `STEP`, or less if the gap range in which a contact
-    begins is narrow.
-    """
-    touching = (
-        t
-        for s in collocation.transcriptions
-        for t in contact_terms(s.experiment)
-    )
+    """Return the step of the differences: `STEP`, or less where a feature needs smaller ones."""
     return min(
         (
             STEP,
             *(
-                STEP_PER_CONTACT_WIDTH * term.law_of_contact.largest_width_m
-                for term in touching
+                feature.largest_difference_step(segment.experiment)
+                for segment in collocation.transcriptions
+                for feature in FEATURES
             ),
         )
     )
