@@ -211,9 +211,7 @@ def run(
     log : callable, optional
         Called with a text at the beginning of each step after the solve.
     seek_causes : bool
-        Whether to test hypotheses about the cause of a misfit, see `find_misspecifications`;
-        without them there are no solves with finer discretisations either, even if the problem
-        requests these.
+        Whether to test hypotheses about the cause of a misfit, see `find_misspecifications`.
     probe : bool
         Whether to refit subsets of the data and to relax each assumption, see `deep_probes`.
 
@@ -278,10 +276,13 @@ def run(
                     answer, fit, changes=changes, say=say, deep=probe
                 ),
             )
-        if not seek_causes or answer.solution.status is Status.INTERRUPTED:
+        if answer.solution.status is Status.INTERRUPTED:
             return timed(answer)
-        say("testing possible causes of the misfit")
-        answer = replace(answer, causes=find_misspecifications(answer.solution))
+        if seek_causes:
+            say("testing possible causes of the misfit")
+            answer = replace(
+                answer, causes=find_misspecifications(answer.solution)
+            )
         if problem.uncertainty.numerical and answer.uncertainty is not None:
             answer = refine(answer, report_progress=say)
         return timed(answer)

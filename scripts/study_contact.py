@@ -102,6 +102,7 @@ def pressed(
         [*sliding, touched],
         kind="static",
         gravity_m_s2=np.zeros(3),
+        air_density_kg_m3=0.0,
         nuisance=cs.Nuisance.none(),
     )
     seen = cs.simulate(experiment, LAW)

@@ -2,6 +2,7 @@
 
 - `declarations`, `schema_tables`, `validated_types`: classes that users state in Python or in a
   problem file, and their checks.
+- `time_dependence`: fields that depend on time, their selection and interpolation.
 - `files`, `array_files`, `written_files`: reading and writing of files, completely or not at all.
 - `serialisation`: results as JSON; `display`: output as text, HTML and Markdown; `console`:
   terminal output; `pages`: pages of the documentation.

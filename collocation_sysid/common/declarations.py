@@ -17,7 +17,7 @@ from typing import Any, TypeVar, dataclass_transform, get_args
 from pydantic import TypeAdapter, ValidationError
 
 from ..errors import InputError, located
-from .validated_types import expected
+from .validated_types import expected, faulty_entry
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -59,6 +59,7 @@ def key(
     *,
     converter: Callable[[S], T] | None = None,
     read: Callable[[Any], Any] | None = None,
+    metadata: Mapping[str, Any] | None = None,
     **field_options: Any,
 ) -> Any:
     """Return a dataclass field with a converter, which a problem file may state.
@@ -72,13 +73,13 @@ def key(
         if there is one, and otherwise kept as it is.
     read : callable, optional
         Conversion from the value in the file to the field; a `Key` as `form` has its own instead.
+    metadata : mapping, optional
+        Further metadata of the field, such as `time_dependence.over_time()`.
     **field_options
         See `dataclasses.field`.
     """
-    return field(
-        metadata={"converter": converter, "form": form, "read": read},
-        **field_options,
-    )
+    own = {"converter": converter, "form": form, "read": read}
+    return field(metadata={**own, **(metadata or {})}, **field_options)
 
 
 @dataclass_transform(
@@ -135,12 +136,8 @@ def _converted(field: Field[Any], instance: Any, value: Any) -> Any:
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         called = re.sub("(?<!^)(?=[A-Z])", " ", type(instance).__name__).lower()
-        what = field.name
         word = getattr(instance, "description_name", called)
-        for part in fault["loc"]:
-            if isinstance(value, Mapping) and part in value:
-                what = f"{what}.{part}"
-                value = value[part]
+        what, value = faulty_entry(field.name, value, fault=fault)
         whose = (
             f"the {word} {instance.name!r}"
             if hasattr(instance, "name")

@@ -89,6 +89,28 @@ def expected(fault: Mapping[str, Any]) -> str:
     return fault["msg"].removeprefix("Input should be ")
 
 
+def faulty_entry(
+    name: str, value: Any, fault: Mapping[str, Any]
+) -> tuple[str, Any]:
+    """Return the name and the value of the entry of a table that is at fault, or those of the value
+    itself if it is no table.
+
+    Parameters
+    ----------
+    name : str
+        Name of the value; names of entries follow it after dots.
+    value : object
+        Value that was validated.
+    fault : mapping
+        One entry of pydantic's `ValidationError.errors()`.
+    """
+    for part in fault["loc"]:
+        if isinstance(value, Mapping) and part in value:
+            name = f"{name}.{part}"
+            value = value[part]
+    return name, value
+
+
 @dataclass(frozen=True)
 class Options:
     """Base class of methods and option groups: frozen dataclasses that check the types of their
@@ -148,10 +170,7 @@ def _refusal(name: str, value: Any, fault: Mapping[str, Any]) -> InputError:
     fault : mapping
         One entry of pydantic's `ValidationError.errors()`.
     """
-    for part in fault["loc"]:
-        if isinstance(value, Mapping) and part in value:
-            name = f"{name}.{part}"
-            value = value[part]
+    name, value = faulty_entry(name, value, fault=fault)
     if fault["type"] == "value_error":
         return InputError(str(fault["ctx"]["error"]), None, where=name)
     choices = re.findall(

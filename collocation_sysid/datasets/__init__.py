@@ -13,6 +13,7 @@ problem file and tables, which ``collocation-sysid new NAME --dataset DATASET`` 
 
 from __future__ import annotations
 
+from ..common.time_dependence import at_times, values_over_time
 from ..fem.laws.materials import Energy, Material
 from ..recording import Experiment, Specimen
 from ..recording.specimen_files import SpecimenLayout, read_specimen
@@ -257,7 +258,7 @@ def _rubber(
     exact = {"strain_zero": 0.0, "area_error": 0.0} if is_exact else {}
     specimen = Specimen(
         test,
-        **table.rows((1 + largest <= limit).nonzero()[0]),
+        **values_over_time(at_times(table, 1 + largest <= limit)),
         sigma_pa=sigma_pa,
         **exact,
     )

@@ -17,6 +17,7 @@ from ..fem.kernels import map_experiments
 from ..model.forces import Forces
 from ..program.collocation import Collocation, ExperimentIterate
 from ..program.forward.initial_equilibrium import initial_state
+from ..program.forward.loss_of_stability import explain_failure
 from ..program.forward.newton_solver import NewtonOptions, NewtonSolver
 from ..program.forward.scheme_simulation import (
     continue_simulation,
@@ -74,10 +75,16 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
             )
         except SimulationError as error:
             positions.append(rigid_trajectory(segment, theta))
+            reason = explain_failure(segment.experiment, theta, error=error)
+            picture = (
+                ""
+                if reason.stability_loss is None
+                else "; the command simulate draws the mode"
+            )
             notes.append(
                 f"experiment '{segment.experiment.name}': the simulation at the guess failed "
-                f"({error}); the initial trajectory is the rest shape moving rigidly with the "
-                "grasp"
+                f"({reason}){picture}; the initial trajectory is the rest shape moving rigidly "
+                "with the grasp"
             )
     return collocation.pack(p, positions), notes
 
@@ -168,16 +175,22 @@ def continue_trajectory(
     Returns
     -------
     tuple of (m, 3n) array and SimulationError or None
-        Trajectory with the known rows [m], and the failure; None if the trajectory is complete.
+        Trajectory with the known rows [m], and the failure, which names the mode where the body
+        lost its stability; None if the trajectory is complete.
     """
-    return continue_simulation(
-        iterate.segment.experiment,
+    experiment = iterate.segment.experiment
+    positions_m, failure = continue_simulation(
+        experiment,
         iterate.equations.dynamics.truncated_to(rows),
         known=iterate.x if len(iterate.x) else None,
         options=options,
         stopwatch=stopwatch,
         approximate_solution=guess,
     )
+    if failure is not None:
+        theta = np.asarray(iterate.equations.theta)
+        failure = explain_failure(experiment, theta, error=failure)
+    return positions_m, failure
 
 
 def complete_variables(

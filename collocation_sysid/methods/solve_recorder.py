@@ -120,10 +120,17 @@ class Recorder:
         except SearchEnded as end:
             return end.status, end.message
         except SimulationError as error:
-            return (
-                Status.NOT_SIMULABLE,
-                f"{Status.NOT_SIMULABLE.sentence} {error}.",
+            # Another stiffness does not prevent that a surface wrinkles: stretches decide.
+            is_physical = (
+                error.stability_loss is not None
+                and error.stability_loss.is_surface_instability
             )
+            sentence = (
+                "The recording cannot be simulated to its end:"
+                if is_physical
+                else Status.NOT_SIMULABLE.sentence
+            )
+            return Status.NOT_SIMULABLE, f"{sentence} {error}."
         except KeyboardInterrupt:
             return Status.INTERRUPTED, Status.INTERRUPTED.sentence
 

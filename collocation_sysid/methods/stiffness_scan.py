@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
+from typing import ClassVar
 
 import numpy as np
 
@@ -59,8 +60,8 @@ NO_GUESS = "no guess"
 
 
 @dataclass(frozen=True, eq=False)
-class Scan:
-    """Result of a scan of the stiffness.
+class ScanSummary:
+    """Stiffnesses of a scan and their misfits, as in ``result.json``.
 
     Attributes
     ----------
@@ -74,28 +75,20 @@ class Scan:
         body could not be simulated.
     best : int
         Index of the modulus that was chosen.
-    parameters : Parameters
-        Parameters with the guesses to start from.
     samples : int
         Number of first samples that were compared, over all experiments.
     time_s : float
         Computing time [s].
-    starts : mapping of int to Parameters
-        Parameters with guesses by the index of a modulus, for `best` and `others`.
-    others : tuple of int
-        Indices of other moduli that may lead to a better solution where there are local minima:
-        those next to the best, and other minima of the misfit, in ascending order of the misfit.
     """
+
+    SERIALISED_PROPERTIES: ClassVar = ("sentence",)
 
     reason: str
     young_pa: Array
     misfit: Array
     best: int
-    parameters: Parameters
     samples: int
     time_s: float
-    starts: Mapping[int, Parameters] = field(default_factory=dict)
-    others: tuple[int, ...] = ()
 
     @property
     def sentence(self) -> str:
@@ -106,6 +99,26 @@ class Scan:
             f"{self.reason}: started from E = {self.young_pa[self.best]:.3g} Pa after a scan of "
             f"{len(self.young_pa)} stiffnesses in {self.time_s:.2g} s"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Scan(ScanSummary):
+    """Result of a scan of the stiffness, with parameters to start from.
+
+    Attributes
+    ----------
+    parameters : Parameters
+        Parameters with the guesses to start from.
+    starts : mapping of int to Parameters
+        Parameters with guesses by the index of a modulus, for `best` and `others`.
+    others : tuple of int
+        Indices of other moduli that may lead to a better solution where there are local minima:
+        those next to the best, and other minima of the misfit, in ascending order of the misfit.
+    """
+
+    parameters: Parameters
+    starts: Mapping[int, Parameters] = field(default_factory=dict)
+    others: tuple[int, ...] = ()
 
 
 def start_problem(

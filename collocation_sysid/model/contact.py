@@ -34,7 +34,7 @@ Euler evaluate the pressure at the end of a step, and lose energy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import NamedTuple, Self
 
@@ -42,6 +42,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.array_types import Array, Index
+from ..common.time_dependence import LOAD
 from ..fem.body import Body
 from ..fem.contact_surface import VECTORS_PER_POINT, ContactSurface
 from ..fem.force_points import ForcePoints
@@ -571,7 +572,7 @@ class Contact(Pointwise):
     """
 
     law_of_contact: ContactLaw
-    factor: float = 1.0
+    factor: float = field(default=1.0, metadata=LOAD)
     previous_state: PreviousState | None = None
     variable_weights: Array | None = None
     step_s: float = 0.0
@@ -672,14 +673,6 @@ class Contact(Pointwise):
 
     def with_inputs(self, u: Array) -> Self:
         """Return self: contact has no inputs beside the constants of the body."""
-        return self
-
-    def at_times(self, rows: slice) -> Self:
-        """Return self: contact is the same at all times; a `previous_state` is not cut."""
-        return self
-
-    def interpolate(self, other: Self, share: float) -> Self:
-        """Return self: obstacles move with the nodes of their frames."""
         return self
 
     def active_points(self, states: States) -> tuple[Index | None, Array]:

@@ -17,13 +17,14 @@ coefficients of one row.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array
+from ..common.time_dependence import PARTS_OVER_TIME, at_times, over_time
 from ..fem.body import Body, Linearisation
 from ..fem.pattern import SymmetricPattern
 from ..recording.experiment import Experiment
@@ -50,11 +51,11 @@ class StencilTables:
         Coefficient of the start velocity.
     """
 
-    p: Array
-    q: Array
-    w: Array
-    s: Array
-    r: Array  # (N,)
+    p: Array = field(metadata=over_time())
+    q: Array = field(metadata=over_time())
+    w: Array = field(metadata=over_time())
+    s: Array = field(metadata=over_time())
+    r: Array = field(metadata=over_time())
 
     @classmethod
     def from_scheme(
@@ -119,14 +120,14 @@ class Dynamics:
     """
 
     body: Body
-    tables: StencilTables
-    t_s: Array
+    tables: StencilTables = field(metadata=PARTS_OVER_TIME)
+    t_s: Array = field(metadata=over_time())
     first_row: int
-    mass: DofMasses
-    forces: Forces
-    prescribed_m: Array
-    is_temporarily_prescribed: NDArray[np.bool_]
-    evaluated_s: Array
+    mass: DofMasses = field(metadata=PARTS_OVER_TIME)
+    forces: Forces = field(metadata=PARTS_OVER_TIME)
+    prescribed_m: Array = field(metadata=over_time())
+    is_temporarily_prescribed: NDArray[np.bool_] = field(metadata=over_time())
+    evaluated_s: Array = field(metadata=over_time())
     start_velocity_m_s: Array
     loaded_since_s: float = np.inf
     is_static: bool = False
@@ -251,19 +252,7 @@ class Dynamics:
         """
         if rows >= self.row_count:
             return self
-        t = self.tables
-        return replace(
-            self,
-            tables=StencilTables(
-                t.p[:rows], t.q[:rows], w=t.w[:rows], s=t.s[:rows], r=t.r[:rows]
-            ),
-            t_s=self.t_s[:rows],
-            mass=self.mass.at_times(slice(rows)),
-            forces=self.forces.at_times(slice(rows)),
-            prescribed_m=self.prescribed_m[:rows],
-            is_temporarily_prescribed=self.is_temporarily_prescribed[:rows],
-            evaluated_s=self.evaluated_s[:rows],
-        )
+        return at_times(self, slice(rows))
 
     @property
     def pattern(self) -> SymmetricPattern:
@@ -350,7 +339,7 @@ class Dynamics:
         first_rows = slice(len(x))
         states = self.all_evaluation_states(x)
         return histories_of_trajectory(
-            self.forces.at_times(first_rows),
+            at_times(self.forces, first_rows),
             states,
             until_next_s=self.interval_to_next_s[first_rows],
             loaded_s=self.loaded_since_s,
@@ -410,7 +399,7 @@ class Dynamics:
         """
         rows = slice(self.first_row, self.row_count) if rows is None else rows
         return insert_histories(
-            self.forces.at_times(rows), histories, rows=rows
+            at_times(self.forces, rows), histories, rows=rows
         )
 
     def combine(self, table: Array, rows: Array) -> Array:
@@ -446,7 +435,7 @@ class Dynamics:
     @property
     def evaluated_forces(self) -> Forces:
         """Forces of the rows from `first_row` on."""
-        return self.forces.at_times(slice(self.first_row, self.row_count))
+        return at_times(self.forces, slice(self.first_row, self.row_count))
 
     def force(self, x: Array, histories: Sequence[AnyHistory] = ()) -> Array:
         """Return the forces F (N − first_row, 3n) [N] at the evaluation states of x (N, 3n).

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.array_types import Array, Index
+from ..common.time_dependence import at_times
 from ..fem.body import SecondDerivatives
 from .force_term import States
 from .forces import Forces
@@ -110,7 +111,7 @@ class ForceHistory:
             Weights of h in second derivatives; 0 by default.
         """
         before, since_s = self.previous_state
-        term = self.forces.pointwise_term(self.number)[0].at_times(rows)
+        term = at_times(self.forces.pointwise_term(self.number)[0], rows)
         return term.with_previous_state(
             PreviousState(before[:, rows], since_s[rows]), variable_weights
         )

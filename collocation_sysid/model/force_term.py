@@ -11,12 +11,13 @@ in `equations_at_parameters`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, Self
 
 import numpy as np
 
 from ..common.array_types import Array, Index
+from ..common.time_dependence import over_time
 from ..fem.body import Linearisation, SecondDerivatives
 from ..fem.pattern import SymmetricPattern
 
@@ -59,6 +60,9 @@ class AssemblyIndices:
 class ForceTerm(ABC):
     """Force at T times, with first and second derivatives.
 
+    A term marks its fields that depend on time and those that are loads (`common.time_dependence`);
+    masses and internal variables are no loads.
+
     Attributes
     ----------
     size : int
@@ -86,30 +90,7 @@ class ForceTerm(ABC):
     @abstractmethod
     def with_inputs(self, u: Array) -> Self:
         """Return this force at inputs u (T, size), of which it may keep views; self if it has no
-        inputs. Like all methods that return a force, it does not modify self.
-        """
-
-    @abstractmethod
-    def at_times(self, rows: slice) -> Self:
-        """Return this force at some of the T times, given as a slice; self if it is the same at all
-        times.
-        """
-
-    @abstractmethod
-    def scaled(self, factor: float) -> Self:
-        """Return this force multiplied by a factor; its masses and internal variables stay."""
-
-    @abstractmethod
-    def interpolate(self, other: Self, share: float) -> Self:
-        """Return this force with its loads and times interpolated linearly to those of another
-        time.
-
-        Parameters
-        ----------
-        other : Self
-            The force at the other time.
-        share : float
-            Fraction of the way: 0 for this time, 1 for the other.
+        inputs. Self is not modified.
         """
 
     @abstractmethod
@@ -196,7 +177,7 @@ class Potential(ForceTerm):
     """
 
     scalar: ShapeFunctional
-    amplitude: Array
+    amplitude: Array = field(metadata=over_time(is_load=True))
 
     @property
     def size(self) -> int:  # type: ignore[override]
@@ -211,22 +192,6 @@ class Potential(ForceTerm):
     def with_inputs(self, u: Array) -> Self:
         """Return this force with another amplitude (T, 1)."""
         return replace(self, amplitude=u)
-
-    def at_times(self, rows: slice) -> Self:
-        """Return this force at some of the T times, given as a slice."""
-        return self.with_inputs(self.amplitude[rows])
-
-    def scaled(self, factor: float) -> Self:
-        """Return this force multiplied by a factor."""
-        return self.with_inputs(factor * self.amplitude)
-
-    def interpolate(self, other: Self, share: float) -> Self:
-        """Return this force with its amplitude interpolated linearly to that of another time;
-        `share` is 0 for this time and 1 for the other.
-        """
-        return self.with_inputs(
-            self.amplitude + share * (other.amplitude - self.amplitude)
-        )
 
     def force(self, states: States) -> Array:
         """Return the forces −c ∂S/∂x (T, 3n) [N]."""

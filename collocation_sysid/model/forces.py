@@ -10,7 +10,7 @@ those by the other inputs u, in the order of the terms, see `inputs`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate
 
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.array_types import Array, Index
+from ..common.time_dependence import PARTS_OVER_TIME
 from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.laws.memory import MemoryInput
 from ..fem.pattern import JointPattern, SymmetricPattern
@@ -56,8 +57,8 @@ class Forces:
         Internal variables of a body with memory at the evaluations; None for no overstress.
     """
 
-    weight: Weight
-    external_terms: tuple[ForceTerm, ...]
+    weight: Weight = field(metadata=PARTS_OVER_TIME)
+    external_terms: tuple[ForceTerm, ...] = field(metadata=PARTS_OVER_TIME)
     joint_pattern: JointPattern
     theta: Array
     is_static: bool = False
@@ -185,51 +186,6 @@ class Forces:
             )
         )
         return replace(forces, weight=weight, external_terms=tuple(further))
-
-    def at_times(self, rows: slice) -> Forces:
-        """Return these forces at some of the T times, given as a slice; `memory_state` is kept as it
-        is.
-        """
-        further = tuple(term.at_times(rows) for term in self.external_terms)
-        return replace(
-            self, weight=self.weight.at_times(rows), external_terms=further
-        )
-
-    def scaled(self, factor: float) -> Forces:
-        """Return these forces with weight, loads and other external forces multiplied by a factor.
-
-        Masses, internal forces and internal variables are unchanged, and so is self.
-        """
-        further = tuple(term.scaled(factor) for term in self.external_terms)
-        return replace(
-            self, weight=self.weight.scaled(factor), external_terms=further
-        )
-
-    def interpolate(self, other: Forces, share: float) -> Forces:
-        """Return forces with the loads interpolated linearly to those of another time: applied
-        forces, tied masses, amplitudes of actuators and the times of custom forces.
-
-        Gravity and the masses of the body are those of this time; internal variables, constants and
-        couplings those of `other`. Self and `other` are unchanged.
-
-        Parameters
-        ----------
-        other : Forces
-            Forces at the other time.
-        share : float
-            Fraction of the way: 0 for this time, 1 for the other.
-        """
-        further = tuple(
-            term.interpolate(that, share)
-            for term, that in zip(
-                self.external_terms, other.external_terms, strict=True
-            )
-        )
-        return replace(
-            other,
-            weight=self.weight.interpolate(other.weight, share),
-            external_terms=further,
-        )
 
     def with_term(self, number: int, term: ForceTerm) -> Forces:
         """Return these forces with one of the further terms replaced; self is unchanged.

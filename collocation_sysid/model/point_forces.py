@@ -13,13 +13,14 @@ its derivatives are those of any other force; `force_internal_variables` treats 
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from ..common.array_types import Array, Index
+from ..common.time_dependence import LOAD, over_time
 from ..fem.air import unit_drag
 from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.force_points import ForcePoints
@@ -115,10 +116,6 @@ class Pointwise(ForceTerm):
     def couplings(self) -> SymmetricPattern:  # type: ignore[override]
         """Pairs of dofs of the nodes at each point."""
         return self.points.couplings
-
-    def scaled(self, factor: float) -> Self:
-        """Return this force multiplied by a factor."""
-        return replace(self, factor=factor * self.factor)  # type: ignore[type-var]
 
     def with_previous_state(
         self,
@@ -503,8 +500,8 @@ class CustomForce(Pointwise):
     """
 
     placed: LocatedForce
-    t_s: Array
-    factor: float = 1.0
+    t_s: Array = field(metadata=over_time())
+    factor: float = field(default=1.0, metadata=LOAD)
     previous_state: PreviousState | None = None
     variable_weights: Array | None = None
     size = 0
@@ -542,20 +539,6 @@ class CustomForce(Pointwise):
     def with_inputs(self, u: Array) -> Self:
         """Return self: the force has no inputs beside the constants of the body."""
         return self
-
-    def at_times(self, rows: slice) -> Self:
-        """Return this force at some of the T times, given as a slice; internal variables of the
-        previous evaluations are kept as they are, see `with_previous_state`.
-        """
-        return replace(self, t_s=self.t_s[rows])
-
-    def interpolate(self, other: Self, share: float) -> Self:
-        """Return the force of `other`, at times interpolated linearly between both: `share` is 0
-        for the times of this force and 1 for those of the other.
-
-        Internal variables are those of `other`.
-        """
-        return replace(other, t_s=self.t_s + share * (other.t_s - self.t_s))
 
     def constants(self, states: States) -> Array:
         """Return the constants (c, 1) of the law."""

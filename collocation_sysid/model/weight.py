@@ -15,7 +15,7 @@ gravity, where a parameter rotates it, and each s_l as a change from the stated 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple, Self
 
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
+from ..common.time_dependence import LOAD, PARTS_OVER_TIME, over_time
 from ..fem.air import ADDED_MASS_SHARE
 from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.regions import Theta
@@ -48,13 +49,9 @@ class DofMasses:
     """
 
     own_kg: Array
-    tied_kg: Array
+    tied_kg: Array = field(metadata=over_time())
     displaced_kg: Array
     added_kg: Array
-
-    def at_times(self, rows: slice) -> DofMasses:
-        """Return these masses at some of the T times, given as a slice."""
-        return replace(self, tied_kg=self.tied_kg[rows])
 
     @cached_property
     def inertia_kg(self) -> Array:
@@ -122,13 +119,13 @@ class Weight(ForceTerm):
     """
 
     body: Body
-    mass: DofMasses
-    gravity_m_s2: Array
-    applied_n: Array
+    mass: DofMasses = field(metadata=PARTS_OVER_TIME)
+    gravity_m_s2: Array = field(metadata=LOAD)
+    applied_n: Array = field(metadata=over_time(is_load=True))
     has_gravity_input: bool
     joining_kg: Array
-    joining_n: Array
-    share: Array
+    joining_n: Array = field(metadata=over_time(axis=1, is_load=True))
+    share: Array = field(metadata=over_time())
 
     couplings = None
 
@@ -243,48 +240,6 @@ class Weight(ForceTerm):
         )
         mass = replace(self.mass, tied_kg=tied_kg)
         return replace(weight, mass=mass, applied_n=applied_n, share=share)
-
-    def at_times(self, rows: slice) -> Self:
-        """Return this weight at some of the T times, given as a slice."""
-        return replace(
-            self,
-            mass=self.mass.at_times(rows),
-            applied_n=self.applied_n[rows],
-            joining_n=self.joining_n[:, rows],
-            share=self.share[rows],
-        )
-
-    def scaled(self, factor: float) -> Self:
-        """Return gravity and loads multiplied by a factor, with unchanged masses."""
-        return replace(
-            self,
-            gravity_m_s2=factor * self.gravity_m_s2,
-            applied_n=factor * self.applied_n,
-            joining_n=factor * self.joining_n,
-        )
-
-    def interpolate(self, other: Self, share: float) -> Self:
-        """Return this weight with tied masses and loads interpolated linearly to those of another
-        time.
-
-        Gravity and the masses of body and air stay those of this time. `share` is 0 for this time
-        and 1 for the other.
-        """
-
-        def between(a: Array, b: Array) -> Array:
-            """Return the linear interpolation between two arrays."""
-            return a + share * (b - a)
-
-        mass = replace(
-            self.mass, tied_kg=between(self.mass.tied_kg, other.mass.tied_kg)
-        )
-        return replace(
-            self,
-            mass=mass,
-            applied_n=between(self.applied_n, other.applied_n),
-            joining_n=between(self.joining_n, other.joining_n),
-            share=between(self.share, other.share),
-        )
 
     @cached_property
     def gravity(self) -> Array:

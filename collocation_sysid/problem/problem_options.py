@@ -6,11 +6,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from ..common.validated_types import Options, Positive, Text
 from ..statistics.budget.shape_error import CORRELATION
-from ..statistics.budget.systematic_effects import CORRELATION_KEY, Assumptions
+from ..statistics.budget.systematic_effects import (
+    CORRELATION_KEY,
+    Assumptions,
+    ExactIfNone,
+)
 from ..statistics.uncertainty import ErrorModel
 
 
@@ -41,14 +45,17 @@ class UncertaintyOptions(ErrorModel):
     numerical : bool
         Solve again with half the step and on a finer mesh, to estimate the discretisation error.
     assumptions : Assumptions
-        Standard deviations of systematic effects, by name.
+        Standard deviations of systematic effects, by name; "none" if all are exact, as for a
+        simulated recording.
     surface_correlation : float
         Correlation length of the error of the surface over the longest extent of the body.
     """
 
     profile: tuple[Text, ...] = ()
     numerical: bool = False
-    assumptions: Assumptions = field(default_factory=Assumptions)
+    assumptions: Annotated[Assumptions, ExactIfNone()] = field(
+        default_factory=Assumptions
+    )
     surface_correlation: Positive = CORRELATION
 
     @property

@@ -32,7 +32,7 @@ from ..fem.spatial_field import ALL_MODULI, SMOOTH, Lengths, Prior
 from ..model.schemes import MOST_STEPS, SCHEMES
 from ..recording.environment import usual_air_density
 from ..recording.node_selection import Nodes
-from ..statistics.budget.systematic_effects import Assumptions
+from ..statistics.budget.systematic_effects import Assumptions, ExactIfNone
 from .problem_options import RolloutOptions, UncertaintyOptions
 from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection
@@ -463,7 +463,9 @@ class AssumptionsSection(Section, Assumptions):  # pyright: ignore[reportGeneral
 class UncertaintySection(Section, UncertaintyOptions):  # pyright: ignore[reportGeneralTypeIssues]
     """Intervals of the estimates."""
 
-    assumptions: AssumptionsSection = AssumptionsSection()
+    assumptions: Annotated[AssumptionsSection, ExactIfNone()] = (
+        AssumptionsSection()
+    )
 
 
 def _kind_tag(value: Any) -> str:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..common.array_types import Array, Index
+from ..common.time_dependence import at_times, values_over_time
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..recording import Experiment, Specimen
@@ -111,7 +111,7 @@ class SpecimenReader:
             self._add_note(
                 f"{section.file}: {len(rows)} of {len(table.t_s)} rows are used"
             )
-        arguments: dict[str, Any] = table.rows(rows)
+        arguments = values_over_time(at_times(table, rows))
         if table.is_displacement and section.area_m2 is not None:
             arguments |= {
                 "length_m": section.length_m,

@@ -45,6 +45,9 @@ FIRST_SCHEME_STEPS = 1
 # Largest number of steps a sample that automatic refinement takes: the cost of all refinements
 # together is then 63 times that of one step a sample.
 MOST_AUTOMATIC_STEPS = 32
+# Share of the first pass in a simulation with automatic steps: half of the second one, which is
+# the last one at the earliest.
+FIRST_PASS_SHARE = 1 / 3
 # Largest error of node positions at the samples, relative to the way of the node that moves
 # farthest, that automatic refinement accepts. For a swung block it changes E by 0.4 %
 # (`tests/program/test_substeps.py`), which a run's interval for its own step covers.
@@ -134,8 +137,9 @@ def simulate(
     options : NewtonOptions, optional
         Options of Newton's method.
     progress : callable, optional
-        Called with the share done, between 0 and 1, of each pass; automatic steps take several
-        passes.
+        Called with the share done, ascending from 0 to 1. Automatic steps take several passes,
+        whose number is not known before: each pass takes a part of what remains, and the share
+        may end before 1.
 
     Returns
     -------
@@ -243,7 +247,12 @@ def _with_automatic_steps(
     order = NEWMARK_ORDER if is_newmark else as_scheme(integrator).order
     steps = FIRST_NEWMARK_STEPS if is_newmark else FIRST_SCHEME_STEPS
     coarser: Trajectory | None = None
+    done = 0.0
     while True:
+        # Each pass takes twice as long as the one before it; another one may follow.
+        share = FIRST_PASS_SHARE if not done else (1.0 - done) / 2
+        report = None if progress is None else _part(progress, done, share)
+        done += share
         try:
             finer = _with_steps(
                 experiment,
@@ -251,7 +260,7 @@ def _with_automatic_steps(
                 integrator=integrator,
                 steps=steps,
                 options=options,
-                progress=progress,
+                progress=report,
             )
         except SimulationError:
             if steps >= MOST_AUTOMATIC_STEPS:
@@ -269,6 +278,18 @@ def _with_automatic_steps(
             return finer
         coarser = finer
         steps *= 2
+
+
+def _part(progress: Progress, done: float, share: float) -> Progress:
+    """Return a function that reports a share from 0 to 1 of a part of the work, which begins at
+    `done` and takes `share` of it, to `progress`.
+    """
+
+    def report(part: float) -> None:
+        """Report the share of all work."""
+        progress(done + share * part)
+
+    return report
 
 
 def _accepted_error_m(trajectory: Trajectory) -> float:

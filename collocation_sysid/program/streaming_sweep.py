@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array
+from ..common.time_dependence import at_times
 from ..fem.body import Linearisation
 from ..model.dynamics import StencilRow
 from ..recording.poses import Poses
@@ -239,7 +240,7 @@ class StreamingSweep:
         self.count = 1 + len(self.moving)
         self.mass_kg = self.dynamics.mass.inertia_kg[0]
         # Loads are always there: what acts on one row acts on every one.
-        self.forces = self.dynamics.forces.at_times(slice(1))
+        self.forces = at_times(self.dynamics.forces, slice(1))
         self._rows = (
             {} if self.setting.mass_depends_on_parameters else model.cached_rows
         )

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
+from ..common.time_dependence import at_times
 from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.pattern import SymmetricPattern
 from ..model.dynamics import Dynamics, StencilRow
@@ -612,7 +613,7 @@ class Transcription:
         at_rest = self.body.nodes_m
         dynamics = self.dynamics.with_theta(theta)
         pattern = self.pattern
-        at_last = dynamics.forces.at_times(slice(dynamics.row_count - 1, None))
+        at_last = at_times(dynamics.forces, slice(dynamics.row_count - 1, None))
         forces = at_last.linearise(at_rest, np.zeros_like(at_rest))
         last = StencilRow.from_dynamics(dynamics, dynamics.row_count - 1)
         block = last.block(

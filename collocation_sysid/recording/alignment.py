@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.time_dependence import at_times
 from ..errors import InputError
 from .marker_files import MarkerTable
 from .poses import PoseSequence
@@ -101,11 +102,7 @@ def align(
         fewest=1 if static else _FEWEST_SAMPLES,
     )
     if every > 1:
-        table = MarkerTable(
-            table.t_s[::every],
-            table.names,
-            positions_m=table.positions_m[::every],
-        )
+        table = at_times(table, slice(None, None, every))
     if static:
         t_s = grid = table.t_s
     elif resample_hz is None:
@@ -194,9 +191,7 @@ def _cut_to_poses(
     )
     if cut[0] > t_s[0]:
         note += f"; start now refers to the state at {cut[0]:.9g} s now"
-    return MarkerTable(
-        cut, table.names, positions_m=table.positions_m[is_inside]
-    ), [note]
+    return at_times(table, is_inside), [note]
 
 
 def _cut_to_window(
@@ -204,8 +199,7 @@ def _cut_to_window(
 ) -> MarkerTable:
     """Return the samples of a table within a window, its first and last time [s] included.
 
-    Times count as inside up to `STEP_TOLERANCE` median intervals beyond it. Notes of the table are
-    left out.
+    Times count as inside up to `STEP_TOLERANCE` median intervals beyond it.
 
     Raises
     ------
@@ -223,11 +217,7 @@ def _cut_to_window(
             f"window_s = [{first_s:g}, {last_s:g}] holds no marker sample; "
             f"the markers run from {table.t_s[0]:.9g} s to {table.t_s[-1]:.9g} s"
         )
-    return MarkerTable(
-        table.t_s[is_inside],
-        table.names,
-        positions_m=table.positions_m[is_inside],
-    )
+    return at_times(table, is_inside)
 
 
 def _even_grid(t_s: Array, rate_hz: float) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..common.declarations import declaration, key
+from ..common.time_dependence import over_time
 from ..errors import InputError, hint_at, listed
 from .checked_arrays import float_converter, read_only_tracks
 from .formats import c3d, motive, plain_csv, qualisys, trc
@@ -45,9 +46,12 @@ class MarkerTable:
         What was missing or assumed in the file, a sentence each.
     """
 
-    t_s: Array = key(converter=float_converter((None,), "t_s of the markers"))
+    t_s: Array = key(
+        converter=float_converter((None,), "t_s of the markers"),
+        metadata=over_time(),
+    )
     names: tuple[str, ...] = key(converter=tuple[str, ...])
-    positions_m: Array = key(converter=np.asarray)
+    positions_m: Array = key(converter=np.asarray, metadata=over_time())
     notes: tuple[str, ...] = key(converter=tuple[str, ...], default=())
 
     def __post_init__(self) -> None:

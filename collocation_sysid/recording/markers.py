@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array, Index
 from ..common.declarations import Key, declaration, identity, key
+from ..common.time_dependence import over_time
 from ..common.validated_types import Positive
 from ..errors import InputError
 from .checked_arrays import float_converter, read_only_floats, read_only_tracks
@@ -74,8 +75,11 @@ class Markers:
         given.
     """
 
-    t_s: Array = key(converter=float_converter((None,), "t_s of the markers"))
-    positions_m: Array = key(converter=np.asarray)
+    t_s: Array = key(
+        converter=float_converter((None,), "t_s of the markers"),
+        metadata=over_time(),
+    )
+    positions_m: Array = key(converter=np.asarray, metadata=over_time())
     sigma_m: Array = key(converter=np.asarray)
     names: tuple[str, ...] = key(converter=tuple[str, ...], default=None)
     places_m: Array | None = key(converter=np.asarray, default=None)

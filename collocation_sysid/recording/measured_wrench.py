@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..common.array_types import Array
 from ..common.declarations import declaration, key
 from ..common.schema_tables import Vector
+from ..common.time_dependence import over_time
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from .checked_arrays import float_converter, read_only_floats
@@ -64,8 +65,11 @@ class Wrench:
         If shapes disagree, time does not increase, nothing is measured, or a sigma is missing.
     """
 
-    t_s: Array = key(converter=float_converter((None,), "t_s of the wrench"))
-    values: Array = key(converter=_with_torques)
+    t_s: Array = key(
+        converter=float_converter((None,), "t_s of the wrench"),
+        metadata=over_time(),
+    )
+    values: Array = key(converter=_with_torques, metadata=over_time())
     sigma_n: float = key(Positive)
     sigma_nm: float | None = key(Positive | None, default=None)
     frame: Frame = key(Frame, default="world")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.time_dependence import at_times
 from .custom_sensor import Gauge
 from .depth_camera import until_all_cameras_see
 from .experiment import Experiment
@@ -54,12 +55,13 @@ def shortened_experiment(
     )
     t_s = experiment.t_s[:count]
     markers = experiment.markers
-    positions_m = markers.positions_m[:count]
     grasps = experiment.grasps
     if shortens_sensors:
-        if not np.isfinite(positions_m).any():
+        if not np.isfinite(markers.positions_m[:count]).any():
             # At least one sample has to be present.
-            positions_m = np.nan_to_num(positions_m)
+            markers = replace(
+                markers, positions_m=np.nan_to_num(markers.positions_m)
+            )
         grasps = tuple(
             replace(grasp, wrench=_within(grasp.wrench, t_s, fewest=fewest))
             for grasp in grasps
@@ -67,9 +69,7 @@ def shortened_experiment(
     return replace(
         experiment,
         t_s=t_s,
-        markers=replace(
-            markers, t_s=markers.t_s[:count], positions_m=positions_m
-        ),
+        markers=at_times(markers, slice(count)),
         grasps=grasps,
         depths=depths,
     )
@@ -85,7 +85,7 @@ def _within(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
     here = (wrench.t_s >= t_s[0]) & (wrench.t_s <= t_s[-1])
     if here.sum() < fewest or not wrench.is_measured[here].any():
         return None
-    return replace(wrench, t_s=wrench.t_s[here], values=wrench.values[here])
+    return at_times(wrench, here)
 
 
 def without_later_measurements(

@@ -8,13 +8,14 @@ measured, else from incompressibility.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from ..common.array_types import Array, Index
+from ..common.array_types import Array
+from ..common.time_dependence import over_time
 from ..errors import InputError
 from .experiment import Experiment
 from .formats.columns import (
@@ -122,31 +123,14 @@ class SpecimenTable:
         Whether the strain is a displacement over the length of the specimen.
     """
 
-    t_s: Array
-    strain: Array
-    stress_pa: Array
-    second_strain: Array | None
-    second_stress_pa: Array | None
-    lateral_stretch: Array | None
+    t_s: Array = field(metadata=over_time())
+    strain: Array = field(metadata=over_time())
+    stress_pa: Array = field(metadata=over_time())
+    second_strain: Array | None = field(metadata=over_time())
+    second_stress_pa: Array | None = field(metadata=over_time())
+    lateral_stretch: Array | None = field(metadata=over_time())
     is_incompressible: bool
     is_displacement: bool
-
-    def rows(self, chosen: Index) -> dict[str, Array | None]:
-        """Return the arrays at the rows `chosen`, indices from 0, by the names of the arguments of
-        `Specimen`; None for quantities without a column.
-        """
-        arrays = {
-            "t_s": self.t_s,
-            "strain": self.strain,
-            "stress_pa": self.stress_pa,
-            "second_strain": self.second_strain,
-            "second_stress_pa": self.second_stress_pa,
-            "lateral_stretch": self.lateral_stretch,
-        }
-        return {
-            name: None if each is None else each[chosen]
-            for name, each in arrays.items()
-        }
 
 
 @names_file_in_errors

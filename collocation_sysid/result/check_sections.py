@@ -84,6 +84,23 @@ def _check_verdict(findings: CheckResult) -> Line:
     )
 
 
+def _point_masses(body: BodyCheck) -> str:
+    """Return the point masses of a body's experiments as text after its own mass; empty if there
+    are none.
+    """
+    masses = body.point_masses_kg
+    if not masses:
+        return ""
+    if len(set(masses.values())) == 1 and len(masses) == len(body.experiments):
+        added_kg = next(iter(masses.values()))
+        total_g = 1e3 * (body.mass_kg + added_kg)
+        return f", with point masses of {1e3 * added_kg:.4g} g {total_g:.4g} g"
+    stated = ", ".join(
+        f"{1e3 * mass_kg:.4g} g in '{name}'" for name, mass_kg in masses.items()
+    )
+    return f", and point masses: {stated}"
+
+
 def _body_section(body: BodyCheck) -> Table:
     """Return the table of a body: size, mass, mesh, element quality, rest shape and fields."""
     if body.is_homogeneous:
@@ -99,7 +116,8 @@ def _body_section(body: BodyCheck) -> Table:
     return labelled(
         "Body",
         {
-            "object": f"{size} mm, {1e6 * body.volume_m3:.4g} cm³, {1e3 * body.mass_kg:.4g} g",
+            "object": f"{size} mm, {1e6 * body.volume_m3:.4g} cm³, {1e3 * body.mass_kg:.4g} g"
+            + _point_masses(body),
             "mesh": f"{body.nodes:,} nodes, {body.elements:,} {body.element}; edges "
             f"{low:.3g} to {high:.3g} mm (mean {mean:.3g})",
             "quality": f"median {body.median_element_quality:.2f}, worst in elements {worst}",

@@ -445,10 +445,14 @@ def _deviation_text(deviation: float | None) -> str:
     return "" if deviation is None else short(deviation)
 
 
-def refinement_table(result: Result) -> Table:
+def refinement_table(result: Result) -> Table | Line:
     """Return the table of measured discretisation errors, with corrected values and combined
-    intervals.
+    intervals; a sentence if no estimate changed.
     """
+    if not result.numerical_errors:
+        return Line(
+            "No estimate changes with the step or the mesh: every parameter is fixed or at a bound."
+        )
     rows = []
     for name, error in result.numerical_errors.items():
         each = result.values[name]

@@ -104,6 +104,17 @@ class Recipe(Options):
         require_among(self.integrator, (NEWMARK, *SCHEMES), where="integrator")
 
 
+def _share_of_experiment(
+    progress: Callable[[float], None] | None, index: int, count: int
+) -> Callable[[float], None] | None:
+    """Return a function that reports the share of one simulation, by its index among `count`, as a
+    share of all to `progress`; None if that is None.
+    """
+    if progress is None:
+        return None
+    return lambda share: progress((index + share) / count)
+
+
 def write_data(
     problem: Problem,
     folder: str | Path,
@@ -128,7 +139,7 @@ def write_data(
     recipe : Recipe, optional
         Integrator, noise and seed; without noise by default.
     progress : callable, optional
-        Called with the completed share of a simulation, from 0 to 1.
+        Called with the completed share of all simulations, ascending from 0 to 1.
 
     Returns
     -------
@@ -173,10 +184,14 @@ def write_data(
             substeps="auto"
             if recipe.integrator == NEWMARK
             else problem.substeps,
-            progress=progress,
+            progress=_share_of_experiment(
+                progress, number, count=len(problem.experiments)
+            ),
         )
-        for experiment in problem.experiments
+        for number, experiment in enumerate(problem.experiments)
     ]
+    if progress is not None:
+        progress(1.0)
     written: list[Path] = []
     drafts_of: dict[Path, Path] = {}
     with ExitStack() as stack:  # all files appear at its end, or none

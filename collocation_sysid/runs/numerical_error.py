@@ -140,8 +140,8 @@ def solve_refined(
     Raises
     ------
     InputError
-        For another number of levels, where a finer problem is not solved, or where all recordings
-        are specimens without a mesh.
+        For another number of levels, where a finer problem is not solved, where no parameter is
+        estimated, or where all recordings are specimens without a mesh.
     KeyboardInterrupt
         If a solve was interrupted; the levels passed to `save_progress` are complete.
     """
@@ -152,6 +152,11 @@ def solve_refined(
         for experiment in problem.experiments
         if not experiment.validation
     ]
+    if not problem.parameters.free:
+        raise InputError(
+            "no parameter was estimated, and only estimates have a discretisation error; expected "
+            "at least one parameter without a fixed value"
+        )
     if all(experiment.specimen is not None for experiment in fitted):
         raise InputError(
             "the deformation of specimens is homogeneous and exact, without a mesh and time steps; "

@@ -24,6 +24,7 @@ from ..features.measurement_results import (
 )
 from ..features.registry import merged_fields
 from ..fem.laws.constants import GAMMA_R
+from ..methods.stiffness_scan import ScanSummary
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
@@ -43,7 +44,6 @@ from .result_content import (
     Provenance,
     RecordingsAgreement,
     Result,
-    ScanResult,
     UncertaintyResult,
 )
 from .solved_problem import SolvedProblem
@@ -82,7 +82,7 @@ def build_result(answer: SolvedProblem) -> Result:
         uncertainty=_uncertainty_result(answer),
         scan=None
         if solution.scan is None
-        else copy_fields(ScanResult, solution.scan),
+        else copy_fields(ScanSummary, solution.scan),
         fit=_fit_result(answer),
         residuals=answer.diagnoses,
         dynamics=DynamicsResult(

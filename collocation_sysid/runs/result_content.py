@@ -16,6 +16,7 @@ from ..fem.laws.constants import field_coefficient, symbol_of, unit_of
 from ..fem.spatial_field import FieldResolution
 from ..fem.two_phase import PhaseSummary
 from ..methods.solution import Iteration, Timing
+from ..methods.stiffness_scan import ScanSummary
 from ..statistics.assessment import Assessment
 from ..statistics.budget.discretisation_error import (
     DiscretisationError,
@@ -332,37 +333,6 @@ class UncertaintyResult:
     profiles: Mapping[str, ProfileResult]
 
 
-@dataclass(frozen=True, eq=False)
-class ScanResult:
-    """The scan over stiffnesses that gave the start of the search.
-
-    Attributes
-    ----------
-    reason : str
-        Why a scan was needed.
-    young_pa : (k,) array
-        Young's moduli, ascending.
-    misfit : (k,) array
-        Their misfits in standard deviations; NaN where the body could not be simulated.
-    best : int
-        Index of the chosen one.
-    samples : int
-        Number of samples that were simulated.
-    time_s : float
-        Duration of the scan.
-    sentence : str
-        Result in words.
-    """
-
-    reason: str
-    young_pa: Array
-    misfit: Array
-    best: int
-    samples: int
-    time_s: float
-    sentence: str
-
-
 @dataclass(frozen=True)
 class DynamicsResult:
     """Residuals of the equations of motion.
@@ -489,7 +459,7 @@ class Result:
         Constants that vary in space.
     uncertainty : UncertaintyResult or None
         Statistics behind the error bars; None without error bars.
-    scan : ScanResult or None
+    scan : ScanSummary or None
         Scan of the stiffness; None if there was none.
     fit, rollout : FitResult, ForwardResult
         Errors of the fit and of the forward simulations.
@@ -530,7 +500,7 @@ class Result:
     nuisance: Mapping[str, Mapping[str, NuisanceResult]]
     fields: Mapping[str, FieldResult]
     uncertainty: UncertaintyResult | None
-    scan: ScanResult | None
+    scan: ScanSummary | None
     fit: FitResult
     residuals: tuple[MarkerDiagnosis, ...]
     dynamics: DynamicsResult

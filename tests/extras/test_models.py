@@ -675,6 +675,25 @@ def test_of_models_that_predict_alike_the_one_with_fewer_parameters_is_taken():
     assert "hardly distinguish the models" in advice(rows)
 
 
+def test_a_clear_difference_of_predictions_is_not_said_to_be_hardly_one():
+    better = row_of("better", 4, {"a": WAVY.tolist()}, 900)
+    worse = row_of("worse", 4, {"a": (15.0 * WAVY).tolist()}, 900)
+    text = advice(rows_of(better, worse))
+    assert "3.87 times as large" in text
+    assert "better certainly predicts these held-out samples better" in text
+    assert "hardly distinguish" not in text
+
+
+def test_a_ratio_of_predictions_that_may_be_one_has_its_interval():
+    uneven = STEADY * np.array([0.1, 0.1, 0.1, 12.0, 0.1, 0.1, 0.1, 0.1])
+    small = row_of("small", 4, {"a": STEADY.tolist()}, 900)
+    large = row_of("large", 4, {"a": (1.05 * uneven).tolist()}, 900)
+    text = advice(rows_of(small, large))
+    assert "times as large" not in text
+    assert "which may be one (" in text
+    assert "hardly distinguish the models" in text
+
+
 def test_models_that_predict_alike_tell_what_they_disagree_about():
     def model(name: str, times: float, young_pa: float) -> dict:
         found = row_of(name, 4, {"a": (times * WAVY).tolist()}, 900)

@@ -12,6 +12,11 @@ from kit.densities import parameters, with_core
 from kit.forces import breath, foundation
 from kit.problems import GUESS, driven_bar, hung_cube, nodes_where
 
+from collocation_sysid.common.time_dependence import (
+    at_times,
+    interpolate_in_time,
+    scale_loads,
+)
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.selection import Box
@@ -147,7 +152,7 @@ def forces_at(segment: Transcription, u: np.ndarray) -> Forces:
     """The forces at inputs."""
     whole = np.broadcast_to(u[0], (segment.grid_times, u.shape[1])).copy()
     whole[ROWS] = u
-    return segment.dynamics.with_inputs(whole).forces.at_times(ROWS)
+    return at_times(segment.dynamics.with_inputs(whole).forces, ROWS)
 
 
 def test_tendons_and_pressures_are_lengths_and_volumes_times_what_drives_them(
@@ -196,7 +201,9 @@ def test_forces_on_the_way_to_other_times_lie_between_them(segment, rng):
     )
     ends = [each.total(x[:2], v[:2]) for each in (here, there)]
     for share in (0.0, SHARE, 1.0):
-        found = here.interpolate(there, share).total(x[:2], v[:2])
+        found = interpolate_in_time(here, there, share=share).total(
+            x[:2], v[:2]
+        )
         np.testing.assert_allclose(
             found, (1 - share) * ends[0] + share * ends[1], atol=1e-12
         )
@@ -211,7 +218,7 @@ def test_a_share_is_one_of_all_that_acts(segment, rng):
     whole = Forces.from_experiment(segment.experiment, FROM_S, theta)
     internal = segment.body.force(x[:2], still, theta)
     outer = whole.total(x[:2], still) - internal
-    found = whole.scaled(SHARE).total(x[:2], still) - internal
+    found = scale_loads(whole, SHARE).total(x[:2], still) - internal
     np.testing.assert_allclose(found, SHARE * outer, atol=1e-12)
     assert np.abs(outer).max() > 1e-3
 

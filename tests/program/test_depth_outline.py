@@ -39,6 +39,7 @@ from collocation_sysid.program.depth.surface_correspondences import (
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.recording.depth_camera import (
     MOST_OUTLINE_IMAGES,
+    points_from_image,
     samples_with_outlines,
 )
 from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
@@ -98,6 +99,43 @@ def test_the_outline_of_the_true_shape_is_at_the_edges_in_the_image():
     assert len(apart_px) > 50
     assert abs(apart_px.mean()) < 0.1
     assert apart_px.std() < 0.4
+
+
+def test_rounding_of_edges_to_pixels_is_averaged_along_the_outline():
+    """A single search line per point leaves 0.28 pixels, the rounding to whole pixels."""
+    assert outside_px(sighting(image_m())).std() < 0.2
+
+
+def test_noise_along_the_rays_does_not_choose_the_points_beside_a_crease():
+    noise_m = NOISE_M * np.random.default_rng(3).normal(size=SHAPE)
+    found = []
+    for sign in (1.0, -1.0):
+        cloud_m = points_from_image(image_m(), CAMERA)
+        rays = cloud_m / cloud_m[:, 2:]
+        moved_m = cloud_m + sign * rays * noise_m.ravel()[: len(rays), None]
+        depth = cs.Depth(
+            "front", [0.0], [moved_m], NOISE_M, CAMERA, spacing_m=5e-4
+        )
+        experiment = hanging((depth,), nuisance=UNKNOWN)
+        nuisance = NuisanceMap.from_experiment(experiment)
+        view = DepthCameraModel.from_experiment(experiment, 0, nuisance)
+        found.append(
+            SurfaceCorrespondences.from_shapes(
+                view,
+                bar(),
+                surface_m(TRUTH["young_pa"])[None],
+                np.zeros(nuisance.size),
+                0.01,
+                settled=True,
+            )
+        )
+    nearer, farther = found
+    assert nearer.excluded_counts["crease"] > 20
+    np.testing.assert_array_equal(nearer.is_compared, farther.is_compared)
+    used = nearer.is_compared[0]
+    turned = np.abs(nearer.normals - farther.normals)[0, used].max(axis=1) > 0.1
+    # With the points beside the crease, noise turns the normal of twelve points.
+    assert np.count_nonzero(turned) <= 2
 
 
 def test_a_body_that_is_too_soft_extends_beyond_what_the_image_shows():

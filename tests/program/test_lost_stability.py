@@ -10,11 +10,15 @@ import pytest
 
 import collocation_sysid as cs
 from collocation_sysid.errors import SimulationError
+from collocation_sysid.methods.solution import Status
+from collocation_sysid.model.forces import Forces
 from collocation_sysid.program.forward.loss_of_stability import (
     BIOT_RATIO,
     StabilityLoss,
     is_on_surface,
 )
+from collocation_sysid.program.modes.stability import growth_rate_1_s
+from collocation_sysid.runs.check import check_problem
 
 LAW = {"young_pa": 2e4, "poisson": 0.45, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 SIZE_M = (0.08, 0.01, 0.06)
@@ -80,6 +84,30 @@ def test_a_compressed_surface_that_wrinkles_is_named_with_its_stretch():
     assert lost.place_m[2] == pytest.approx(SIZE_M[2])
     assert "physical instability of the surface" in str(error)
     assert "finer mesh may help" not in str(error)
+
+
+def test_check_and_solve_name_the_instability_of_the_surface():
+    unknown = cs.Parameters.from_mapping({**LAW, "young_pa": cs.Unknown(2e4)})
+    problem = cs.Problem([compressed((8, 1, 6), SIZE_M)], unknown)
+    (note,) = (n for n in check_problem(problem).notes if "at the guess" in n)
+    assert "physical instability of the surface" in note
+    assert "command simulate draws the mode" in note
+    solution = cs.solve(problem)
+    assert solution.status is Status.NOT_SIMULABLE
+    assert "physical instability of the surface" in solution.message
+    assert "stretches of the surface are 0.36" in solution.message
+    for text in (note, solution.message):
+        assert "finer mesh may help" not in text
+        assert "stiffer" not in text
+
+
+def test_states_with_inverted_elements_have_no_growth_rate():
+    experiment = compressed((2, 1, 2), SIZE_M)
+    theta = experiment.body.theta_from_values(LAW)
+    forces = Forces.from_experiment(experiment, 0.0, theta=theta)
+    inverted_m = experiment.body.nodes_m * [-1.0, 1.0, 1.0]
+    free = np.arange(12, inverted_m.size)
+    assert growth_rate_1_s(forces, inverted_m.ravel(), free_dofs=free) == 0.0
 
 
 def test_a_slender_body_buckles_and_does_not_wrinkle():

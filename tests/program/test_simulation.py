@@ -321,6 +321,14 @@ def test_progress_is_reported_up_to_one():
         assert shares == pytest.approx([0.25, 0.5, 0.75, 1.0])
 
 
+def test_progress_with_automatic_steps_never_decreases():
+    shares: list[float] = []
+    simulate(hung_cube(4), TRUTH, "newmark", progress=shares.append)
+    assert len(shares) > 8  # more than one pass
+    assert shares == sorted(shares)
+    assert 0 < shares[0] < shares[-1] <= 1
+
+
 # Large steps
 
 

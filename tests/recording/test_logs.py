@@ -335,6 +335,78 @@ def test_markers_of_several_namespaces_have_these_in_their_names(
     assert read_markers(f"{log}#/one").names == ("0", "1")
 
 
+def point(
+    t: float, place: tuple[float, ...], frame: str = "world"
+) -> tuple[float, dict[str, Any]]:
+    """A PointStamped as JSON."""
+    stamp = {"sec": int(START_S + t), "nanosec": round((t % 1) * 1e9)}
+    return t, {
+        "header": {"stamp": stamp, "frame_id": frame},
+        "point": dict(zip("xyz", place, strict=True)),
+    }
+
+
+def points_log(
+    folder: Path, base_times: tuple[float, ...], base_frame: str = "world"
+) -> Path:
+    """A log with two topics of points, of which one has its own times and frame."""
+    kind = "geometry_msgs/PointStamped"
+    tip = [point(t, (t, 0, 1)) for t in (0.0, 0.25, 0.5, 0.75)]
+    base = [point(t, (0, 2 * t, 0), base_frame) for t in base_times]
+    return json_mcap(
+        folder / "run.mcap",
+        {"/mocap/tip/point": (kind, tip), "/mocap/base/point": (kind, base)},
+    )
+
+
+def test_points_of_several_topics_are_one_set_of_markers(
+    tmp_path: Path,
+) -> None:
+    log = points_log(tmp_path, (0.0, 0.25, 0.75))
+    address = f"{log}#/mocap/tip/point,/mocap/base/point"
+    table = read_markers(address)
+    assert table.names == ("tip", "base")
+    np.testing.assert_allclose(table.t_s, [0.0, 0.25, 0.5, 0.75])
+    np.testing.assert_allclose(
+        table.positions_m[:, 0], [[t, 0, 1] for t in table.t_s]
+    )
+    base = table.positions_m[:, 1]
+    np.testing.assert_allclose(base[[0, 1, 3], 1], [0, 0.5, 1.5])
+    # The median interval is 0.375 s: 0.5 s is no gap.
+    np.testing.assert_allclose(base[2], [0, 1.0, 0])
+    for topic in list_topics(log):
+        assert topic.write[-1] == "run.mcap#/mocap/tip/point,/mocap/base/point"
+
+
+def test_a_point_is_missing_where_its_topic_has_a_gap_or_has_ended(
+    tmp_path: Path,
+) -> None:
+    log = points_log(tmp_path, (0.0, 0.01, 0.02, 0.6))
+    table = read_markers(f"{log}#/mocap/tip/point,/mocap/base/point")
+    is_missing = np.isnan(table.positions_m[:, 1, 0])
+    assert is_missing.tolist() == [False, True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("base_frame", "topics", "message"),
+    [
+        (
+            "camera",
+            "/mocap/tip/point,/mocap/base/point",
+            "different frame_id (/mocap/tip/point: world; /mocap/base/point: camera)",
+        ),
+        ("world", "/mocap/tip/point,/mocap/bse/point", "there is no topic"),
+    ],
+)
+def test_points_that_are_not_one_set_of_markers_are_refused(
+    tmp_path: Path, base_frame: str, topics: str, message: str
+) -> None:
+    log = points_log(tmp_path, (0.0, 0.25), base_frame)
+    with pytest.raises(InputError) as raised:
+        read_markers(f"{log}#{topics}")
+    assert message in str(raised.value)
+
+
 RAYS = {
     "matrix": [[100, 0, 3], [0, 101, 2], [0, 0, 1]],
     "distortion": [0.1, -0.02, 1e-3, 2e-3, 0.003],

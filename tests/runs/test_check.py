@@ -19,6 +19,7 @@ from kit.problem_files import (
     replace_text,
     run_command,
     settings,
+    write_problem,
 )
 from kit.problems import TRUTH, bar_in_two_hands, hung_cube
 from kit.static import block
@@ -567,3 +568,17 @@ def test_the_json_holds_everything(tiny: Path):
     }
     assert isinstance(found["warnings"], list)
     assert found["rms_at_guess_m"] > 0
+
+
+def test_point_masses_are_stated_beside_the_mass_of_the_body(tmp_path):
+    file = write_problem(tmp_path, {"swing": 4})
+    file.write_text(
+        file.read_text()
+        + "\n[[experiment.mass]]\nnodes = { ball_m = [[0.03, 0.03, 0.0], 0.02] }\n"
+        "mass_kg = 0.002\n"
+    )
+    (body,) = check_problem(Problem.read(file)).bodies
+    assert body.point_masses_kg == {"swing": 0.002}
+    out = run_command("check", file).out
+    total_g = 1e3 * (body.mass_kg + 0.002)
+    assert f"with point masses of 2 g {total_g:.4g} g" in out

@@ -11,6 +11,7 @@ import pytest
 from kit.problem_files import run_command, settings, write_problem
 from kit.problems import GUESS, TRUTH, hung_cube, measured
 
+from collocation_sysid.common.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.model.parameters import Parameters
@@ -20,6 +21,7 @@ from collocation_sysid.problem import (
     RolloutOptions,
     UncertaintyOptions,
 )
+from collocation_sysid.result.run_sections import refinement_table
 from collocation_sysid.runs.numerical_error import refine
 from collocation_sysid.statistics.assessment import numerical_concerns
 from collocation_sysid.statistics.budget.discretisation_error import (
@@ -218,6 +220,44 @@ def test_more_error_of_the_step_than_noise_is_to_be_checked(answer):
 def test_other_numbers_of_levels_are_refused(answer):
     with pytest.raises(InputError, match="levels = 1"):
         refine(answer, levels=1)
+
+
+def test_without_an_estimated_parameter_it_is_refused_with_the_reason(answer):
+    fixed = Parameters(
+        tuple(
+            replace(each, is_fixed=True)
+            for each in answer.problem.parameters.items
+        )
+    )
+    alone = replace(answer, problem=replace(answer.problem, parameters=fixed))
+    with pytest.raises(InputError, match="no parameter was estimated"):
+        refine(alone)
+
+
+def test_estimates_that_do_not_change_are_stated_instead_of_an_empty_table(
+    answer,
+):
+    result = answer.result
+    unchanged = replace(
+        result,
+        **{
+            of: {
+                name: replace(each, numerical_error=None)
+                for name, each in getattr(result, of).items()
+            }
+            for of in ("parameters", "derived")
+        },
+    )
+    text = plain_text([refinement_table(unchanged)])
+    assert "No estimate changes with the step or the mesh" in text
+
+
+def test_a_run_without_tests_of_causes_has_the_error_that_the_problem_asks_for():
+    problem = coarse()
+    asked = replace(problem.uncertainty, numerical=True)
+    found = run(replace(problem, uncertainty=asked), seek_causes=False)
+    assert found.refinement is not None
+    assert found.refinement.levels
 
 
 @pytest.mark.long

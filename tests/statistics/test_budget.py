@@ -28,6 +28,7 @@ from collocation_sysid import (
     with_markers,
 )
 from collocation_sysid.common.display import plain_text
+from collocation_sysid.errors import InputError
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.recording.nuisance import KINDS
 from collocation_sysid.result.run_sections import run_summary
@@ -392,3 +393,19 @@ def test_other_laws_of_damping_count_unless_the_law_is_known_and_rayleighs_only_
     assert default["damping_law"] == 1.0
     assert default["rayleigh_damping"] is None
     assert Assumptions(damping_law="none").deviations["damping_law"] is None
+
+
+@pytest.mark.parametrize("stated", ["none", NOTHING])
+def test_all_assumptions_are_exact_with_one_word(stated):
+    options = UncertaintyOptions(assumptions=stated)
+    assert options.assumptions == Assumptions.exact()
+
+
+def test_a_problem_file_states_with_one_word_that_all_is_exact(tmp_path):
+    file = write_problem(tmp_path, {"swing": 5})
+    read = Problem.read(file, ['uncertainty.assumptions="none"'])
+    assert read.uncertainty.assumptions == Assumptions.exact()
+    with pytest.raises(
+        InputError, match=r'found "exact"; expected a table, or "none"'
+    ):
+        Problem.read(file, ['uncertainty.assumptions="exact"'])

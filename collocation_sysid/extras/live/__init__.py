@@ -5,7 +5,8 @@ Use `LiveEstimator`: `LiveEstimator.update` takes one frame and returns estimate
 
 - `estimator`: the estimator, its options and its output.
 - `frames`: frames as Python values, JSON lines or rows of a table; `sources`: streams of frames.
-- `frame_buffer`: buffer that turns frames into time steps with interpolated poses.
+- `frame_buffer`: buffer that turns frames into time steps with interpolated poses; `initial_rest`:
+  the end of a rest before the motion.
 - `live_model`: the model of a problem's recording; `window_pass`: the window of recent time steps,
   with its information and prior. Time marching with sensitivities is `program.streaming`.
 - `time_budget`: computing time per frame; `stiffness_search`: initial values without a guess.

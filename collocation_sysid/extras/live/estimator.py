@@ -39,7 +39,7 @@ from ...statistics.concerns import concern_if
 from ...statistics.estimates import Estimate, user_estimates
 from ...statistics.linearised import AT_BOUND
 from .batch_solution import recording_from_log, solve_recording
-from .frame_buffer import LARGEST_GAP, FrameBuffer
+from .frame_buffer import LARGEST_GAP, BufferedFrame, FrameBuffer
 from .frames import (
     Frame,
     Pose,
@@ -49,6 +49,7 @@ from .frames import (
     parse_time,
     parse_wrenches,
 )
+from .initial_rest import InitialRest
 from .live_model import model_from_problem
 from .live_trust import (
     LARGEST_SETTLED_DISTANCE,
@@ -245,6 +246,9 @@ class LiveEstimator:
             instruments=stencils,
         )
         self.counts = self.intake.counts
+        self._initial_rest = InitialRest(
+            model.body_size_m, model.experiment.markers.sigma_m
+        )
         self.samples = 0
         self.budget_s = options.budget_s or BUDGET_FRACTION * model.interval_s
         self.rows = options.rows
@@ -338,7 +342,9 @@ class LiveEstimator:
 
         Frames that are ignored, and those before the first pose, give a result as well, with a
         note where there is a reason. After a gap in the poses the estimator restarts from rest with
-        the information of the samples so far as a prior. Rows that cannot be simulated raise no
+        the information of the samples so far as a prior. When the motion begins after a long rest,
+        it starts as if the stream had begun with the last frames at rest, see `InitialRest`. Rows
+        that cannot be simulated raise no
         error: the verdict of the result says so.
         """
         began = self.clock()
@@ -353,13 +359,9 @@ class LiveEstimator:
                 notes.append(
                     "restarted after a gap in the poses, assuming that the body is at rest"
                 )
-        buffered = self.intake.add_frame(
-            frame.t_s,
-            frame.pose,
-            tracks_m=frame.tracks_m,
-            instrument_samples=frame.instrument_samples,
-        )
-        rows = buffered.rows
+        rows = self._rows_before_motion(frame, notes)
+        buffered = self._buffered(frame)
+        rows += buffered.rows
         notes += buffered.notes
         self.budget.start_frame()
         caught_up = self._catch_up(began, notes)
@@ -788,6 +790,56 @@ class LiveEstimator:
         self.log.clear()
         self.intake.reset()
         self.counts["begun anew"] += 1
+
+    def _rows_before_motion(
+        self, frame: Frame, notes: list[str]
+    ) -> list[LoggedRow]:
+        """Start anew if the motion begins with this frame after a long rest, and return the rows of
+        the last frames at rest; otherwise an empty list. `notes` are extended in place.
+        """
+        frames = self._initial_rest.frames_before_motion(frame)
+        if not frames or self.first_pass is None:
+            return []
+        self._start_anew()
+        notes.append(
+            "the motion begins after a rest: frames at rest are left out, except the last ones"
+        )
+        rows: list[LoggedRow] = []
+        for each in frames:
+            buffered = self._buffered(each)
+            rows += buffered.rows
+            if rows:
+                rows[-1].samples.extend(buffered.late_samples)
+        return rows
+
+    def _buffered(self, frame: Frame) -> BufferedFrame:
+        """Add a frame to the buffer and return the rows that it completes."""
+        return self.intake.add_frame(
+            frame.t_s,
+            frame.pose,
+            tracks_m=frame.tracks_m,
+            instrument_samples=frame.instrument_samples,
+        )
+
+    def _start_anew(self) -> None:
+        """Discard passes, log, frames and information, and return to the initial guess or to a
+        new search for it; counts and positions of markers stay.
+        """
+        model = self.model
+        self.first_pass = self.second_pass = None
+        self.log.clear()
+        self.intake.reset()
+        self.prior = SquareRootInformation.empty(model.parameter_count)
+        self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
+        self.search = (
+            self._new_search()
+            if self.problem.parameters.names_without_guess
+            else None
+        )
+        self.scatter = ResidualScatter()
+        self._trust = INITIAL_RADIUS
+        self._rejected = 0
+        self.counts["searched"] = 0
 
     # Estimates --------------------------------------------------------------------------------
 

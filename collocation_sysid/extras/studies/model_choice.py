@@ -348,9 +348,27 @@ def _comparison(chosen: Row, rival: Row) -> str:
     better, worse = (chosen, rival) if support > 0 else (rival, chosen)
     return (
         f"{prediction}{size}, that of {rival['model']} is {_prediction_text(rival)}, "
-        f"{exp(ratio):.3g} times as large (±{100 * error:.2g} %). The AIC of {better['model']} is "
+        f"{_ratio_text(ratio, error)}. The AIC of {better['model']} is "
         f"{abs(support):.3g} lower than that of {worse['model']}"
     )
+
+
+def _ratio_text(ratio: float, error: float) -> str:
+    """Return the ratio of two prediction errors as text, with its standard error if it differs from
+    one by more than that, otherwise with the interval of `SURE` standard errors, which contains one.
+
+    Parameters
+    ----------
+    ratio : float
+        Logarithm of the ratio.
+    error : float
+        Its standard error.
+    """
+    if ratio > LIKELY * error:
+        return f"{exp(ratio):.3g} times as large (±{100 * error:.2g} %)"
+    low = exp(ratio - SURE * error)
+    high = exp(ratio + SURE * error)
+    return f"a ratio of {exp(ratio):.3g}, which may be one ({low:.2g} to {high:.2g})"
 
 
 def _prediction_text(row: Row) -> str:
@@ -390,6 +408,12 @@ def _certainty(chosen: Row, rival: Row) -> str:
         return (
             f"{rival['model']} fits better, but does not predict better: more recordings, or "
             "larger motions, would decide."
+        )
+    if ratio > LIKELY * error:
+        certainty = "certainly" if ratio > SURE * error else "probably"
+        return (
+            f"{chosen['model']} {certainty} predicts these held-out samples better, but does not "
+            "fit all recordings better: more recordings, or larger motions, would decide."
         )
     return (
         "These recordings hardly distinguish the models: of those that predict equally well, the "

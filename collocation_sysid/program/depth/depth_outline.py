@@ -16,7 +16,7 @@ outline point, in pixels, is the residual (see `outline_residual`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -36,6 +36,13 @@ from .visible_surface import VisibleSurface
 SEARCH_PX = 6.0
 # Step of this search [pixels].
 STEP_PX = 0.25
+# Offsets along the outline of parallel lines of this search, over which the edge is averaged
+# [pixels]. A single line finds the border of a pixel, up to half a pixel off; an edge that is not
+# along rows or columns crosses other pixels on the other lines, and the errors cancel in part.
+LINES_PX = np.linspace(-2.0, 2.0, 9)
+# Largest distance from the edge on the middle line at which other lines find the same edge
+# [pixels].
+SAME_EDGE_PX = 1.5
 # Distance outside an outline at which the body itself must not cover the image [pixels].
 OUTSIDE_PX = 1.5
 # If at least this many pixels show background per pixel without depth, the sensor measures its
@@ -399,31 +406,40 @@ def _edges(
     empty = no_depth_is_empty(
         camera_in, image_m, sample=sample, size_m=camera_in.size_m
     )
+
+    def shown_at(pixels: Array) -> NDArray[np.int64]:
+        """Return the classes (…, P) of pixels (…, P, 2) beside the points of the outline."""
+        return _classify_pixels(
+            image_m,
+            pixels,
+            depth_m=points.depth_m,
+            gate_m=gate_m,
+            is_missing_empty=empty,
+        )
+
     offsets = np.arange(-SEARCH_PX, SEARCH_PX + STEP_PX / 2, STEP_PX)
-    across = (
-        points.pixels[:, None] + offsets[:, None] * points.outwards[:, None]
+    middle = _nearest_ends(points, offsets, along_px=0.0, shown_at=shown_at)
+    has_edge = np.isfinite(middle)
+    on_lines = np.array(
+        [
+            _nearest_ends(
+                points,
+                offsets,
+                along_px=along_px,
+                shown_at=shown_at,
+                expected=np.where(has_edge, middle, 0.0),
+            )
+            for along_px in LINES_PX
+        ]
     )
-    shown = _classify_pixels(
-        image_m,
-        across,
-        depth_m=points.depth_m[:, None],
-        gate_m=gate_m,
-        is_missing_empty=empty,
-    )
-    ends = (shown[:, :-1] == BODY) & (shown[:, 1:] == EMPTY)
-    middles = (offsets[:-1] + offsets[1:]) / 2
-    nearest = np.where(ends, np.abs(middles), np.inf).argmin(axis=1)
-    has_edge = ends.any(axis=1)
+    is_same = np.abs(on_lines - middle) <= SAME_EDGE_PX
+    # Lines in pairs on both sides, so that their mean is at the point of a straight edge.
+    is_same &= is_same[::-1]
+    counts = np.maximum(is_same.sum(axis=0), 1)
+    mean_offsets = np.where(is_same, on_lines, 0.0).sum(axis=0) / counts
     outwards = points.outwards.copy()
-    edges = points.pixels + middles[nearest, None] * outwards
-    here = _classify_pixels(
-        image_m,
-        points.pixels,
-        depth_m=points.depth_m,
-        gate_m=gate_m,
-        is_missing_empty=empty,
-    )
-    is_beyond = ~has_edge & (here == EMPTY)
+    edges = points.pixels + mean_offsets[:, None] * outwards
+    is_beyond = ~has_edge & (shown_at(points.pixels) == EMPTY)
     if is_beyond.any():
         is_nothing = (image_m > points.depth_m.max() + gate_m) | (
             np.isnan(image_m) & empty
@@ -446,6 +462,40 @@ def _edges(
             sample=sample,
         ),
     }
+
+
+def _nearest_ends(
+    points: _OutlinePoints,
+    offsets: Array,
+    *,
+    along_px: float,
+    shown_at: Callable[[Array], NDArray[np.int64]],
+    expected: Array | float = 0.0,
+) -> Array:
+    """Return the offsets (P,) along the normals of an outline at which the image of the body ends
+    [pixels]; NaN where it does not end.
+
+    Parameters
+    ----------
+    points : _OutlinePoints
+        The P points of the outline.
+    offsets : (k,) array
+        Offsets at which the image is examined, ascending [pixels].
+    along_px : float
+        Distance of the lines from the points, along the outline [pixels].
+    shown_at : callable
+        Classes (k, P) of pixels (k, P, 2).
+    expected : (P,) array or float
+        Of several ends, the nearest to this offset counts [pixels].
+    """
+    tangents = np.column_stack([-points.outwards[:, 1], points.outwards[:, 0]])
+    start = points.pixels + along_px * tangents
+    shown = shown_at(start + offsets[:, None, None] * points.outwards)
+    is_end = (shown[:-1] == BODY) & (shown[1:] == EMPTY)
+    middles = (offsets[:-1] + offsets[1:]) / 2
+    apart = np.where(is_end, np.abs(middles[:, None] - expected), np.inf)
+    nearest = middles[apart.argmin(axis=0)]
+    return np.where(is_end.any(axis=0), nearest, np.nan)
 
 
 def _classify_pixels(

@@ -39,7 +39,16 @@ SAME = 0.2
 # Largest alignment in standard deviations of its prior; more belongs to something else.
 FARTHEST = 4.0
 # Reasons for leaving points out, in the order in which they are tested.
-EXCLUSION_REASONS = ("far", "grazing", "turned away", "not chosen", "hidden")
+EXCLUSION_REASONS = (
+    "far",
+    "grazing",
+    "turned away",
+    "not chosen",
+    "hidden",
+    "crease",
+)
+# Distance from a crease within which points are left out, in standard deviations of the noise.
+CREASE_SIGMAS = 3.0
 # Share of the spacing of points by which a part must be in front to hide another; shapes that
 # change by less have converged.
 FRONT = 0.5
@@ -407,13 +416,20 @@ def _match_image(
     normals[is_beyond_edge] = (
         offsets[is_beyond_edge] / distance[is_beyond_edge, None]
     )
-    has_similar_normal = is_visible = is_any = np.ones(len(indices), dtype=bool)
+    is_any = np.ones(len(indices), dtype=bool)
+    has_similar_normal = is_visible = is_on_one_face = is_any
     if cloud.shape[1] == 6:
         measured = cloud[indices, 3:] @ camera.poses[0][sample].T
         has_similar_normal = np.sum(normals * measured, axis=1) >= GRAZING
     if settled:
         is_visible = ~surface.is_hidden(
             x, eye_m, points_m=feet, front_m=FRONT * depth.spacing_m
+        )
+        is_on_one_face = ~surface.is_near_crease(
+            x,
+            eye_m,
+            points_m=world[indices],
+            reach_m=CREASE_SIGMAS * depth.sigma_m,
         )
     is_within_gate = distance <= gate_m
     remaining = np.cumprod(
@@ -424,6 +440,7 @@ def _match_image(
             has_similar_normal,
             surface.is_selected[faces],
             is_visible,
+            is_on_one_face,
         ],
         axis=0,
     )

@@ -26,6 +26,11 @@ STILL = 1e-6
 # Cosine between normal and view below which a point is seen at a grazing angle; measured normals
 # may be off by as much.
 GRAZING = 0.3
+# Cosine between the normals of two flat triangles below which their common edge is a crease:
+# 30 degrees, more than between the facets of usual meshes of curved surfaces.
+CREASE_COSINE = 0.87
+# Distance between the points that stand for a crease, relative to the distance that is compared.
+CREASE_STEP = 0.5
 
 # Barycentric coordinates of the nodes of a face: corners a, b, c, then the middles of ab, bc, ca.
 CORNERS = np.vstack([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]])
@@ -299,6 +304,54 @@ class VisibleSurface:
         )
         behind[point[(shares >= 0).all(axis=1) & hit]] = True
         return behind
+
+    def is_near_crease(
+        self, x: Array, eye_m: Array | None, points_m: Array, reach_m: float
+    ) -> NDArray[np.bool_]:
+        """Return the mask (P,) of points whose ray passes a visible crease at a small distance.
+
+        A crease is an edge between two flat triangles that face the camera, with normals whose
+        cosine is below `CREASE_COSINE`. Noise of the depth moves a point along its ray, and so does
+        not change the result.
+
+        Parameters
+        ----------
+        x : (n, 3) array
+            Node positions [m].
+        eye_m : (3,) array or None
+            Position of the camera [m]; for None, which has no rays, no point is near.
+        points_m : (P, 3) array
+            Points [m].
+        reach_m : float
+            Largest distance, perpendicular to the ray at the depth of the crease [m].
+        """
+        near = np.zeros(len(points_m), dtype=bool)
+        if eye_m is None or not len(points_m):
+            return near
+        ends, triangles = self.edges
+        a, b, c = x[self.plane_triangles].transpose(1, 0, 2)
+        normals = np.cross(b - a, c - a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+        cosines = np.sum(normals[triangles[:, 0]] * normals[triangles[:, 1]], 1)
+        is_crease = (cosines < CREASE_COSINE) & self.is_facing(x, eye_m)[
+            triangles
+        ].all(axis=1)
+        start, end = x[ends[is_crease]].transpose(1, 0, 2)
+        lengths_m = np.linalg.norm(end - start, axis=1)
+        counts = 1 + np.ceil(lengths_m / (CREASE_STEP * reach_m)).astype(int)
+        crease = np.repeat(np.arange(len(counts)), counts)
+        number = np.arange(len(crease)) - np.repeat(
+            np.cumsum(counts) - counts, counts
+        )
+        share = (number / (counts[crease] - 1))[:, None]
+        on_crease = (1 - share) * start[crease] + share * end[crease] - eye_m
+        if not len(on_crease):
+            return near
+        away_m = np.linalg.norm(on_crease, axis=1)
+        rays = points_m - eye_m
+        rays /= np.linalg.norm(rays, axis=1)[:, None]
+        apart, nearest = KDTree(on_crease / away_m[:, None]).query(rays)
+        return apart * away_m[nearest] <= reach_m
 
     def nearest_points(
         self, x: Array, points: Array, candidates: Index

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array
 from ...common.step_counting import report_state
+from ...common.time_dependence import scale_loads
 from ...model.contact import Contact
 from ...model.forces import Forces
 from ...model.viscoelasticity import with_start_memory
@@ -106,7 +107,7 @@ def _solve_equilibrium(
     without_contact = _without_contact(forces, shape)
 
     def solve(x: Array, share: float) -> Array:
-        loaded = forces.scaled(share)
+        loaded = scale_loads(forces, share)
 
         def residual(state: Array) -> Array:
             return loaded.total(state, zero_velocity)[0]

@@ -10,6 +10,7 @@ from copy import copy
 import numpy as np
 
 from ...common.array_types import Array, Index
+from ...common.time_dependence import at_times, interpolate_in_time
 from ...errors import SimulationError
 from ...fem.rest_shape import RestShapeError
 from ...model.dynamics import Dynamics, StencilRow, weighted_sum_of_past
@@ -126,7 +127,7 @@ def continue_simulation(
         try:
             x[0], v0 = initial_state(
                 experiment,
-                dynamics.forces.at_times(slice(1)),
+                at_times(dynamics.forces, slice(1)),
                 solver=solvers.for_prescribed(is_prescribed[0]),
                 guess=guess,
                 prescribed_m=dynamics.prescribed_m[0],
@@ -279,7 +280,7 @@ class RowEquations:
     ) -> None:
         self.dynamics = dynamics
         self.row = StencilRow.from_dynamics(dynamics, t)
-        self.forces = dynamics.forces.at_times(slice(t, t + 1))
+        self.forces = at_times(dynamics.forces, slice(t, t + 1))
         if previous:
             self.forces = insert_previous_states(
                 self.forces,
@@ -287,7 +288,7 @@ class RowEquations:
                 interval_s=float(dynamics.interval_to_next_s[t - 1]),
             )
         self.forces_before = (
-            dynamics.forces.at_times(slice(t - 1, t))
+            at_times(dynamics.forces, slice(t - 1, t))
             if dynamics.is_static
             else None
         )
@@ -317,7 +318,9 @@ class RowEquations:
         """
         scaled = copy(self)
         if self.forces_before is not None:
-            scaled.rest = self.forces_before.interpolate(self.forces, share)
+            scaled.rest = interpolate_in_time(
+                self.forces_before, self.forces, share=share
+            )
         return scaled
 
     @property

@@ -113,7 +113,7 @@ def _instability(iterate: ExperimentIterate) -> Instability | None:
 
 def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
     """Return the largest Re(s) of M s² + D s + K at a state [1/s]; 0 where none exceeds the
-    rounding errors, or no dof is free.
+    rounding errors, no dof is free, or K or D is not finite, as where an element is inverted.
 
     Parameters
     ----------
@@ -131,6 +131,8 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
     mass = forces.mass.inertia_kg[0, free_dofs]
     pattern = forces.pattern
     lowers = -at.by_position[0], -at.by_velocity[0]
+    if not all(np.isfinite(lower).all() for lower in lowers):
+        return 0.0
     if all(
         _is_definite(lower, pattern, free_dofs=free_dofs, mass=mass)
         for lower in lowers

@@ -5,6 +5,7 @@
 - `raw_tracks`: marker tracks as they are in a file; `c3d`, `trc`, `qualisys`, `motive` and
   `plain_csv` read
 the formats.
-- `logs`, `topics`: logs of robots (ROS bags, MCAP, LeRobot), and the tables in their topics.
+- `logs`, `topics`: logs of robots (ROS bags, MCAP, LeRobot), and the tables in their topics;
+  `point_topics`: one marker table from several topics.
 - `depth_files`, `depth_messages`, `ply`: depth images and clouds of points, from files and logs.
 """

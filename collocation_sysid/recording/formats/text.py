@@ -23,7 +23,7 @@ from ...common.files import require_regular
 from ...errors import InputError, excerpt, located
 from ..sample_times import first_unordered_time
 from .logs import TopicAddress
-from .topics import topic_as_csv
+from .point_topics import address_as_csv
 from .units import UNITS, si_factor
 
 P = ParamSpec("P")
@@ -87,10 +87,10 @@ def read_bytes(path: str | Path) -> bytes:
     Raises
     ------
     InputError
-        If it cannot be read; see `topic_as_csv` for topics. The path is not named.
+        If it cannot be read; see `address_as_csv` for topics. The path is not named.
     """
     if (address := TopicAddress.from_path(path)) is not None:
-        return topic_as_csv(address)
+        return address_as_csv(address)
     require_regular(path)
     try:
         return Path(path).read_bytes()

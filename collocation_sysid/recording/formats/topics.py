@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
@@ -99,9 +99,24 @@ def list_topics(path: str | Path) -> list[LogTopic]:
         If the path is no log, the log is damaged, or a package that reads it is missing.
     """
     with open_log(Path(path), episode=0) as log:
-        return [
+        topics = [
             _describe_topic(log, Path(path), name=name) for name in log.topics
         ]
+        points = [
+            each.name
+            for each in topics
+            if any(
+                point_of_message(message) is not None
+                for _, message in islice(log.messages(each.name), 1)
+            )
+        ]
+    together = f"{Path(path).name}#{','.join(points)}"
+    return [
+        replace(each, write=(*each.write, together))
+        if len(points) > 1 and each.name in points
+        else each
+        for each in topics
+    ]
 
 
 def topic_as_csv(address: TopicAddress) -> bytes:
@@ -126,7 +141,7 @@ def topic_as_csv(address: TopicAddress) -> bytes:
                 f"the topic {address.topic} contains {kind}; expected a topic with numbers"
             )
         if _is_transforms(messages[0][1]):
-            return _csv_content(
+            return csv_content(
                 POSE,
                 *_poses_through_frames(
                     _all_transforms(log, messages, topic=address.topic), address
@@ -148,14 +163,14 @@ def topic_as_csv(address: TopicAddress) -> bytes:
         [[row.get(name, np.nan) for name in columns] for row in rows]
     )
     if address.robot is not None:
-        return _csv_content(
+        return csv_content(
             POSE,
             times,
             values=_poses_from_joints(
                 columns, values, address=address, unit=unit
             ),
         )
-    return _csv_content(columns, times, values=values)
+    return csv_content(columns, times, values=values)
 
 
 def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
@@ -281,9 +296,9 @@ def measurement_time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
     """
     first = next(iter(_first_list(message)), None)
     stamps = (
-        _nested_field(message, "header.stamp"),
-        _nested_field(message, "timestamp"),
-        _nested_field(first, "header.stamp"),
+        nested_field(message, "header.stamp"),
+        nested_field(message, "timestamp"),
+        nested_field(first, "header.stamp"),
     )
     stamped_ns = next(
         (_nanoseconds(each) for each in stamps if each is not None), 0
@@ -324,9 +339,9 @@ def _message_values(message: Any, *, by_namespace: bool) -> Row:
 
     With `by_namespace` the names of markers begin with their namespace.
     """
-    wrench = _nested_field(message, "wrench") or message
-    if _is_vector(force := _nested_field(wrench, "force")):
-        values = [*_vector(force), *_vector(_nested_field(wrench, "torque"))]
+    wrench = nested_field(message, "wrench") or message
+    if _is_vector(force := nested_field(wrench, "force")):
+        values = [*_vector(force), *_vector(nested_field(wrench, "torque"))]
         return dict(zip(WRENCH, values, strict=True))
     if hasattr(message, "name") and hasattr(message, "position"):
         pairs = zip(message.name, message.position, strict=True)
@@ -341,7 +356,7 @@ def _message_values(message: Any, *, by_namespace: bool) -> Row:
             for k, axis in enumerate(AXES)
         }
     for name, column in _NUMBER_FIELDS.items():
-        if isinstance(value := _nested_field(message, name), (int, float)):
+        if isinstance(value := nested_field(message, name), (int, float)):
             return {column: float(value)}
         if (
             name == "data"
@@ -359,9 +374,9 @@ def _pose_of_message(message: Any) -> tuple[float, ...] | None:
     `_POSES` that it has; None if it has no quaternion.
     """
     for position, rotation in _POSES:
-        if hasattr(turned := _nested_field(message, rotation), "w"):
+        if hasattr(turned := nested_field(message, rotation), "w"):
             return (
-                *_vector(_nested_field(message, position)),
+                *_vector(nested_field(message, position)),
                 *_vector(turned),
                 turned.w,
             )
@@ -376,10 +391,8 @@ def _points_of_message(
 
     A single point is named by its frame, else "point"; for items see `_item_name`.
     """
-    if _is_vector(one := _nested_field(message, "point")):
-        return {
-            _nested_field(message, "header.frame_id") or "point": _vector(one)
-        }
+    if (one := point_of_message(message)) is not None:
+        return {nested_field(message, "header.frame_id") or "point": one}
     items = enumerate(_first_list(message))
     places = {
         _item_name(item, k, by_namespace=by_namespace): _position_of_item(item)
@@ -388,9 +401,15 @@ def _points_of_message(
     return {key: place for key, place in places.items() if place is not None}
 
 
+def point_of_message(message: Any) -> tuple[float, ...] | None:
+    """Return the position (x, y, z) of a message with a single point; None if it has none."""
+    one = nested_field(message, "point")
+    return _vector(one) if _is_vector(one) else None
+
+
 def _first_list(message: Any) -> Any:
     """Return the first list of `_LISTS` in a message that is not empty; empty if there is none."""
-    lists = (_nested_field(message, name) for name in _LISTS)
+    lists = (nested_field(message, name) for name in _LISTS)
     return next((each for each in lists if each is not None and len(each)), ())
 
 
@@ -402,7 +421,7 @@ def _position_of_item(item: Any) -> tuple[float, ...] | None:
         (
             _vector(p)
             for name in _POINTS
-            if _is_vector(p := _nested_field(item, name))
+            if _is_vector(p := nested_field(item, name))
         ),
         None,
     )
@@ -412,13 +431,13 @@ def _item_name(item: Any, index: int, *, by_namespace: bool) -> str:
     """Return the name of an item of a list; its number, `index` + 1, if it has none. With
     `by_namespace` its namespace and a slash are put before it, if it has one.
     """
-    names = (_nested_field(item, name) for name in _NAMES)
+    names = (nested_field(item, name) for name in _NAMES)
     name = str(
         next((name for name in names if name not in (None, "")), index + 1)
     )
     return (
         f"{namespace}/{name}"
-        if by_namespace and (namespace := _nested_field(item, "ns"))
+        if by_namespace and (namespace := nested_field(item, "ns"))
         else name
     )
 
@@ -430,7 +449,7 @@ def has_namespaces(messages: Iterable[Any]) -> bool:
     return (
         len(
             {
-                _nested_field(item, "ns")
+                nested_field(item, "ns")
                 for each in messages
                 for item in _first_list(each)
             }
@@ -440,7 +459,7 @@ def has_namespaces(messages: Iterable[Any]) -> bool:
     )
 
 
-def _nested_field(message: Any, path: str) -> Any:
+def nested_field(message: Any, path: str) -> Any:
     """Return the nested field at a path of names with dots between them; None
     if it does not exist.
     """
@@ -467,7 +486,7 @@ def _is_transforms(message: Any) -> bool:
     transform itself.
     """
     return (
-        _nested_field(message, "transforms") is not None
+        nested_field(message, "transforms") is not None
         or _transform_frames(message) is not None
     )
 
@@ -476,8 +495,8 @@ def _transform_frames(transform: Any) -> tuple[str, str] | None:
     """Return the parent and the child frame of a transform, without a leading slash; None if the
     message is no transform. Odometry, which has a twist, is none.
     """
-    child = _nested_field(transform, "child_frame_id")
-    parent = _nested_field(transform, "parent_frame_id") or _nested_field(
+    child = nested_field(transform, "child_frame_id")
+    parent = nested_field(transform, "parent_frame_id") or nested_field(
         transform, "header.frame_id"
     )
     is_one = (
@@ -499,7 +518,7 @@ def _poses_of_transforms(
     """
     edges: Edges = {}
     for at_ns, message in messages:
-        for each in _nested_field(message, "transforms") or [message]:
+        for each in nested_field(message, "transforms") or [message]:
             pose = _pose_of_message(each)
             if (
                 edge := _transform_frames(each)
@@ -784,7 +803,7 @@ def _require_joint_limits(
         )
 
 
-def _csv_content(columns: Any, t_s: Array, values: Array) -> bytes:
+def csv_content(columns: Any, t_s: Array, values: Array) -> bytes:
     """Return times (T,) and values (T, columns) as the bytes of a CSV file with a row of names; NaN
     becomes a blank cell.
     """

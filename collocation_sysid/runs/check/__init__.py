@@ -566,6 +566,11 @@ def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
             body.theta_from_values(guesses),
             experiments=own,
             is_homogeneous=specimens.issuperset(own),
+            point_masses_kg={
+                e.name: sum(mass.mass_kg for mass in e.masses)
+                for e in problem.experiments
+                if e.name in own and e.masses
+            },
         )
         for body, own in zip(problem.bodies, names, strict=True)
     )

@@ -208,6 +208,8 @@ class BodyCheck:
         Numbers of nodes and elements.
     volume_m3, mass_kg : float
         Volume of the mesh, and mass at the guess, without point masses.
+    point_masses_kg : mapping of str to float
+        Sum of the point masses of each experiment that has any, by its name.
     size_m : (x, y, z) extents of the mesh along the axes
     smallest_element_quality, median_element_quality : float
         Mean ratio, see `ElementShape`.
@@ -238,6 +240,7 @@ class BodyCheck:
     element: str
     volume_m3: float
     mass_kg: float
+    point_masses_kg: Mapping[str, float]
     size_m: tuple[float, float, float]
     edges_m: tuple[float, float, float]
     smallest_element_quality: float
@@ -268,6 +271,7 @@ def check_body(
     experiments: tuple[str, ...],
     *,
     is_homogeneous: bool = False,
+    point_masses_kg: Mapping[str, float] | None = None,
 ) -> BodyCheck:
     """Return a summary of size, mesh and guess of a body, with concerns.
 
@@ -298,6 +302,7 @@ def check_body(
         element=body.element.name,
         volume_m3=mesh.volume_m3,
         mass_kg=float(body.mass_of_dofs(theta).sum()) / 3,
+        point_masses_kg=dict(point_masses_kg or {}),
         size_m=(x, y, z),
         edges_m=(quality.edge_min_m, quality.edge_mean_m, quality.edge_max_m),
         smallest_element_quality=quality.quality_min,

@@ -13,10 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic_core import CoreSchema, core_schema
 
 from ...common.array_types import Array, Index
 from ...common.schema_tables import ByForm, Section
@@ -1247,3 +1249,36 @@ class Assumptions(Options):
             for name, deviation in vars(self).items()
             if isinstance(deviation, KnownEffect)
         }
+
+
+class ExactIfNone:
+    """Annotation of a table of assumptions that may be "none": all of them exactly true."""
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Return the schema of the table with "none" replaced by `Assumptions.exact`."""
+        return core_schema.no_info_before_validator_function(
+            self._exact_if_none, handler(source)
+        )
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """Return the JSON schema: the table, or "none"."""
+        return {"anyOf": [handler(schema), {"const": "none", "type": "string"}]}
+
+    @staticmethod
+    def _exact_if_none(value: Any) -> Any:
+        """Return the values of all assumptions in place of "none"; other values unchanged.
+
+        Raises
+        ------
+        ValueError
+            If the value is another text.
+        """
+        if isinstance(value, str) and value != "none":
+            raise ValueError(
+                f'found "{value}"; expected a table, or "none" if all assumptions are exact'
+            )
+        return vars(Assumptions.exact()) if value == "none" else value

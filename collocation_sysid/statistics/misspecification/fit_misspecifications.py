@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...common.array_types import Array, root_mean
+from ...common.time_dependence import at_times
 from ...errors import InputError, SimulationError
 from ...methods.continuation import first_samples
 from ...methods.reduced_space import ReducedSpace
@@ -383,11 +384,7 @@ def with_pose_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
                 replace(g, poses=_delayed_poses(g, t_s, lag_s=lag_s))
                 for g in experiment.grasps
             ],
-            markers=replace(
-                markers,
-                t_s=t_s[is_covered],
-                positions_m=markers.positions_m[is_covered],
-            ),
+            markers=at_times(markers, is_covered),
         )
     except InputError:
         return None
