@@ -353,7 +353,7 @@ def solve_with_renewed_correspondences(
 ) -> Solution:
     """Solve, and repeat while estimates change the correspondences of the measurements.
 
-    These are the elements of markers, the points of depth cameras, and the sample intervals of
+    These are the elements of markers, the correspondences of points, and the sample intervals of
     clocks. There are at most `MOST_REREADINGS` repetitions, and none after a solve that does not
     converge. The last solution is returned, also if it has not converged; its history, counts and
     times are those of the last solve alone.

@@ -313,7 +313,7 @@ def check_problem(
         fit_s=partial(_fit_to_markers_s, collocation, total_s),
         report_progress=report_progress,
     )
-    # Wrenches are compared last: only if nothing else is likely.
+    # In reverse order, because comparisons that need a fit are made only if no other is likely.
     for feature in reversed(FEATURES):
         found, found_notes = feature.simulated_hypotheses(check)
         if found:
