@@ -166,3 +166,16 @@ def main_measurement(experiments: Sequence[Experiment]) -> tuple[str, str]:
     if any(each.wrenches for each in experiments):
         return "wrenches", "sigma_n"
     return "readings", "sigma of the readings"
+
+
+def is_load_only(experiment: Experiment) -> bool:
+    """Return whether a static experiment measures wrenches only, so that no measurement shows the
+    shape of the body between the faces.
+    """
+    return bool(
+        experiment.is_static
+        and experiment.wrenches
+        and not experiment.markers.sample_count
+        and not experiment.depths
+        and not experiment.readings
+    )
