@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from typing import Any
 
 from .contact_feature import CONTACT
 from .custom_sensor_feature import CUSTOM_SENSORS
 from .depth_feature import DEPTH
-from .feature import Feature
+from .feature import Feature, Fields
 from .marker_feature import MARKERS
 from .wrench_feature import WRENCH
 
@@ -22,18 +22,17 @@ FEATURES: tuple[Feature, ...] = (
 )
 
 
-def merged_fields(contribution: str, *arguments: Any) -> dict[str, Any]:
-    """Return the fields that all features contribute by one of their functions.
+def merged_fields(contributions: Iterable[Fields]) -> dict[str, Any]:
+    """Return the fields that several features contribute, as one mapping.
 
-    Parameters
-    ----------
-    contribution : str
-        Name of the function, such as "fit_fields".
-    *arguments
-        Its arguments.
+    Raises
+    ------
+    ValueError
+        If two features contribute the same field.
     """
-    fields: dict[str, Any] = {}
-    for feature in FEATURES:
-        own: Mapping[str, Any] = getattr(feature, contribution)(*arguments)
-        fields |= own
-    return fields
+    merged: dict[str, Any] = {}
+    for fields in contributions:
+        if twice := merged.keys() & fields.keys():
+            raise ValueError(f"two features have the field {min(twice)!r}")
+        merged |= fields
+    return merged

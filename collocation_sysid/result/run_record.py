@@ -19,7 +19,7 @@ from ..common.files import RESULT_FILE, write_text_file
 from ..common.serialisation import as_json
 from ..errors import InputError
 from ..features.depth_feature import fitted_surfaces
-from ..features.registry import merged_fields
+from ..features.registry import FEATURES, merged_fields
 from ..fem.body import Body
 from ..program.depth.depth_comparison import SurfaceComparison
 from ..recording.experiment import Experiment
@@ -248,7 +248,9 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
     ):
         rollout = finished.rollouts[experiment.name]
         rolled_out = None
+        predicted = None
         if isinstance(rollout, ForwardSimulation):
+            predicted = rollout.predicted
             rolled_out = (
                 rollout.trajectory.positions_m,
                 rollout.trajectory.markers_m,
@@ -267,13 +269,10 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
                 natural_hz=natural,
                 places_m=places_m,
                 recorded=merged_fields(
-                    "recorded",
-                    experiment,
-                    finished.solution,
-                    rollout.predicted
-                    if isinstance(rollout, ForwardSimulation)
-                    else None,
-                    shown[0],
+                    feature.recorded(
+                        experiment, finished.solution, predicted, shown[0]
+                    )
+                    for feature in FEATURES
                 ),
             )
             of_cells = _field_estimates(finished, experiment.body)

@@ -221,7 +221,9 @@ def simulate_with_parameters(
         problem, segment, phi=phi, parameters=parameters, report=report
     )
     predicted = InstrumentPrediction(
-        **merged_fields("predict", segment, trajectory, phi)
+        **merged_fields(
+            feature.predict(segment, trajectory, phi) for feature in FEATURES
+        )
     )
     error = prediction_error(experiment, predicted)
     return ForwardSimulation(
@@ -294,7 +296,9 @@ def _blind_error(
     except (InputError, SimulationError):
         return None
     predicted = InstrumentPrediction(
-        **merged_fields("predict", segment, trajectory, phi)
+        **merged_fields(
+            feature.predict(segment, trajectory, phi) for feature in FEATURES
+        )
     )
     return prediction_error(segment.experiment, predicted)
 

@@ -43,7 +43,11 @@ def prediction_error(
     predicted : InstrumentPrediction
         Prediction at the same samples and for the same instruments, in the same order.
     """
-    return PredictionErrors(**merged_fields("errors", experiment, predicted))
+    return PredictionErrors(
+        **merged_fields(
+            feature.errors(experiment, predicted) for feature in FEATURES
+        )
+    )
 
 
 def instrument_misfits(
@@ -148,7 +152,9 @@ def nearest_recording_error(
             reasons[other.name] = reason
             continue
         copy = InstrumentPrediction(
-            **merged_fields("copied", experiment, other)
+            **merged_fields(
+                feature.copied(experiment, other) for feature in FEATURES
+            )
         )
         copies.append(CopyError(other.name, prediction_error(experiment, copy)))
     if not copies:

@@ -22,7 +22,7 @@ from ..features.measurement_results import (
     ForwardResult,
     SimulatedExperiment,
 )
-from ..features.registry import merged_fields
+from ..features.registry import FEATURES, merged_fields
 from ..fem.laws.constants import GAMMA_R
 from ..methods.stiffness_scan import ScanSummary
 from ..model.schemes import as_scheme
@@ -274,7 +274,9 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
                 *_place_sentences(answer.places[name]),
                 *_nuisance_sentences(part, answer),
             ),
-            **merged_fields("fit_fields", part, solution),
+            **merged_fields(
+                feature.fit_fields(part, solution) for feature in FEATURES
+            ),
             air_density_kg_m3=experiment.air_density_kg_m3,
             test=experiment.specimen and experiment.specimen.test,
         )
@@ -288,7 +290,9 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
         solution.rms_m,
         answer.noise_rms_m,
         experiments,
-        **merged_fields("pooled_fields", solution),
+        **merged_fields(
+            feature.pooled_fields(solution) for feature in FEATURES
+        ),
         symmetry=symmetry,
     )
 

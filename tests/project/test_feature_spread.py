@@ -78,14 +78,10 @@ def test_only_the_registry_lists_the_features():
     assert users == {"features/registry.py"}
 
 
-def test_fields_of_all_features_are_merged(monkeypatch):
-    one = Feature("one", pooled_fields=lambda _: {"a": 1})
-    other = Feature("other", pooled_fields=lambda _: {"b": 2})
-    monkeypatch.setattr(
-        "collocation_sysid.features.registry.FEATURES", (one, other)
-    )
-    assert merged_fields("pooled_fields", None) == {"a": 1, "b": 2}
-    assert merged_fields("fit_fields", None, None) == {}
+def test_features_have_different_fields():
+    assert merged_fields([{"a": 1}, {}, {"b": 2}]) == {"a": 1, "b": 2}
+    with pytest.raises(ValueError, match="two features have the field 'a'"):
+        merged_fields([{"a": 1, "b": 2}, {"a": 3}])
 
 
 def test_a_feature_without_functions_contributes_nothing():
