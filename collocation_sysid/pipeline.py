@@ -26,6 +26,7 @@ from .problem import Problem
 from .program.collocation import Collocation
 from .runs.check.cost import require_memory
 from .runs.forward_simulation import simulate_experiments, step_error
+from .runs.misspecifications import find_misspecifications
 from .runs.numerical_error import refine
 from .runs.result_builder import build_result
 from .runs.result_content import Elapsed, Result
@@ -44,9 +45,6 @@ from .statistics.budget.consider_analysis import (
 from .statistics.budget.discretisation_error import MOST_SUBSTEPS
 from .statistics.budget.uncertainty_budget import VarianceSources
 from .statistics.linearised import LinearisedFit, linearise_fit
-from .statistics.misspecification.fit_misspecifications import (
-    find_misspecifications,
-)
 from .statistics.pose_noise import with_pose_noise
 from .statistics.probes.deep_probes import (
     deep_probes,

@@ -222,7 +222,7 @@ def problem_of(mesh: str, steps: int, case: str, ideal: bool) -> Problem:
     )
     guesses = {
         item.name: Unknown(item.guess, item.lower, item.upper)
-        for item in PARAMETERS.items
+        for item in PARAMETERS.scalars
     }
     return Problem([experiment], guesses | memory, scheme="midpoint")
 

@@ -25,12 +25,14 @@ from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
 from wrong_twins import FAULTS, TRACK_FAULTS, WRENCH_FAULTS, Fault
 
 from collocation_sysid.errors import InputError, SimulationError
+from collocation_sysid.features.depth_feature import (
+    depth_image_hypotheses,
+    may_be_images,
+)
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.check import (
-    depth_image_hypotheses,
-    may_be_images,
     misspecification_hypotheses,
 )
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (

@@ -146,7 +146,7 @@ def static_travel_m(problem: Problem, fibre_pa: float, mbar: float) -> float:
         pressures=[inflated],
         nuisance=Nuisance.none(),
     )
-    items = problem.parameters.items
+    items = problem.parameters.scalars
     values = {
         item.name: float(item.guess) for item in items if item.guess is not None
     }
@@ -247,7 +247,7 @@ def variant_of_problem(variant: str) -> Problem:
 def print_estimates(problem: Problem, solution: Solution) -> None:
     """Print the estimated parameters with their statistical intervals."""
     uncertainty: Uncertainty = uncertainty_at(solution.collocation, solution.z)
-    for item in problem.parameters.items:
+    for item in problem.parameters.scalars:
         if item.is_fixed:
             continue
         estimate = uncertainty.estimates[item.name]

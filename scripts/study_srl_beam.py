@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from collocation_sysid import Problem, Solution, solve
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.model.parameters import FieldCoefficients
 from collocation_sysid.program.collocation import ExperimentIterate
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.identifiability import (
@@ -296,7 +297,9 @@ def started(problem: Problem, solution: Solution) -> Problem:
     found = solution.parameters
     items = tuple(
         item
-        if item.is_fixed or item.name not in found
+        if isinstance(item, FieldCoefficients)
+        or item.is_fixed
+        or item.name not in found
         else replace(item, guess=found[item.name])
         for item in problem.parameters.items
     )

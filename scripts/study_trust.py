@@ -34,10 +34,8 @@ from collocation_sysid.problem import Problem, UncertaintyOptions
 from collocation_sysid.problem.recording_reader import require_plausible_markers
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers
+from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
-from collocation_sysid.statistics.misspecification.fit_misspecifications import (
-    find_misspecifications,
-)
 from collocation_sysid.statistics.misspecification.plausibility import (
     size_and_density_hypotheses,
 )

@@ -70,7 +70,7 @@ class Linearisation:
         Lower triangles of the skew part of ∂f/∂x; empty if it is zero.
     by_velocity_skew : (T, m) or (T, 0)
         Lower triangles of the skew part of ∂f/∂v; only external forces have one: custom forces,
-        such as gyroscopic ones, and contact whose pressure is averaged over a step.
+        such as gyroscopic ones, and forces on frames that are averaged over a step.
     """
 
     force: Array
@@ -482,7 +482,7 @@ class Body(Discretisation):
     def with_frames(
         self,
         count: int,
-        has_skew_contact: bool = False,
+        has_skew_frame_forces: bool = False,
         frictions: tuple[Constant, ...] = (),
     ) -> Body:
         """Return this body with the frames of obstacles: four further nodes each, which no cell has.
@@ -495,13 +495,17 @@ class Body(Discretisation):
         ----------
         count : int
             Number of obstacles; 0 removes all frames.
-        has_skew_contact : bool
-            Whether derivatives of the contact forces have a skew part.
+        has_skew_frame_forces : bool
+            Whether derivatives of the forces between the body and the frames have a skew part.
         frictions : tuple of Constant
             Friction coefficients that are parameters; the last entries of θ.
         """
-        key = count, has_skew_contact, frictions
-        if key == (len(self.frames), self.has_skew_contact, self.frictions):
+        key = count, has_skew_frame_forces, frictions
+        if key == (
+            len(self.frames),
+            self.has_skew_frame_forces,
+            self.frictions,
+        ):
             return self
         if key not in self._framed:
             other = copy(self)
@@ -510,7 +514,7 @@ class Body(Discretisation):
             ConstantsModel.__init__(
                 other, self.parts, forces=self.forces, frictions=frictions
             )
-            other.has_skew_contact = has_skew_contact
+            other.has_skew_frame_forces = has_skew_frame_forces
             other._evaluators = {}
             first = len(self.nodes.points_m)
             added = np.tile(self.frame_nodes_m, (count, 1))

@@ -268,4 +268,6 @@ def _coarse_field(
         )
     centres_m = body.mesh.centres_m[source.cells]
     _, nearest = KDTree(centres_m).query(coarse.mesh.centres_m[part.cells])
-    return modes.on_cells(nearest, coarse.mesh.volumes_m3[part.cells])
+    return modes.on_cells(
+        np.asarray(nearest), coarse.mesh.volumes_m3[part.cells]
+    )

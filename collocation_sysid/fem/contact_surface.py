@@ -8,6 +8,7 @@ import numpy as np
 
 from ..common.array_types import Array, Index
 from .body import Body
+from .elements import face_shape_functions
 from .force_points import ForcePoints
 from .meshes.selection import Selection
 
@@ -116,28 +117,3 @@ class ContactSurface:
             points_per_face=count,
             faces=rows,
         )
-
-
-def face_shape_functions(places: Array, nodes: int) -> tuple[Array, Array]:
-    """Return the shape functions (q, v) of faces with v nodes, and derivatives (q, v, 3).
-
-    Nodes are the corners and, for six of them, the middles of ab, bc and ca.
-
-    Parameters
-    ----------
-    places : (q, 3)
-        Barycentric coordinates, by which the derivatives are taken.
-    nodes : {3, 6}
-        Number v of nodes.
-    """
-    unit = np.broadcast_to(np.eye(3), (len(places), 3, 3))
-    if nodes == 3:
-        return places, unit
-    next_places = np.roll(places, -1, axis=1)
-    weights = np.hstack([places * (2 * places - 1), 4 * places * next_places])
-    side_slopes = next_places[:, :, None] * unit + places[:, :, None] * np.roll(
-        unit, 1, axis=2
-    )
-    return weights, np.hstack(
-        [(4 * places - 1)[:, :, None] * unit, 4 * side_slopes]
-    )

@@ -69,8 +69,8 @@ class Discretisation(ConstantsModel):
         Undeformed node positions, including obstacle frames [m].
     frames : (k, 4)
         Indices of the nodes of obstacle frames; (0, 4) until `Body.with_frames` adds some.
-    has_skew_contact : bool
-        Whether derivatives of contact forces have a skew part.
+    has_skew_frame_forces : bool
+        Whether derivatives of the forces between the body and its frames have a skew part.
     cells : (E, nodes per element)
         Node indices of each element.
     geometry : (E, q, 3·nodes + 1)
@@ -103,7 +103,7 @@ class Discretisation(ConstantsModel):
         self.nodes = ElementNodes.for_element(mesh, self.element)
         self.nodes_m: Array = self.nodes.points_m
         self.frames: Index = np.zeros((0, 4), dtype=np.int64)
-        self.has_skew_contact = False
+        self.has_skew_frame_forces = False
         self._framed: dict[tuple[Any, ...], Any] = {}
         self.cells: Index = self.nodes.cells
         self.threads = threads or available_threads()
@@ -330,12 +330,13 @@ class Discretisation(ConstantsModel):
     @cached_property
     def is_unsymmetric(self) -> bool:
         """Whether a derivative of the forces by position or velocity can have a skew part: that of a
-        damping law given as a stress, of contact (`has_skew_contact`), or of a custom force.
+        damping law given as a stress, of forces on frames (`has_skew_frame_forces`), or of a custom
+        force.
         """
         laws = any(part.damping.stress is not None for part in self.parts)
         return (
             laws
-            or self.has_skew_contact
+            or self.has_skew_frame_forces
             or any(
                 f.has_skew_stiffness or f.has_skew_damping for f in self.forces
             )

@@ -134,6 +134,31 @@ ELEMENTS: dict[str, Element] = {
 }
 
 
+def face_shape_functions(places: Array, nodes: int) -> tuple[Array, Array]:
+    """Return the shape functions (q, v) of faces with v nodes, and derivatives (q, v, 3).
+
+    Nodes are the corners and, for six of them, the middles of ab, bc and ca.
+
+    Parameters
+    ----------
+    places : (q, 3)
+        Barycentric coordinates, by which the derivatives are taken.
+    nodes : {3, 6}
+        Number v of nodes.
+    """
+    unit = np.broadcast_to(np.eye(3), (len(places), 3, 3))
+    if nodes == 3:
+        return places, unit
+    next_places = np.roll(places, -1, axis=1)
+    weights = np.hstack([places * (2 * places - 1), 4 * places * next_places])
+    side_slopes = next_places[:, :, None] * unit + places[:, :, None] * np.roll(
+        unit, 1, axis=2
+    )
+    return weights, np.hstack(
+        [(4 * places - 1)[:, :, None] * unit, 4 * side_slopes]
+    )
+
+
 def element_named(name: str) -> Element:
     """Return the element of this name in `ELEMENTS`.
 

@@ -14,12 +14,11 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 from ..common.array_types import Array
-from ..common.time_dependence import at_times
 from ..common.validated_types import Options
 from ..errors import InputError, hint_at
 from ..program.collocation import Collocation
-from ..recording.depth_camera import until_all_cameras_see
 from ..recording.experiment import Experiment
+from ..recording.measurement_selection import shortened_experiment
 from ..recording.time_tables import FEWEST_SHARED_SAMPLES
 from .comparison.casadi_nlp import Sleqp, SqpMethod
 from .comparison.penalty import AugmentedLagrangian, Penalty
@@ -131,32 +130,19 @@ class Continuation(Options):
 
 
 def first_samples(experiment: Experiment, count: int) -> Experiment:
-    """Return the experiment with its first samples; depth cameras without a point in them are left
-    out.
+    """Return the experiment with its first samples, see `shortened_experiment`.
 
     Parameters
     ----------
     experiment : Experiment
         Experiment.
     count : int
-        Number of samples; it is increased to three, to the first sample with a marker, and until
-        every depth camera has points and three images (one if static), but not beyond the
-        recording.
+        Number of samples; it is increased to three and to the first sample with a marker, and as in
+        `shortened_experiment`, but not beyond the recording.
     """
-    markers = experiment.markers
-    stop = min(
-        len(experiment.t_s), max(count, markers.first_visible_sample + 1, 3)
-    )
-    fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
-    stop, depths = until_all_cameras_see(
-        experiment.depths, experiment.t_s, count=stop, fewest=fewest
-    )
-    return replace(
-        experiment,
-        t_s=experiment.t_s[:stop],
-        markers=at_times(markers, slice(stop)),
-        depths=depths,
-    )
+    first_visible = experiment.markers.first_visible_sample
+    count = max(count, first_visible + 1, FEWEST_SHARED_SAMPLES)
+    return shortened_experiment(experiment, min(len(experiment.t_s), count))
 
 
 def first_share(collocation: Collocation, share: float) -> Collocation:

@@ -1,8 +1,8 @@
 """Search of the reduced-space method: trust region, acceptance of trials, and increasing horizons.
 
 `SearchOptions` are the options that the user sets; `ReducedSearch` is the search itself. Where
-measurements are associated with the body at estimated positions (markers of unknown position, depth
-cameras), the search also updates the association.
+measurements are associated with the body at estimated positions (markers of unknown position,
+correspondences of points with the surface), the search also updates the association.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ SAFETY = 0.3
 FEASIBLE_FORCE = 1e-10
 # Largest trust region.
 WIDEST = 4.0
-# Largest trust region with depth cameras, whose associations are valid only nearby.
+# Largest trust region with correspondences, which are valid only nearby.
 SEEING = 0.25
-# With depth cameras, a rejected step shorter than this ends the search.
+# With correspondences, a rejected step shorter than this ends the search.
 LEAST_DETERMINED_SHARE = 1e-3
-# Smallest share of the associated depth points that a step must keep.
+# Smallest share of the correspondences that a step must keep.
 LEAST_VISIBLE_SHARE = 0.97
-# Largest increase of the mean loss of a depth point by a new association.
+# Largest increase of the mean loss of a measured number by a new association.
 EQUAL_MISFIT_RATIO = 1.01
 # Largest step from which the curvature at the solution is learned.
 LOCAL = 0.1
@@ -111,7 +111,7 @@ class SearchOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class _ReassociatedTrial:
-    """Trial whose depth points have been associated at its own estimates.
+    """Trial whose correspondences have been found again at its own estimates.
 
     Attributes
     ----------
@@ -149,10 +149,11 @@ class ReducedSearch:
         Change of each parameter that counts as a step of one.
     lower, upper : (np,) array
         Bounds of the parameters.
-    has_depth_cameras : bool
-        Whether an experiment has depth cameras.
+    has_correspondences : bool
+        Whether an experiment has measured points that correspond to the nearest surface, as those
+        of cameras do.
     is_associated : bool
-        Whether depth cameras of unknown position have been associated with trajectories of
+        Whether cameras of unknown position have been associated with trajectories of
         sufficient length.
     indefinite_steps : int
         Time steps with an indefinite matrix at the best point.
@@ -186,11 +187,11 @@ class ReducedSearch:
         self.recorder = recorder
         self.collocation = collocation = recorder.collocation
         self.sweeps = 0
-        # Depth points are associated with the nearest surface, which is valid for short steps.
-        self.has_depth_cameras = any(
-            segment.depths for segment in collocation.transcriptions
+        self.has_correspondences = any(
+            segment.association.correspondences
+            for segment in collocation.transcriptions
         )
-        self.largest_trust = SEEING if self.has_depth_cameras else WIDEST
+        self.largest_trust = SEEING if self.has_correspondences else WIDEST
         self.trust = min(options.trust, self.largest_trust)
         self.indefinite_steps = 0
         self.lower, self.upper = collocation.parameter_bounds
@@ -209,7 +210,7 @@ class ReducedSearch:
                 for part in collocation.iterates(start)
             ]
         self.point: Iterate | None = None
-        self.camera_trial: _ReassociatedTrial | None = None
+        self.reassociated_trial: _ReassociatedTrial | None = None
         nodes = [segment.body.nodes_m for segment in collocation.transcriptions]
         self.edge_m = min(
             segment.length_m for segment in collocation.transcriptions
@@ -415,7 +416,7 @@ class ReducedSearch:
             if (
                 trial is not None
                 and is_better
-                and self._is_better_for_cameras(horizon, point, trial=trial)
+                and self._is_better_reassociated(horizon, point, trial=trial)
             ):
                 if is_last and length <= LOCAL:
                     curvature = self._update_curvature(
@@ -430,7 +431,7 @@ class ReducedSearch:
                 and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m
             ):
                 return Status.CONVERGED  # rounding keeps it from getting better
-            if self.has_depth_cameras and length <= LEAST_DETERMINED_SHARE:
+            if self.has_correspondences and length <= LEAST_DETERMINED_SHARE:
                 return (
                     Status.CONVERGED
                 )  # the association changes the loss by more than such a step
@@ -597,7 +598,7 @@ class ReducedSearch:
                 rows = horizon.first_rows(self.trajectories, counts)
                 # Images of later rows are associated when the trajectories are long enough.
                 self.is_associated = (
-                    not self.has_depth_cameras or [*map(len, rows)] == counts
+                    not self.has_correspondences or [*map(len, rows)] == counts
                 )
                 self._set_collocation(
                     horizon,
@@ -621,11 +622,11 @@ class ReducedSearch:
 
         The collocation with this association and its parameters replace those of the search, of the
         recorder and of the horizon, see `_set_collocation`, and `reassociations` is increased by
-        one. For the trial that `_is_better_for_cameras` has associated last, that association is
+        one. For the trial that `_is_better_reassociated` has associated last, that association is
         used; else positions and sensitivities of the point are kept, and measurements are evaluated
         again.
         """
-        stored = self.camera_trial
+        stored = self.reassociated_trial
         if stored is not None and stored.trial is point:
             collocation = stored.collocation
             p = stored.reassociated.p
@@ -645,19 +646,19 @@ class ReducedSearch:
             return stored.reassociated
         return horizon.reassociate(p, point)
 
-    def _is_better_for_cameras(
+    def _is_better_reassociated(
         self, horizon: Horizon, point: Iterate, trial: Iterate
     ) -> bool:
-        """Return whether a trial is still acceptable with depth points associated at its estimates.
+        """Return whether a trial is still acceptable with correspondences found at its estimates.
 
-        A depth point may then belong to another part of the surface, or to none. The number of
+        A point may then belong to another part of the surface, or to none. The number of
         measurements, with those left out because of a crease (`Collocation.associated_count`), must
-        be at least `LEAST_VISIBLE_SHARE` of the largest so far, and the loss per
-        measurement at most `EQUAL_MISFIT_RATIO` times that of the point. True without depth
-        cameras; false if the association may not be updated any more.
+        be at least `LEAST_VISIBLE_SHARE` of the largest so far, and the loss per measurement at most
+        `EQUAL_MISFIT_RATIO` times that of the point. True without correspondences; false if the
+        association may not be updated any more.
 
         Afterwards collocation and parameters are those of the point, in the search, the recorder
-        and the horizon. The association at the trial is stored in `camera_trial` for
+        and the horizon. The association at the trial is stored in `reassociated_trial` for
         `_reassociate`, and `most_measurements` is updated; `reassociations` is unchanged.
 
         Parameters
@@ -670,7 +671,7 @@ class ReducedSearch:
             Point after a step that `_judge` accepts, with the same association.
         """
         before = self.collocation
-        if not self.has_depth_cameras:
+        if not self.has_correspondences:
             return True
         if self.reassociations >= REREADINGS:
             return False
@@ -680,7 +681,7 @@ class ReducedSearch:
         after = self._reassociate(horizon, trial)
         if self.collocation is not before:
             self.reassociations -= 1  # it counts when the trial is accepted
-        self.camera_trial = _ReassociatedTrial(
+        self.reassociated_trial = _ReassociatedTrial(
             trial, self.collocation, reassociated=after
         )
         associated = self.collocation.associated_count

@@ -36,6 +36,7 @@ from ..fem.kernels import concurrent_count
 from ..program.collocation import Collocation
 from ..program.linear_algebra.lapack import one_blas_thread
 from ..program.sweep import Sweep
+from ..recording.measurement_selection import main_measurement
 from .experiment_executors import ExperimentExecutor, LocalExecutor
 from .initial_trajectories import complete_variables, simulate_trajectories
 from .loss_curvature import require_second_derivatives
@@ -157,20 +158,6 @@ def memory_mb(collocation: Collocation) -> float:
     return (8 * values + sum(chunks[-concurrent:])) / 1e6
 
 
-def _main_measurement(collocation: Collocation) -> tuple[str, str]:
-    """Return the kind of measurement that dominates, as plural text, and the key that states its
-    noise: markers, else depth cameras, else wrenches, else custom sensors.
-    """
-    experiments = [segment.experiment for segment in collocation.transcriptions]
-    if any(each.markers.sample_count for each in experiments):
-        return "markers", "sigma_m"
-    if any(each.depths for each in experiments):
-        return "points of depth cameras", "sigma_m of depth"
-    if any(each.wrenches for each in experiments):
-        return "wrenches", "sigma_n"
-    return "readings", "sigma of the readings"
-
-
 def _notes(
     collocation: Collocation, indefinite_steps: int, z: Array, status: Status
 ) -> list[str]:
@@ -202,7 +189,9 @@ def _notes(
         misfit = float(np.sqrt(squares / max(1, collocation.measurement_count)))
         if misfit > MISFIT:
             size = f" ({1e3 * collocation.rms_marker_distance_m(z):.3g} mm rms)"
-            measurements, noise_key = _main_measurement(collocation)
+            measurements, noise_key = main_measurement(
+                [segment.experiment for segment in collocation.transcriptions]
+            )
             are_markers = noise_key == "sigma_m"
             notes.append(
                 f"the residuals of the {measurements} are {misfit:.3g} times their standard "

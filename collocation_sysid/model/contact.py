@@ -11,7 +11,7 @@ with stiffness κ, width δ, friction coefficient μ, slip ε and the tangential
 to the obstacle. The forces are −∂Ψ/∂(x, X) − ∂D/∂(v, V), where V is the velocity of the frame;
 forces on the frame are the reaction of the obstacle and balance those on the body. Ψ has continuous
 second derivatives and couples only the nodes of one face. At negative gaps N is linear, so that
-Newton's method leaves any depth in one step, where a quadratic law would halve the depth each time.
+Newton's method removes any penetration in one step, where a quadratic law would halve it each time.
 In a static experiment v is the displacement since the previous sample, so that friction holds each
 point where it was then.
 
@@ -708,10 +708,10 @@ class Contact(Pointwise):
         )
 
     def deepest_point(self, x: Array) -> tuple[float, Array]:
-        """Return the depth δ − g [m] of the point with the smallest gap at positions x (3n,) [m],
+        """Return the penetration δ − g [m] of the point with the smallest gap at positions x (3n,) [m],
         and the gradient of its gap (3,) in the axes of the world, the obstacle's outward normal.
 
-        The depth is negative if no point has a pressure.
+        The penetration is negative if no point has a pressure.
         """
         y = self.points.vectors(x[None])
         gap, slopes = self.law_of_contact.gap_function.evaluate_with_jacobian(

@@ -313,7 +313,7 @@ class Problem:
             require_method(chosen, "method")
             chosen = METHODS[chosen]()
         if isinstance(chosen, InteriorPoint):
-            # Validation recordings are only simulated forward, by the contact's energy.
+            # Validation recordings are only simulated forward, by the energies of obstacles.
             chosen.require(
                 each for each in self.experiments if not each.validation
             )

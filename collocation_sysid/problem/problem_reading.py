@@ -83,7 +83,7 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
         ):  # on which the parser would spend minutes
             raise RecursionError
         content = tomllib.loads(text)
-        if _depth(content) > DEEPEST:
+        if _nesting_level_count(content) > DEEPEST:
             raise RecursionError
         return content
     except tomllib.TOMLDecodeError as error:
@@ -91,17 +91,17 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
     except (
         RecursionError,
         ValueError,
-    ) as error:  # Python's limits of depth and of digits
+    ) as error:  # Python's limits of nesting and of digits
         raise InputError(_beyond_limits(error), path) from error
 
 
-def _depth(content: Any) -> int:
+def _nesting_level_count(content: Any) -> int:
     """Return the number of nested levels of a table or list, itself included (1 if nothing is
     nested); counting stops at `DEEPEST` + 1.
     """
     level = [content]
-    depth = 0
-    while level and depth <= DEEPEST:
+    level_count = 0
+    while level and level_count <= DEEPEST:
         tables = [
             each.values() if isinstance(each, dict) else each for each in level
         ]
@@ -111,8 +111,8 @@ def _depth(content: Any) -> int:
             for each in table
             if isinstance(each, (dict, list))
         ]
-        depth += 1
-    return depth
+        level_count += 1
+    return level_count
 
 
 def _beyond_limits(error: Exception) -> str:
@@ -219,12 +219,12 @@ def _apply_override(content: dict[str, Any], override: str) -> None:
     table: Any = content
     shared: Any = content.get("experiment_defaults")
     *leading, last = _join_dotted_names(content, parts)
-    for depth, part in enumerate(leading):
+    for level, part in enumerate(leading):
         item: Any = _item_key(table, part, key=key)
         if isinstance(table, dict):
             # An experiment gets a default of its own, a part of which is to be overridden.
             has_default = (
-                depth == 2
+                level == 2
                 and leading[0] == "experiment"
                 and isinstance(shared, dict)
             )

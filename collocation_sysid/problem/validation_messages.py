@@ -71,9 +71,9 @@ def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:
     parts = [
         p for k, p in enumerate(loc) if k >= own or not str(p).startswith("<")
     ]
-    field, depth = _schema_field(parts, root)
+    field, part_count = _schema_field(parts, root)
     if field is not None and _table_model(field.annotation) is None:
-        while len(parts) > depth and isinstance(parts[-1], int):
+        while len(parts) > part_count and isinstance(parts[-1], int):
             parts.pop()
     return parts
 
@@ -215,7 +215,7 @@ def _schema_field(
     """
     model: type[BaseModel] | None = root
     field = None
-    depth = 0
+    part_count = 0
     named = False
     for count, part in enumerate(key, start=1):
         if isinstance(part, int):
@@ -239,10 +239,10 @@ def _schema_field(
         if model is None or part not in _fields_by_key(model):
             break
         field = _fields_by_key(model)[part]
-        depth = count
+        part_count = count
         named = False
         model = _table_model(field.annotation)
-    return field, depth
+    return field, part_count
 
 
 def _fields_by_key(model: type[BaseModel]) -> dict[str, FieldInfo]:
@@ -280,5 +280,5 @@ def shortened(value: Any) -> str:
     except (
         ValueError,
         RecursionError,
-    ):  # beyond Python's limits of digits and of depth
+    ):  # beyond Python's limits of digits and of nesting
         return f"a {type(value).__name__} too large to show"

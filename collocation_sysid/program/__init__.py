@@ -13,7 +13,7 @@ Measurements
     `observables` are measurable quantities, `observable_response` linearises them along the
     equations of motion, and `measurement_residual` compares them with data. `custom_sensor_residual`
     is the measurement of a custom sensor; the packages `markers`, `wrench` and `depth` contain the
-    other kinds.
+    other kinds. `reaction_forces` are those of grasps.
 Linear algebra
     `sweep` solves the linearised equations of motion forward and backward in time,
     `least_squares` accumulates normal equations in square-root form, `stopwatch` measures time, and
@@ -24,7 +24,7 @@ Streaming
 Simulation
     `simulation` simulates an experiment with the package `forward`.
 Analyses of a motion
-    The packages `contact` and `modes`, and reaction forces in `wrench`.
+    The packages `contact` and `modes`.
 
 Methods use `Collocation`; statistics use `Transcription`, `ExperimentIterate` and `Sweep`;
 predictions use `simulate`; live estimation uses `streaming`.

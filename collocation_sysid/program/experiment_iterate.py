@@ -22,8 +22,8 @@ from .depth.depth_residual import DepthResidual
 from .depth.outline_residual import OutlineResidual
 from .measurement_residual import Observable
 from .observables import ObservedMotion, ReactionForces
+from .reaction_forces import reaction_vjp, reactions_at
 from .transcription import Transcription
-from .wrench.reaction_forces import reaction_vjp, reactions_at
 
 
 @dataclass(frozen=True, eq=False)

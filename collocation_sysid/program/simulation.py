@@ -30,7 +30,7 @@ from .forward.newmark import simulate_newmark
 from .forward.newton_solver import NewtonOptions
 from .forward.scheme_simulation import Progress, simulate_scheme
 from .observables import ObservedMotion, ReactionForces
-from .wrench.reaction_forces import reactions_at
+from .reaction_forces import reactions_at
 from .wrench.wrench_observable import ReactionGrid, sensed_dofs
 from .wrench.wrench_residual import wrench_residuals
 

@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
 from ..fem.laws.constants import GAMMA_M, without_region
@@ -555,23 +554,13 @@ def _still_experiment(
         t_s=t_s,
         grasps=[
             replace(
-                grasp, wrench=grasp.wrench and _still_wrench(grasp.wrench, t_s)
+                grasp, wrench=grasp.wrench and grasp.wrench.with_zeros_at(t_s)
             )
             for grasp in _grasps_at(experiment, _first_poses(experiment))
         ],
         markers=replace(markers, t_s=t_s, positions_m=tracks),
         readings=gauges,
     )
-
-
-def _still_wrench(wrench: Wrench, t_s: NDArray) -> Wrench:
-    """Return a wrench sensor with values of zero at the times t_s, NaN for components that it does
-    not measure.
-    """
-    values = np.where(
-        wrench.measured_components, np.zeros((len(t_s), 1)), np.nan
-    )
-    return replace(wrench, t_s=t_s, values=values)
 
 
 def _first_poses(experiment: Experiment) -> Poses:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -104,6 +105,15 @@ class Wrench:
     def __repr__(self) -> str:
         names = ", ".join(self.component_names)
         return f"Wrench({len(self.t_s)} samples of {names} in the frame of the {self.frame})"
+
+    def with_zeros_at(self, t_s: Array) -> Wrench:
+        """Return a copy with zeros at the times `t_s` (S,) [s], as placeholders; NaN for components
+        that are not measured.
+        """
+        values = np.where(
+            self.measured_components, np.zeros((len(t_s), 1)), np.nan
+        )
+        return replace(self, t_s=t_s, values=values)
 
     @property
     def is_measured(self) -> NDArray[np.bool_]:

@@ -238,5 +238,5 @@ def with_obstacle_frames(
         for each in obstacles
     )
     return body.with_frames(
-        len(obstacles), has_skew_contact=unsymmetric, frictions=frictions
+        len(obstacles), has_skew_frame_forces=unsymmetric, frictions=frictions
     )

@@ -241,9 +241,9 @@ class LocatedBody:
         If several elements share the nearest edge or corner, it is the one in which the least
         barycentric coordinate of the point is largest.
         """
-        depth = self.barycentric(point, slice(None)).min(axis=1)
-        cell = int(np.argmax(depth))
-        if depth[cell] >= -_INSIDE_TOLERANCE:
+        least_coordinate = self.barycentric(point, slice(None)).min(axis=1)
+        cell = int(np.argmax(least_coordinate))
+        if least_coordinate[cell] >= -_INSIDE_TOLERANCE:
             return cell, 0.0
         to_faces = np.linalg.norm(
             point - nearest_points_of_triangles(point, self.triangles), axis=1
@@ -253,7 +253,7 @@ class LocatedBody:
         nearest = self.body.mesh.surface_cells[
             to_faces <= distance + 1e-9 * self.mean_edge_m
         ]
-        return int(nearest[np.argmax(depth[nearest])]), distance
+        return int(nearest[np.argmax(least_coordinate[nearest])]), distance
 
     def weights_at_nearest_point(self, point: Array) -> tuple[Index, Array]:
         """Return nodes (npe,) and weights (npe,) of the point of the body that is nearest to a

@@ -99,7 +99,10 @@ class DepthProjection:
             )
         right_top_mm = 1e3 * self.parallel_camera.project(world_m)
         return np.column_stack(
-            [right_top_mm * [1, -1], -self.parallel_camera.depths_m(world_m)]
+            [
+                right_top_mm * [1, -1],
+                -self.parallel_camera.coordinates_to_viewer_m(world_m),
+            ]
         )
 
     def outlines(self, shape_m: Array, sample: int) -> Array:

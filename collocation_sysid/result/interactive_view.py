@@ -30,7 +30,7 @@ from .web_page import Colouring, cells_below_faces, write_page
 WINDOW_SIZE_PIXELS = (1100, 800)
 DEFAULT_FIELD = "von_mises_pa"
 # Fields on the surface, of replays with obstacles.
-CONTACT_FIELDS = ("pressures_pa", "gaps_m")
+SURFACE_FIELDS = ("pressures_pa", "gaps_m")
 
 
 def export_page(
@@ -51,7 +51,7 @@ def export_page(
     experiment : str, optional
         Name of the experiment; the first with a trajectory by default.
     field : str, optional
-        Point or cell data of the frames that colour the fitted body, or the contact quantities
+        Point or cell data of the frames that colour the fitted body, or the quantities of faces
         "pressures_pa" or "gaps_m", which experiments for validation have, too; by default the
         strain of the fitted and the simulated body.
 
@@ -77,8 +77,8 @@ def export_page(
 def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
     """Return a field (T, F) on the boundary triangles, at each sample that of the nearest frame.
 
-    Point data are averaged over the corners of a triangle; of vectors the norm is taken. Contact
-    pressure and gap come from `replay` and need no frames.
+    Point data are averaged over the corners of a triangle; of vectors the norm is taken.
+    Pressure and gap come from `replay` and need no frames.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
     replay : MotionRecord
         Experiment of this run.
     field : str
-        Point or cell data of the frames, or one of `CONTACT_FIELDS`.
+        Point or cell data of the frames, or one of `SURFACE_FIELDS`.
 
     Raises
     ------
@@ -95,10 +95,10 @@ def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
         If the frames have no such field, or there are none.
     """
     if (
-        field in CONTACT_FIELDS
-        and (contact_values := getattr(replay, field)) is not None
+        field in SURFACE_FIELDS
+        and (values_of_faces := getattr(replay, field)) is not None
     ):
-        return contact_values
+        return values_of_faces
     frames = _frames_of_fit(run, replay)
     cells = cells_below_faces(replay.tetrahedra, replay.surface)
     with _damaged_frames_refused(Path(run)):

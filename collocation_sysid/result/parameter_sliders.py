@@ -17,6 +17,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.display import number
 from ..errors import InputError, SimulationError, require_among
+from ..features.registry import FEATURES
 from ..fem.laws.constants import symbol_with_unit
 from ..model.parameters import Parameters
 from ..problem import Problem
@@ -292,24 +293,18 @@ class ParameterSliders:
     def _misfit_text(self, simulation: ForwardSimulation) -> str:
         """Return the RMS differences from the measurements in words, separated by semicolons.
 
-        They are of markers [mm], also the largest, forces [N], custom sensors (in their unit, which
-        is not written) and depth cameras [mm]; without any measurement the text says so.
+        They are of markers [mm], also the largest, and of all features, those of custom sensors
+        without their unit; without any measurement the text says so.
         """
         texts = []
         if len(self._experiment.markers.names):
             rms_mm = number(1e3 * simulation.rms_m, 3)
             max_mm = number(1e3 * simulation.max_m, 3)
             texts.append(f"markers: {rms_mm} mm RMS, at most {max_mm} mm")
-        if simulation.wrench_rms[0] is not None:
-            texts.append(f"force: {number(simulation.wrench_rms[0], 3)} N RMS")
         texts += [
-            f"{name}: {number(rms, 3)} RMS"
-            for name, rms in simulation.reading_rms.items()
-        ]
-        texts += [
-            f"{name}: {number(1e3 * each.rms_m, 3)} mm RMS"
-            for name, each in simulation.depth.items()
-            if each.rms_m is not None
+            text
+            for feature in FEATURES
+            for text in feature.brief_texts(simulation.error)
         ]
         return "; ".join(texts) or "no measurement to compare with"
 
@@ -331,13 +326,15 @@ class ParameterSliders:
         if experiment.wrenches:
             sensor = experiment.wrenches[0]
             columns = _sensor_columns(
-                sensor.t_s, sensor.values, simulated=simulation.wrenches[0]
+                sensor.t_s,
+                sensor.values,
+                simulated=simulation.predicted.wrenches[0],
             )
             columns[:, 1:] *= sensor.symmetry
             return sensor_picture(columns, COMPONENTS, units=UNITS)
         if experiment.readings:
             gauge = experiment.readings[0]
-            predicted = simulation.readings[gauge.name]
+            predicted = simulation.predicted.readings[gauge.name]
             columns = _sensor_columns(
                 gauge.sample_times_s, gauge.measured_values, simulated=predicted
             )

@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager
 from dataclasses import MISSING, dataclass, field, fields
 from itertools import count, takewhile
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -136,7 +137,7 @@ class MotionRecord:
     obstacles_m : (T, o, 3), or None
         Points of the obstacles' outlines, NaN after each line.
     gaps_m, pressures_pa : (T, F), or None
-        Gap and contact pressure on the fitted or else simulated surface; None without obstacles.
+        Gap and pressure of obstacles on the fitted or else simulated surface; None without any.
     fields : mapping of name to (E, 4)
         For each spatially varying constant: the estimate, the ends of its 95 % interval, and its
         posterior over its prior standard deviation; NaN in elements of other regions.
@@ -190,9 +191,7 @@ class MotionRecord:
         simulated: tuple[Array, Array] | None = None,
         natural_hz: Array | None = None,
         places_m: Array | None = None,
-        wrenches: Sequence[Array] = (),
-        readings: Mapping[str, Array] | None = None,
-        contact: tuple[Array, Array] | None = None,
+        recorded: Mapping[str, Any] = MappingProxyType({}),
     ) -> MotionRecord:
         """Return the motion of an experiment; obstacles' nodes are left out.
 
@@ -209,10 +208,8 @@ class MotionRecord:
             Natural frequencies [Hz].
         places_m : (M, 3), optional
             Estimated places of the markers; the stated ones by default.
-        wrenches, readings
-            See the attributes.
-        contact : ((T, F), (T, F)), optional
-            Gap [m] and pressure [Pa] on the surface.
+        recorded : mapping of attribute to value, optional
+            Further attributes, as the features give them, see `Feature.recorded`.
         """
         body = experiment.body
         markers = experiment.markers
@@ -245,12 +242,11 @@ class MotionRecord:
             *(fitted or (None, None)),
             *(simulated or (None, None)),
             natural_hz,
-            wrenches,
-            experiment.is_static,
-            _join_polylines([tendon.points_m for tendon in experiment.tendons]),
-            readings or {},
-            _obstacle_outlines(experiment),
-            *(contact or (None, None)),
+            static=experiment.is_static,
+            tendons_m=_join_polylines(
+                [tendon.points_m for tendon in experiment.tendons]
+            ),
+            obstacles_m=_obstacle_outlines(experiment),
             reading_units={
                 gauge.name: gauge.unit
                 for gauge in experiment.readings
@@ -259,6 +255,7 @@ class MotionRecord:
             strain=specimen_strains(experiment)[0]
             if experiment.specimen
             else None,
+            **recorded,
         )
 
     @property

@@ -18,8 +18,9 @@ from ..common.array_types import Array
 from ..common.files import RESULT_FILE, write_text_file
 from ..common.serialisation import as_json
 from ..errors import InputError
+from ..features.depth_feature import fitted_surfaces
+from ..features.registry import FEATURES, merged_fields
 from ..fem.body import Body
-from ..program.contact.contact_summary import surface_gaps_and_pressures
 from ..program.depth.depth_comparison import SurfaceComparison
 from ..recording.experiment import Experiment
 from ..runs.forward_simulation import ForwardSimulation
@@ -247,7 +248,9 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
     ):
         rollout = finished.rollouts[experiment.name]
         rolled_out = None
+        predicted = None
         if isinstance(rollout, ForwardSimulation):
+            predicted = rollout.predicted
             rolled_out = (
                 rollout.trajectory.positions_m,
                 rollout.trajectory.markers_m,
@@ -265,10 +268,11 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
                 simulated=rolled_out,
                 natural_hz=natural,
                 places_m=places_m,
-                wrenches=_wrench_columns(finished, experiment),
-                readings=_custom_sensor_columns(finished, experiment),
-                contact=_surface_contact(
-                    finished, experiment, positions_m=shown[0]
+                recorded=merged_fields(
+                    feature.recorded(
+                        experiment, finished.solution, predicted, shown[0]
+                    )
+                    for feature in FEATURES
                 ),
             )
             of_cells = _field_estimates(finished, experiment.body)
@@ -291,14 +295,9 @@ def _depth_rows(
     rollout = finished.rollouts[experiment.name]
     surfaces: Mapping[str, SurfaceComparison] = {}
     if part is not None:
-        surfaces = {
-            reading.correspondences.camera.depth.name: SurfaceComparison.from_fit(
-                reading, part.x, values=values, phi=part.phi
-            )
-            for reading, values in part.depth_residuals
-        }
+        surfaces = fitted_surfaces(part)
     elif isinstance(rollout, ForwardSimulation):
-        surfaces = rollout.depth_surfaces
+        surfaces = rollout.predicted.surfaces
     if not surfaces:
         return {}
     from .depth_overlays import surface_rows  # which needs matplotlib
@@ -307,34 +306,6 @@ def _depth_rows(
         name: surface_rows(surface, experiment.upward_direction)
         for name, surface in surfaces.items()
     }
-
-
-def _surface_contact(
-    finished: SolvedProblem, experiment: Experiment, positions_m: Array
-) -> tuple[Array, Array] | None:
-    """Return gap [m] and contact pressure [Pa] on the boundary triangles at the estimates, (T, F)
-    each; None without obstacles.
-
-    With several obstacles the gap is the smallest, and pressures are added. Where no obstacle may
-    touch a triangle the gap is NaN and the pressure zero. Poses are corrected by the nuisance
-    parameters if the experiment was fitted.
-
-    Parameters
-    ----------
-    finished : SolvedProblem
-    experiment : Experiment
-        Experiment of the problem.
-    positions_m : (T, n, 3)
-        Node positions.
-    """
-    if not experiment.obstacles:
-        return None
-    if (part := finished.solution.part_of(experiment.name)) is not None:
-        experiment = part.segment.corrected_experiment(part.phi)
-    theta = experiment.body.theta_from_values(finished.solution.parameters)
-    return surface_gaps_and_pressures(
-        experiment, np.array(theta), x=positions_m.reshape(len(positions_m), -1)
-    )
 
 
 def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
@@ -350,71 +321,6 @@ def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
                 part.field_name
             ].by_element
     return estimates
-
-
-def _wrench_columns(
-    finished: SolvedProblem, experiment: Experiment
-) -> list[Array]:
-    """Return an array (S, 19) for each force sensor: time, and the wrench measured, fitted and
-    simulated.
-
-    The wrenches are those of the whole specimen also where symmetry reduces the model to a part of
-    it. NaN where the experiment was not fitted or not simulated.
-    """
-    sensors = experiment.wrenches
-    rollout = finished.rollouts[experiment.name]
-    fitted = finished.solution.wrenches
-    fit = fitted.get(experiment.name, [None] * len(sensors))
-    rolled = (
-        rollout.wrenches
-        if isinstance(rollout, ForwardSimulation)
-        else [None] * len(sensors)
-    )
-    both = zip(sensors, fit, rolled, strict=True)
-    sensed = []
-    for sensor, *models in both:
-        columns = _comparison_columns(sensor.t_s, sensor.values, *models)
-        columns[:, 1:] *= sensor.symmetry
-        sensed.append(columns)
-    return sensed
-
-
-def _custom_sensor_columns(
-    finished: SolvedProblem, experiment: Experiment
-) -> dict[str, Array]:
-    """Return an array (S, 1 + 3m) for each custom sensor, by name.
-
-    The columns are the time [s], and its m numbers as measured, fitted and simulated; NaN where the
-    experiment was not fitted or not simulated.
-    """
-    rollout = finished.rollouts[experiment.name]
-    fit = finished.solution.readings
-    rolled = rollout.readings if isinstance(rollout, ForwardSimulation) else {}
-    both = fit.get(experiment.name, {}), rolled
-    return {
-        gauge.name: _comparison_columns(
-            gauge.sample_times_s,
-            gauge.measured_values,
-            *(each.get(gauge.name) for each in both),
-        )
-        for gauge in experiment.readings
-    }
-
-
-def _comparison_columns(
-    t_s: Array, measured: Array, *models: Array | None
-) -> Array:
-    """Return the columns time, measured values and the values of each model, as one array (S, 1 + m
-    (1 + number of models)).
-
-    `t_s` is (S,), `measured` and each of `models` (S, m); the columns of a model that is None are
-    NaN.
-    """
-    columns = (
-        np.full_like(measured, np.nan) if each is None else each
-        for each in models
-    )
-    return np.column_stack([t_s, measured, *columns])
 
 
 def _marker_places_m(finished: SolvedProblem, experiment: str) -> Array | None:

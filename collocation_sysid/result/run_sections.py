@@ -29,13 +29,13 @@ from ..common.display import (
 )
 from ..common.files import is_own
 from ..common.pages import explain_command, page_url
-from ..common.serialisation import content
+from ..common.serialisation import content, copy_fields
 from ..errors import listed
+from ..features.measurement_results import PredictionErrors, SimulatedExperiment
+from ..features.registry import FEATURES
 from ..fem.laws.constants import symbol_of, symbol_with_unit, unit_of
-from ..program.depth.depth_comparison import DepthError
 from ..recording.nuisance import in_readable_unit
-from ..runs.prediction import PredictionErrors
-from ..runs.result_content import Elapsed, Result, SimulatedExperiment
+from ..runs.result_content import Elapsed, Result
 from ..statistics.assessment import Assessment
 from ..statistics.budget.uncertainty_budget import main_sources, source_label
 from ..statistics.concerns import Concern, topics_of
@@ -504,24 +504,9 @@ def _fit_section(result: Result) -> TitledParts:
     )
     lines = [markers * marked + dynamics]
     for name, each in experiments.items():
-        if sizes := _forces_text(each.wrench_rms_n, each.wrench_rms_nm):
-            sigma = _forces_text(each.wrench_sigma_n, each.wrench_sigma_nm)
-            lines.append(f"wrench of '{name}': {sizes} RMS (sigma {sigma})")
-        for reading, rms in (each.reading_rms or {}).items():
-            unit = _unit_text(each.reading_unit, reading)
-            sigma = short((each.reading_sigma or {})[reading])
-            lines.append(
-                f"{reading} of '{name}': {short(rms)}{unit} RMS (sigma {sigma}{unit})"
-            )
-        unit = "J in the modelled part" if name in (fit.symmetry or {}) else "J"
-        for obstacle, friction in (each.friction or {}).items():
-            energy = f"{short(friction.dissipated_j)} {unit}"
-            lines.append(
-                f"friction of {obstacle} in '{name}': at most {friction.used:.0%} of its limit, "
-                f"slip during {friction.slipping:.0%} of the time, {energy} dissipated"
-            )
-        for camera, error in (each.depth or {}).items():
-            lines.append(f"depth of {camera} in '{name}': {_depth_text(error)}")
+        is_symmetric = name in (fit.symmetry or {})
+        for feature in FEATURES:
+            lines += feature.fit_lines(name, each, is_symmetric)
     for name, each in result.rollout.experiments.items():
         lines += _simulation_lines(name, each)
     for parts in sorted({*(fit.symmetry or {}).values()}):
@@ -589,14 +574,7 @@ def _simulation_lines(
     if simulated.failed is not None:
         yield f"{kind} '{name}': failed: {simulated.failed}"
         return
-    own = PredictionErrors(
-        rms_m=simulated.rms_m,
-        max_m=simulated.max_m,
-        wrench_rms_n=simulated.wrench_rms_n,
-        wrench_rms_nm=simulated.wrench_rms_nm,
-        reading_rms=simulated.reading_rms,
-        depth=simulated.depth,
-    )
+    own = copy_fields(PredictionErrors, simulated)
     units = simulated.reading_unit
     yield f"{kind} '{name}': {_errors_text(own, units) or 'no measurements to compare with'}"
     if simulated.fitted:
@@ -619,66 +597,25 @@ def _errors_text(
 ) -> str:
     """Return the errors of a prediction in words; "" if nothing is compared.
 
-    Errors of markers and forces that are None or zero are left out; those of custom sensors and
-    depth cameras are all written.
+    Errors that are None, and errors of markers and forces that are zero, are left out.
 
     Parameters
     ----------
     error : PredictionErrors
-        Errors of markers, forces, custom sensors and depth cameras.
+        Errors of all kinds of measurements.
     units : mapping of str to str, or None
         Units of custom sensors by name; None if none states a unit.
     """
-    texts = []
-    if error.rms_m:  # none without markers
-        texts.append(
-            f"{_millimetres(error.rms_m)} mm RMS, at most {1e3 * (error.max_m or 0.0):.2f} mm"
-        )
-    if forces := _forces_text(error.wrench_rms_n, error.wrench_rms_nm):
-        texts.append(f"{forces} RMS")
-    texts += [
-        f"{reading} {rms:.2g}{_unit_text(units, reading)} RMS"
-        for reading, rms in (error.reading_rms or {}).items()
-    ]
-    texts += [
-        f"depth of {camera} {_depth_text(each)}"
-        for camera, each in (error.depth or {}).items()
-    ]
-    return "; ".join(texts)
-
-
-def _unit_text(units: Mapping[str, str] | None, reading: str) -> str:
-    """Return the unit of the custom sensor `reading` after a space; "" if it states none or `units`
-    is None.
-    """
-    unit = (units or {}).get(reading, "")
-    return f" {unit}" if unit else ""
-
-
-def _depth_text(error: DepthError) -> str:
-    """Return the distances of a depth camera's points from the surface, in words."""
-    if error.rms_m is None:
-        return "no point near the body"
-    sentence = f"{1e3 * error.rms_m:.3g} mm RMS of {error.points} points"
-    if not error.share_beyond_gate:
-        return f"{sentence}, all within the gate of {1e3 * error.gate_m:.3g} mm"
-    beyond = f"{sentence}, {error.share_beyond_gate:.0%} beyond the gate of {1e3 * error.gate_m:.3g} mm"
-    if error.rms_within_gate_m is None:
-        return beyond
-    return f"{beyond}, the others {1e3 * error.rms_within_gate_m:.3g} mm RMS"
+    return "; ".join(
+        text
+        for feature in FEATURES
+        for text in feature.error_texts(error, units)
+    )
 
 
 def _millimetres(metres: float) -> str:
     """Return a length [m] as text in millimetres, without the unit."""
     return f"{1e3 * metres:.3f}"
-
-
-def _forces_text(*sizes: float | None) -> str:
-    """Return RMS or σ of a force [N] and a torque [N m], in this order, in words; sizes that are
-    None or zero are left out.
-    """
-    pairs = zip(sizes, ("N", "N m"), strict=True)
-    return ", ".join(f"{short(size)} {unit}" for size, unit in pairs if size)
 
 
 def _notes_section(result: Result) -> TitledParts:

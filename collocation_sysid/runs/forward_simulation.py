@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..common.array_types import Array
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, SimulationError
+from ..features.measurement_results import (
+    CopyError,
+    InstrumentMisfit,
+    InstrumentPrediction,
+    PredictionErrors,
+)
+from ..features.registry import FEATURES, merged_fields
 from ..fem.kernels import map_experiments
-from ..methods.complementarity import with_contact_energy
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..model.schemes import MOST_STEPS, as_scheme
 from ..problem import Problem
-from ..program.collocation import ExperimentIterate
-from ..program.custom_sensor_residual import custom_sensor_residuals
-from ..program.depth.depth_comparison import DepthError, SurfaceComparison
-from ..program.observables import ObservedMotion, ReactionForces
 from ..program.simulation import Trajectory, simulate
 from ..program.transcription import Transcription
-from ..program.wrench.wrench_observable import ReactionGrid
 from ..recording import Experiment
 from ..statistics.budget.discretisation_error import (
     Refinement,
@@ -32,10 +33,6 @@ from ..statistics.budget.discretisation_error import (
 from ..statistics.estimates import Estimate
 from ..statistics.linearised import LinearisedFit, parameter_values
 from .prediction import (
-    CopyError,
-    InstrumentMisfit,
-    InstrumentPrediction,
-    PredictionErrors,
     instrument_misfits,
     nearest_recording_error,
     nuisance_of_fitted_recordings,
@@ -61,16 +58,10 @@ class ForwardSimulation:
         those of places are displacements from their start. Empty for fitted experiments.
     places_m : mapping of marker to place [x, y, z]
         Marker places on the undeformed body, fitted likewise; empty for fitted experiments.
-    wrenches : sequence of (S, 6)
-        Predicted forces [N] and torques [N m] of the sensors of grasps; NaN where unknown.
-    wrench_rms : (force, torque)
-        RMS difference of force [N] and torque [N m]; None where there is none.
-    readings : mapping of name to (S, m)
-        Predicted values of custom sensors.
-    reading_rms : mapping of name to float
-        RMS difference of each custom sensor.
-    depth_surfaces : mapping of the name of a depth camera to SurfaceComparison
-        Its points against the simulated surface.
+    predicted : InstrumentPrediction
+        Predictions of all instruments.
+    error : PredictionErrors
+        Their RMS and largest differences from the measurements.
     misfits : tuple of InstrumentMisfit
         Differences of each instrument over its stated σ.
     blind_error : PredictionErrors or None
@@ -86,23 +77,11 @@ class ForwardSimulation:
     trajectory: Trajectory
     nuisance: Mapping[str, float]
     places_m: Mapping[str, list[float]]
-    wrenches: Sequence[Array] = ()
-    wrench_rms: tuple[float | None, float | None] = (None, None)
-    readings: Mapping[str, Array] = field(default_factory=dict)
-    reading_rms: Mapping[str, float] = field(default_factory=dict)
-    depth_surfaces: Mapping[str, SurfaceComparison] = field(
-        default_factory=dict
-    )
+    predicted: InstrumentPrediction
+    error: PredictionErrors
     misfits: tuple[InstrumentMisfit, ...] = ()
     blind_error: PredictionErrors | None = None
     copy_error: CopyError | str = ""
-
-    @property
-    def depth(self) -> dict[str, DepthError]:
-        """Distances of depth cameras' points from the simulated surface, by camera."""
-        return {
-            name: surface.error for name, surface in self.depth_surfaces.items()
-        }
 
 
 def simulate_experiments(
@@ -241,7 +220,11 @@ def simulate_with_parameters(
     trajectory = _simulate(
         problem, segment, phi=phi, parameters=parameters, report=report
     )
-    predicted, surfaces = _predict_instruments(segment, trajectory, phi=phi)
+    predicted = InstrumentPrediction(
+        **merged_fields(
+            feature.predict(segment, trajectory, phi) for feature in FEATURES
+        )
+    )
     error = prediction_error(experiment, predicted)
     return ForwardSimulation(
         rms_m=error.rms_m or 0.0,
@@ -249,11 +232,8 @@ def simulate_with_parameters(
         trajectory=replace(trajectory, markers_m=predicted.markers_m),
         nuisance={},
         places_m={},
-        wrenches=predicted.wrenches,
-        wrench_rms=(error.wrench_rms_n, error.wrench_rms_nm),
-        readings=predicted.readings,
-        reading_rms=error.reading_rms or {},
-        depth_surfaces=surfaces,
+        predicted=predicted,
+        error=error,
         misfits=tuple(instrument_misfits(experiment, predicted)),
     )
 
@@ -280,62 +260,17 @@ def _simulate(
     integrator = (
         problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
     )
+    experiment = segment.corrected_experiment(phi)
+    for feature in FEATURES:
+        experiment = feature.for_simulation(experiment)
     return simulate(
-        with_contact_energy(segment.corrected_experiment(phi)),
+        experiment,
         segment.body.theta_from_values(parameters),
         integrator=integrator,
         timestep_s=_step_s(problem, segment),
         substeps=segment.substeps,
         progress=report,
     )
-
-
-def _predict_instruments(
-    segment: Transcription, trajectory: Trajectory, phi: Array
-) -> tuple[InstrumentPrediction, dict[str, SurfaceComparison]]:
-    """Return the predictions of a recording's instruments for a simulated motion.
-
-    Parameters
-    ----------
-    segment : Transcription
-        Recording with its instruments.
-    trajectory : Trajectory
-        Simulated motion at its samples.
-    phi : (k,) array
-        Nuisance parameters of the recording.
-
-    Returns
-    -------
-    predicted : InstrumentPrediction
-    surfaces : mapping of the name of a depth camera to SurfaceComparison
-    """
-    grid, forced = trajectory.reactions
-    positions_m = trajectory.positions_m
-    x = positions_m.reshape(len(positions_m), -1)
-    gauged = zip(
-        segment.custom_sensors,
-        _predict_sensors(segment, x, reactions=trajectory.reactions, phi=phi),
-        strict=True,
-    )
-    surfaces = {
-        reading.correspondences.camera.depth.name: SurfaceComparison.from_motion(
-            reading, trajectory.t_s, positions_m=positions_m, phi=phi
-        )
-        for reading in segment.depths
-    }
-    predicted = InstrumentPrediction(
-        markers_m=segment.markers.predict_samples(positions_m, phi),
-        wrenches=[
-            sensor.on_grid(grid).predict_reactions(forced, phi)
-            for sensor in segment.sensors
-        ],
-        readings={
-            gauge.sensor.name: gauge.without_padding(each)
-            for gauge, each in gauged
-        },
-        depth={name: surface.error for name, surface in surfaces.items()},
-    )
-    return predicted, surfaces
 
 
 def _blind_error(
@@ -360,7 +295,11 @@ def _blind_error(
         )
     except (InputError, SimulationError):
         return None
-    predicted, _ = _predict_instruments(segment, trajectory, phi=phi)
+    predicted = InstrumentPrediction(
+        **merged_fields(
+            feature.predict(segment, trajectory, phi) for feature in FEATURES
+        )
+    )
     return prediction_error(segment.experiment, predicted)
 
 
@@ -437,27 +376,15 @@ def step_error(
     ]
     if not moving or any(experiment.obstacles for experiment in moving):
         return None
-    for part, readings in zip(solution.parts, solution.readings_m, strict=True):
-        segment = part.segment
-        experiment = part.segment.experiment
-        rollout = rollouts.get(experiment.name)
-        share = _step_error_share(problem, segment)
+    for part in solution.parts:
+        rollout = rollouts.get(part.segment.experiment.name)
+        share = _step_error_share(problem, part.segment)
         if not isinstance(rollout, ForwardSimulation) or share is None:
             return None
-        way = share * (rollout.trajectory.markers_m - readings)
-        differences.append(
-            np.nan_to_num(way / experiment.markers.sigma_m[:, None])
-        )
-        fitted = solution.wrenches.get(experiment.name, [])
-        for sensor, read, rolled in zip(
-            segment.sensors, fitted, rollout.wrenches, strict=True
-        ):
-            way = share * np.nan_to_num((rolled - read) / sensor.wrench.sigmas)
-            differences.append(way.reshape(-1, 2, 3))
-        differences += _sensor_differences(
-            part, rollout.trajectory, share=share
-        )
-        differences += _depth_differences(part, rollout.trajectory, share=share)
+        for feature in FEATURES:
+            differences += feature.step_differences(
+                part, rollout.trajectory, rollout.predicted, share
+            )
     change = change_in_observations(fit, differences)[: collocation.nq]
     q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
     linear = problem.parameters.linear_names
@@ -471,101 +398,6 @@ def step_error(
             linear=linear,
         )
     )
-
-
-def _sensor_differences(
-    part: ExperimentIterate, trajectory: Trajectory, share: float
-) -> list[Array]:
-    """Return `share` times the difference (simulated − fitted) of each custom sensor, (S, G, 3),
-    over σ; zero where a value is NaN. Empty without custom sensors.
-
-    Parameters
-    ----------
-    part : ExperimentIterate
-        Fitted experiment at the solution.
-    trajectory : Trajectory
-        Its forward simulation.
-    share : float
-        Factor on all differences.
-    """
-    if not (segment := part.segment).custom_sensors:
-        return []
-    fitted = (
-        part.x[segment.markers.sample_rows],
-        (ReactionGrid.from_dynamics(segment.dynamics), part.reactions),
-    )
-    rolled = (
-        trajectory.positions_m.reshape(len(fitted[0]), -1),
-        trajectory.reactions,
-    )
-    here, there = (
-        _predict_sensors(segment, *each, part.phi) for each in (fitted, rolled)
-    )
-    return [
-        share
-        * np.nan_to_num(simulated_values - fitted_values)
-        / gauge.sigmas[:, None]
-        for gauge, fitted_values, simulated_values in zip(
-            segment.custom_sensors, here, there, strict=True
-        )
-    ]
-
-
-def _depth_differences(
-    part: ExperimentIterate, trajectory: Trajectory, share: float
-) -> list[Array]:
-    """Return the change of each depth camera's residuals, (S, M, 3) in σ, for `share` times the
-    difference between simulated and fitted positions, at the correspondences of the fit; empty
-    without depth cameras.
-    """
-    if not (sights := part.surface_residuals):
-        return []
-    known_s = part.segment.experiment.t_s
-    rows_s = part.segment.dynamics.t_s
-    fitted = part.x[part.segment.markers.sample_rows]
-    way_m = share * (trajectory.positions_m.reshape(len(fitted), -1) - fitted)
-    way_rows_m = np.array(
-        [np.interp(rows_s, known_s, each) for each in way_m.T]
-    )
-    displacements_m = way_rows_m.T.reshape(len(rows_s), -1, 3, 1)
-    return [
-        reading.residual_changes(
-            observation,
-            displacements_m[:, reading.correspondences.surface.nodes],
-            phi=part.phi,
-        )[..., 0]
-        for reading, observation in sights
-    ]
-
-
-def _predict_sensors(
-    segment: Transcription,
-    x: Array,
-    reactions: tuple[ReactionGrid, ReactionForces],
-    phi: Array,
-) -> list[Array]:
-    """Return the predictions of custom sensors, for each (S, G, 3) at S samples of G points or
-    wrenches.
-
-    Parameters
-    ----------
-    segment : Transcription
-    x : (T, 3n) array
-        Positions at the samples [m].
-    reactions : (ReactionGrid, ReactionForces)
-        Grid and values of the reactions of grasps, for sensors of forces.
-    phi : (k,) array
-        Nuisance parameters of the recording.
-    """
-    grid = reactions[0]
-    motion = ObservedMotion(x, reactions[1])
-    gauges = custom_sensor_residuals(
-        segment.experiment,
-        segment.experiment.t_s,
-        grid=grid,
-        nuisance=segment.nuisance,
-    )
-    return [gauge.predict_motion(motion, phi) for gauge in gauges]
 
 
 def _step_error_share(problem: Problem, segment: Transcription) -> float | None:

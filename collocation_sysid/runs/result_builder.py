@@ -10,18 +10,24 @@ from importlib.metadata import version
 import casadi
 import numpy as np
 
-from ..common.array_types import Array, root_mean
+from ..common.array_types import Array
 from ..common.display import short
 from ..common.files import SCHEMA
 from ..common.serialisation import copy_fields
+from ..features.custom_sensor_feature import units_by_name
+from ..features.measurement_results import (
+    CopyError,
+    FitResult,
+    FittedExperiment,
+    ForwardResult,
+    SimulatedExperiment,
+)
+from ..features.registry import FEATURES, merged_fields
 from ..fem.laws.constants import GAMMA_R
-from ..methods.solution import custom_sensor_rms, pooled_wrench_rms
 from ..methods.stiffness_scan import ScanSummary
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
-from ..program.contact.contact_summary import friction_summaries
-from ..program.depth.depth_comparison import DepthError
 from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE, JOINING, PLACE, TARE, in_readable_unit
 from ..statistics.field_estimates import FieldEstimate
@@ -29,24 +35,18 @@ from ..statistics.identifiability import identifiability_sentences
 from ..statistics.scale_identifiability import relative_scale_note
 from ..statistics.uncertainty import MarkerPlace
 from .forward_simulation import ForwardSimulation
-from .prediction import CopyError
 from .result_content import (
     DynamicsResult,
     FieldResult,
-    FitResult,
-    FittedExperiment,
-    ForwardResult,
     NuisanceResult,
     ProfileResult,
     ProgramSize,
     Provenance,
     RecordingsAgreement,
     Result,
-    SimulatedExperiment,
     UncertaintyResult,
 )
 from .solved_problem import SolvedProblem
-from .verdict import depth_errors
 
 
 def build_result(answer: SolvedProblem) -> Result:
@@ -265,21 +265,10 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
     """
     solution = answer.solution
     experiments = {}
-    depths: dict[str, dict[str, DepthError]] = {}
-    for (recording, camera), error in depth_errors(solution).items():
-        depths.setdefault(recording, {})[camera] = error
     for part in solution.parts:
         experiment = part.segment.experiment
         name = experiment.name
         markers = experiment.markers
-        sensors = part.segment.sensors
-        wrenches = [sensor.wrench for sensor in sensors]
-        sigmas = [
-            (wrench.symmetry * wrench.sigmas) ** 2
-            * np.where(wrench.measured_components, 1.0, np.nan)
-            for wrench in wrenches
-        ]
-        both = np.array(sigmas).reshape(-1, 2, 3).swapaxes(0, 1)
         experiments[name] = FittedExperiment(
             solution.rms_by_experiment_m[name],
             markers.sample_count,
@@ -289,23 +278,12 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
                 *_place_sentences(answer.places[name]),
                 *_nuisance_sentences(part, answer),
             ),
-            *solution.wrench_rms.get(name, (None, None)),
-            custom_sensor_rms(experiment, solution.readings[name]) or None,
-            *(root_mean(each[np.isfinite(each)]) or None for each in both),
-            reading_sigma={
-                gauge.name: gauge.sigma for gauge in experiment.readings
-            }
-            or None,
-            reading_unit=_sensor_units(experiment),
-            depth=depths.get(name),
-            friction=friction_summaries(
-                experiment, part.equations.dynamics, x=part.x
-            )
-            or None,
+            **merged_fields(
+                feature.fit_fields(part, solution) for feature in FEATURES
+            ),
             air_density_kg_m3=experiment.air_density_kg_m3,
             test=experiment.specimen and experiment.specimen.test,
         )
-    pooled = pooled_wrench_rms(solution)
     parts = {
         experiment.name: experiment.symmetry
         for experiment in answer.problem.experiments
@@ -316,7 +294,9 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
         solution.rms_m,
         answer.noise_rms_m,
         experiments,
-        *pooled,
+        **merged_fields(
+            feature.pooled_fields(solution) for feature in FEATURES
+        ),
         symmetry=symmetry,
     )
 
@@ -353,13 +333,6 @@ def _forward_results(answer: SolvedProblem) -> ForwardResult:
     )
 
 
-def _sensor_units(experiment: Experiment) -> dict[str, str] | None:
-    """Return the units of the custom sensors that state one, by name; None if none does."""
-    return {
-        gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit
-    } or None
-
-
 def _forward_result(
     answer: SolvedProblem, experiment: Experiment
 ) -> SimulatedExperiment:
@@ -370,17 +343,18 @@ def _forward_result(
     simulated = answer.rollouts[experiment.name]
     if not isinstance(simulated, ForwardSimulation):
         return SimulatedExperiment(fitted, failed=simulated)
-    force, torque = simulated.wrench_rms
+    errors = {
+        key: value
+        for key, value in vars(simulated.error).items()
+        if key not in ("rms_m", "max_m")
+    }
     return copy_fields(
         SimulatedExperiment,
         simulated,
         fitted=fitted,
         failed=None,
-        wrench_rms_n=force,
-        wrench_rms_nm=torque,
-        reading_rms=simulated.reading_rms or None,
-        reading_unit=_sensor_units(experiment),
-        depth=simulated.depth or None,
+        **errors,
+        reading_unit=units_by_name(experiment),
         blind=simulated.blind_error,
         copied=simulated.copy_error
         if isinstance(simulated.copy_error, CopyError)

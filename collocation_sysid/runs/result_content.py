@@ -11,13 +11,12 @@ from ..common.display import short
 from ..common.files import RESULT_FILE, damage_refused, read_json
 from ..common.serialisation import optional, read
 from ..errors import InputError
+from ..features.measurement_results import FitResult, ForwardResult
 from ..fem.laws.constants import field_coefficient, symbol_of, unit_of
 from ..fem.spatial_field import FieldResolution
 from ..fem.two_phase import PhaseSummary
 from ..methods.solution import Iteration, Timing
 from ..methods.stiffness_scan import ScanSummary
-from ..program.contact.contact_summary import FrictionSummary
-from ..program.depth.depth_comparison import DepthError
 from ..statistics.assessment import Assessment
 from ..statistics.budget.discretisation_error import (
     DiscretisationError,
@@ -27,7 +26,6 @@ from ..statistics.estimates import Estimate, IntervalCoordinate
 from ..statistics.probes.relaxed_assumptions import Probe
 from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
 from ..statistics.uncertainty import MarkerPlace
-from .prediction import CopyError, PredictionErrors
 
 
 @dataclass(frozen=True)
@@ -333,152 +331,6 @@ class UncertaintyResult:
     verdicts: tuple[str, ...]
     recordings: Mapping[str, RecordingsAgreement] | None
     profiles: Mapping[str, ProfileResult]
-
-
-@dataclass(frozen=True)
-class FittedExperiment:
-    """Residuals of the fit of an experiment.
-
-    Attributes
-    ----------
-    rms_m : float
-        RMS distance of the markers from the fit [m]; 0 without markers.
-    samples, missing : int
-        Numbers of marker samples that are present, and that are missing.
-    static : bool
-        Whether it is a series of equilibria.
-    notes : tuple of str
-        Sentences on the nuisance parameters of this recording.
-    wrench_rms_n, wrench_rms_nm : float or None
-        RMS differences of forces [N] and torques [N m]; None if not measured.
-    reading_rms : mapping of name to float, or None
-        RMS differences of custom sensors in their units; None without any.
-    wrench_sigma_n, wrench_sigma_nm : float or None
-        Stated standard deviations of the noise of forces [N] and torques [N m]; None if not
-        measured.
-    reading_sigma : mapping of name to float, or None
-        Stated standard deviations of the noise of custom sensors; None without any.
-    reading_unit : mapping of name to str, or None
-        Units of the custom sensors that state one; None if none does.
-    friction : mapping of obstacle to FrictionSummary, or None
-        Friction of the obstacles that have some; None without any.
-    depth : mapping of depth camera to DepthError, or None
-        Distances of its points from the fitted surface; None without depth cameras.
-    air_density_kg_m3 : float
-        Density of the air around the body in the model; zero in a vacuum.
-    test : str or None
-        Kind of material test of a specimen without a mesh; None for other experiments.
-    """
-
-    rms_m: float
-    samples: int
-    missing: int
-    static: bool
-    notes: tuple[str, ...]
-    wrench_rms_n: float | None = optional()
-    wrench_rms_nm: float | None = optional()
-    reading_rms: Mapping[str, float] | None = optional()
-    wrench_sigma_n: float | None = optional()
-    wrench_sigma_nm: float | None = optional()
-    reading_sigma: Mapping[str, float] | None = optional()
-    reading_unit: Mapping[str, str] | None = optional()
-    friction: Mapping[str, FrictionSummary] | None = optional()
-    depth: Mapping[str, DepthError] | None = optional()
-    air_density_kg_m3: float = 0.0
-    test: str | None = optional()
-
-
-@dataclass(frozen=True)
-class FitResult:
-    """Residuals of the fit of all experiments.
-
-    Attributes
-    ----------
-    rms_m, noise_rms_m : float
-        RMS distance of all markers, and that expected from the stated noise.
-    experiments : mapping of name to FittedExperiment
-        Residuals of each fitted experiment.
-    wrench_rms_n, wrench_rms_nm : float or None
-        RMS differences of all forces and torques.
-    symmetry : mapping of experiment to int, optional
-        Of experiments whose loads are reported for the whole specimen: ratio of these to the loads
-        of the modelled part. Energies of friction and nuisance parameters are those of the modelled
-        part.
-    """
-
-    rms_m: float
-    noise_rms_m: float
-    experiments: Mapping[str, FittedExperiment]
-    wrench_rms_n: float | None = optional()
-    wrench_rms_nm: float | None = optional()
-    symmetry: Mapping[str, int] | None = optional()
-
-
-@dataclass(frozen=True)
-class SimulatedExperiment:
-    """Errors of the forward simulation of an experiment; if `failed` is set, all else but `fitted`
-    is None.
-
-    Attributes
-    ----------
-    fitted : bool
-        Whether the experiment was fitted, not only predicted.
-    failed : str or None
-        Why there is no simulation; None if there is one.
-    rms_m, max_m : float or None
-        RMS and largest distance of the markers [m]; 0 without markers.
-    wrench_rms_n, wrench_rms_nm : float or None
-        RMS differences of forces [N] and torques [N m]; None if not measured.
-    reading_rms : mapping of name to float, or None
-        RMS differences of custom sensors in their units; None without any.
-    reading_unit : mapping of name to str, or None
-        Units of the custom sensors that state one; None if none does.
-    nuisance, places_m : mapping or None
-        Nuisance parameters and marker places that were fitted to a recording for validation; empty
-        for fitted experiments.
-    depth : mapping of depth camera to DepthError, or None
-        Distances of its points from the simulated surface; None without depth cameras.
-    blind : PredictionErrors or None
-        Of an experiment for validation, with the nuisance parameters of the fitted recordings in
-        place of its own; None where that cannot be simulated, and for fitted experiments.
-    copied : CopyError or None
-        Of an experiment for validation, with the measurements of the nearest fitted recording as
-        the prediction; None if there is no such copy.
-    not_copied : str or None
-        Why there is no such copy; empty for fitted experiments.
-    """
-
-    fitted: bool
-    failed: str | None = optional()
-    rms_m: float | None = optional()
-    max_m: float | None = optional()
-    reading_unit: Mapping[str, str] | None = optional()
-    nuisance: Mapping[str, float] | None = optional()
-    places_m: Mapping[str, tuple[float, ...]] | None = optional()
-    wrench_rms_n: float | None = optional()
-    wrench_rms_nm: float | None = optional()
-    reading_rms: Mapping[str, float] | None = optional()
-    depth: Mapping[str, DepthError] | None = optional()
-    blind: PredictionErrors | None = optional()  # noqa: RUF009, it returns a field
-    copied: CopyError | None = optional()  # noqa: RUF009, it returns a field
-    not_copied: str | None = optional()
-
-
-@dataclass(frozen=True)
-class ForwardResult:
-    """Forward simulations with the estimates.
-
-    Attributes
-    ----------
-    rms_m, max_m : float or None
-        RMS and largest distance of the markers of all fitted experiments; None without any.
-    experiments : mapping of name to SimulatedExperiment
-        Results of each experiment, also of those for validation.
-    """
-
-    rms_m: float | None
-    max_m: float | None
-    experiments: Mapping[str, SimulatedExperiment]
 
 
 @dataclass(frozen=True)

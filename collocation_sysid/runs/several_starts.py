@@ -1,6 +1,6 @@
 """Solves from several stiffnesses of a scan, where correspondences make local minima.
 
-Points of depth cameras are associated with the nearest part of the surface: a body that is too
+Points measured by a camera are associated with the nearest part of the surface: a body that is too
 soft, with the camera turned to match, can be a local minimum of the loss. So the scan's best
 stiffness and those next to it are all followed to convergence, and the solution with the lowest
 loss counts.
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from ..features.registry import FEATURES
 from ..methods.initial_trajectories import associated_at_guess
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Method, Solution, Status
@@ -46,30 +47,33 @@ class CompletedStart:
 
 
 def has_local_minima(collocation: Collocation) -> bool:
-    """Return whether a fitted experiment has a depth camera, whose correspondences change during
-    the search and can make local minima.
+    """Return whether a fitted experiment has correspondences, which change during the search and can
+    make local minima.
     """
-    return any(segment.depths for segment in collocation.transcriptions)
+    return any(
+        segment.association.correspondences
+        for segment in collocation.transcriptions
+    )
 
 
 def robust_loss(solution: Solution) -> float:
-    """Return the loss with priors, in which a point beyond the gate counts like one at the gate.
+    """Return the loss with priors and with that of the measurements that the fit excludes.
 
-    The loss of a solution leaves out points beyond the gate of a depth camera: compared by it, the
+    The loss of a solution leaves out points beyond the gate of a camera: compared by it, the
     solution that loses most points would seem the best.
     """
     collocation = solution.collocation
     p, _ = collocation.unpack(solution.z)
     prior, _ = collocation.prior_residuals(p)
-    loss_of_distant_points = sum(
-        reading.loss_of_distant_points
+    excluded_loss = sum(
+        feature.excluded_loss(part)
         for part in solution.parts
-        for reading, _ in part.depth_residuals
+        for feature in FEATURES
     )
     return (
         sum(part.loss for part in solution.parts)
         + float(prior @ prior)
-        + loss_of_distant_points
+        + excluded_loss
     )
 
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from ..common.array_types import Array
 from ..common.step_counting import search_activity
 from ..errors import InputError
+from ..features.registry import FEATURES
 from ..fem.laws.constants import usual_value, without_region
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
 from ..methods.initial_trajectories import associated_at_guess
@@ -23,9 +22,6 @@ from ..problem import Problem
 from ..program.collocation import Collocation
 from ..statistics.field_estimates import field_estimates_at
 from ..statistics.linearised import parameter_values
-from ..statistics.misspecification.camera_misspecifications import (
-    require_depth_units,
-)
 from .check.cost import require_memory
 from .coarse_start import (
     CoarseStart,
@@ -315,7 +311,7 @@ def _solve_from_coarse(
         solution,
         scan=coarse.scan,
         timing=solution.timing + coarse.timing,
-        notes=(*notes, *solution.notes, *_depth_notes(solution)),
+        notes=(*notes, *solution.notes, *_feature_notes(solution)),
     )
 
 
@@ -361,7 +357,8 @@ def _solve_directly(
         collocation = problem.collocation()
         started_from: list[str] = []
         for experiment in collocation.experiments:
-            require_depth_units(experiment)
+            for feature in FEATURES:
+                feature.require_valid(experiment)
         if warm_start is not None and problem.substeps == "auto":
             collocation = replace(collocation, substeps=warm_start.substeps)
         has_guesses = not collocation.parameters.names_without_guess
@@ -416,44 +413,19 @@ def _solve_directly(
         *scan_notes,
         *started_from,
         *solution.notes,
-        *_depth_notes(solution),
+        *_feature_notes(solution),
     )
     return replace(solution, scan=scan or solution.scan, notes=notes)
 
 
-def _depth_notes(solution: Solution) -> Iterator[str]:
-    """Yield a note on each depth camera: how many points are compared, their distances from the
-    fitted surface [mm], and why others are excluded; and a note on its outline [pixels], if one is
-    compared.
-    """
-    for part in solution.parts:
-        for reading, observation in part.depth_residuals:
-            distance_m = reading.signed_distances_m(observation, part.phi)
-            sighting = reading.correspondences
-            excluded = ", ".join(
-                f"{count} {why}"
-                for why, count in sighting.excluded_counts.items()
-                if count
-            )
-            distances = "are compared, because none is near enough to the body"
-            if sighting.is_compared.any():
-                distances = (
-                    f"deviate from the surface by {1e3 * np.sqrt(np.nanmean(distance_m**2)):.3g} "
-                    f"mm (RMS; median {1e3 * np.nanmedian(np.abs(distance_m)):.3g} mm)"
-                )
-            yield (
-                f"experiment '{part.segment.experiment.name}': {sighting.is_compared.sum()} "
-                f"points of '{sighting.camera.depth.name}' {distances}; excluded: "
-                f"{excluded or 'none'}"
-            )
-        for outline, distance_px in part.outline_distances_px:
-            if len(distance_px):
-                yield (
-                    f"experiment '{part.segment.experiment.name}': {len(distance_px)} points of "
-                    "the model's outline deviate from the edges in "
-                    f"'{outline.correspondences.camera.depth.name}' by "
-                    f"{np.sqrt(np.mean(distance_px**2)):.2g} pixels (RMS)"
-                )
+def _feature_notes(solution: Solution) -> list[str]:
+    """Return the notes of all features on the experiments of a solution."""
+    return [
+        note
+        for part in solution.parts
+        for feature in FEATURES
+        for note in feature.notes(part)
+    ]
 
 
 def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:
@@ -543,7 +515,7 @@ def solve_with_renewed_correspondences(
 ) -> Solution:
     """Solve, and repeat while estimates change the correspondences of the measurements.
 
-    These are the elements of markers, the points of depth cameras, and the sample intervals of
+    These are the elements of markers, the correspondences of points, and the sample intervals of
     clocks. There are at most `MOST_REREADINGS` repetitions, and none after a solve that does not
     converge. The last solution is returned, also if it has not converged; its history, counts and
     times are those of the last solve alone.

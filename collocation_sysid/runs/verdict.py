@@ -6,26 +6,21 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ..common.array_types import root_mean
 from ..errors import SimulationError
-from ..methods.solution import Solution, Status, pooled_wrench_rms
+from ..features.registry import FEATURES
+from ..methods.solution import Solution, Status
 from ..model.parameters import Parameters
 from ..model.schemes import as_scheme
 from ..problem import Problem
-from ..program.contact.contact_summary import contact_summaries_of_parts
-from ..program.depth.depth_comparison import DepthError, SurfaceComparison
 from ..program.modes.stability import find_instabilities
 from ..recording.grasp_rotation import DOUBTFUL_ANGLE_RAD
-from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN, TIME
+from ..recording.nuisance import TIME
 from ..statistics.assessment import (
-    camera_pose_concerns,
     clock_concerns,
-    contact_concerns,
     fit_concerns,
     forward_simulation_concerns,
     nuisance_concerns,
     outlier_share_concerns,
-    outline_concerns,
     parameter_concerns,
     prediction_concerns,
     rms_expected_from_noise_m,
@@ -103,16 +98,8 @@ def solution_concerns(
             high=high,
             is_specimen=part.segment.experiment.specimen is not None,
         )
-        for camera in range(len(part.segment.experiment.depths)):
-            pose = nuisance.indices_of_rows(
-                DEPTH_TURN, DEPTH_SHIFT, component=camera
-            )
-            yield from camera_pose_concerns(
-                [nuisance.names[k] for k in pose], part.phi[pose].tolist()
-            )
-        for reading, distance_px in part.outline_distances_px:
-            camera = f"'{reading.correspondences.camera.depth.name}' of '{part.segment.experiment.name}'"
-            yield from outline_concerns(camera, distance_px)
+        for feature in FEATURES:
+            yield from feature.part_concerns(part)
         for k in nuisance.indices_of_rows(TIME):
             scale = float(nuisance.scales[k])
             name = part.segment.experiment.name
@@ -123,11 +110,14 @@ def solution_concerns(
         find_instabilities(solution.collocation, solution.z)
     )
     yield from strain_stability_concerns(solution.parts)
-    yield from contact_concerns(contact_summaries_of_parts(solution.parts))
+    for feature in FEATURES:
+        yield from feature.concerns(solution.parts)
     if not solution.collocation.nq:
         yield from _prediction_concerns(rollouts)
     for name, rollout in rollouts.items():
-        yield from _unseen_depth_concerns(name, rollout)
+        if isinstance(rollout, ForwardSimulation):
+            for feature in FEATURES:
+                yield from feature.simulation_concerns(name, rollout.error)
         yield from _forward_concerns(
             name,
             rollout,
@@ -262,24 +252,6 @@ def _prediction_concerns(
             yield from prediction_concerns(name, **vars(misfit))
 
 
-def _unseen_depth_concerns(
-    name: str, rollout: ForwardSimulation | str
-) -> Iterator[Concern]:
-    """Yield a concern for each depth camera of the experiment `name` without a point within its
-    gate of the simulated surface; none if the simulation failed (`rollout` is its reason).
-    """
-    for camera, error in (
-        rollout.depth.items() if isinstance(rollout, ForwardSimulation) else ()
-    ):
-        if not error.points:
-            data = {
-                "experiment": name,
-                "camera": camera,
-                "seen": error.compared_points,
-            }
-            yield Concern("prediction/unseen", "doubtful", data=data)
-
-
 def _forward_concerns(
     name: str,
     rollout: ForwardSimulation | str,
@@ -289,8 +261,8 @@ def _forward_concerns(
     """Return concerns about the forward simulation of an experiment: that it failed, or that its
     errors are larger than the noise and the residuals of the fit.
 
-    Forces and depth are compared only for experiments that were not fitted, and only if their
-    markers give no concern.
+    Other measurements than markers are compared only for experiments that were not fitted, and only
+    if their markers give no concern.
 
     Parameters
     ----------
@@ -321,55 +293,15 @@ def _forward_concerns(
         noise_rms_m=noise_m,
         is_fitted=fitted,
     )
-    predicted_n = rollout.wrench_rms[0]
-    fit_n = pooled_wrench_rms(solution)[0]
     if fitted or of_markers:
         return of_markers
-    if predicted_n is not None and fit_n is not None:
-        of_markers = forward_simulation_concerns(
-            f"{name}/force",
-            predicted_n,
-            fit_rms_m=fit_n,
-            noise_rms_m=0.0,
-            is_fitted=fitted,
+    return [
+        concern
+        for feature in FEATURES
+        for concern in feature.validation_concerns(
+            name, rollout.error, solution
         )
-    return [*of_markers, *_depth_concerns(name, rollout, solution=solution)]
-
-
-def _depth_concerns(
-    name: str, rollout: ForwardSimulation, solution: Solution
-) -> Iterator[Concern]:
-    """Yield concerns about the predicted depth of the experiment `name`, in stated σ without
-    outliers, against the larger of the fitted residuals of all cameras and the noise.
-    """
-    fitted = [error.tame_sigmas for error in depth_errors(solution).values()]
-    yardstick = max(1.0, root_mean(np.square(fitted)) if fitted else 0.0)
-    for camera, error in rollout.depth.items():
-        yield from forward_simulation_concerns(
-            f"{name}/{camera}",
-            error.tame_sigmas,
-            fit_rms_m=yardstick,
-            noise_rms_m=0.0,
-            is_fitted=False,
-        )
-
-
-def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
-    """Return the distances of depth cameras' points from the fitted surface, by names of experiment
-    and camera; empty without depth cameras.
-    """
-    return {
-        (
-            part.segment.experiment.name,
-            reading.correspondences.camera.depth.name,
-        ): (
-            SurfaceComparison.from_fit(
-                reading, part.x, values=observation, phi=part.phi
-            ).error
-        )
-        for part in solution.parts
-        for reading, observation in part.depth_residuals
-    }
+    ]
 
 
 def expected_rms_m(

@@ -7,7 +7,7 @@ be "good", however many markers and nuisance parameters there are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, get_args
 
@@ -17,7 +17,6 @@ from ..common.array_types import Array
 from ..common.display import short
 from ..errors import listed
 from ..fem.laws.constants import symbol_of, unit_of
-from ..program.contact.contact_summary import ContactSummary
 from ..program.modes.stability import Instability
 from ..recording.experiment import Experiment
 from ..recording.grasp_rotation import WARNING_ANGLE_RAD, fastest_rotation
@@ -62,14 +61,6 @@ GROSS_PREDICTION = 10.0
 LARGEST_OFFSET = 3.0
 # The same for "doubtful".
 ABSURD = 6.0
-# Pose of a depth camera in standard deviations of its prior: "check", because it compensates wrong
-# shapes.
-LARGEST_CAMERA_OFFSET = 2.0
-# Distance of outline points from the edge [pixels] that needs an explanation: edges of pixels
-# scatter by 0.3, lenses and wrong depths at edges by one.
-LARGEST_OUTLINE_DISTANCE_PX = 3.0
-# Share of outline points that may be farther.
-OUTLINE_SHARE = 0.1
 # Time shift in standard deviations of its prior: "check".
 LATE = 1.8
 # Share of the samples beyond Huber's threshold: "check".
@@ -90,8 +81,6 @@ GROSS_PERIOD_ERROR = 0.1
 E_FOLDINGS = 1.0
 # The same for "doubtful".
 GROSS_E_FOLDINGS = 7.0
-# Number of faces below which the mesh determines the width of a contact.
-FEWEST_FACES = 4.0
 # Combined standard uncertainties by which step and mesh may change a parameter: the half width of
 # its 95 % interval.
 MOVED = 2.0
@@ -488,62 +477,6 @@ def nuisance_concerns(
     return concerns
 
 
-def camera_pose_concerns(
-    names: Sequence[str], deviations: Sequence[float]
-) -> list[Concern]:
-    """Return one concern, as a list, if a component of a depth camera's pose error exceeds
-    `LARGEST_CAMERA_OFFSET` standard deviations, about the largest component; else empty, also
-    without components.
-
-    A wrong shape of the body often fits with a camera that is rotated and translated to match.
-
-    Parameters
-    ----------
-    names : (k,) sequence of str
-        Labels of the rotation and translation errors of one camera.
-    deviations : (k,) sequence of float
-        Their values in standard deviations of their priors.
-    """
-    if not len(names):
-        return []
-    worst = int(np.argmax(np.abs(deviations)))
-    deviation = abs(float(deviations[worst]))
-    return concern_if(
-        deviation > LARGEST_CAMERA_OFFSET,
-        False,
-        code="nuisance/camera",
-        name=names[worst],
-        deviations=deviation,
-    )
-
-
-def outline_concerns(camera: str, distances_px: Array) -> list[Concern]:
-    """Return one concern, as a list, if more than `OUTLINE_SHARE` of the outline points are farther
-    than `LARGEST_OUTLINE_DISTANCE_PX` from the edges in a camera's images; else empty, also
-    without points.
-
-    Parameters
-    ----------
-    camera : str
-        Name of the depth camera and of its experiment, for the message.
-    distances_px : (n,) array
-        Distances of outline points from the edges in the images, of either sign [pixels].
-    """
-    share = (
-        float(np.mean(np.abs(distances_px) > LARGEST_OUTLINE_DISTANCE_PX))
-        if len(distances_px)
-        else 0.0
-    )
-    return concern_if(
-        share > OUTLINE_SHARE,
-        False,
-        code="residuals/outline",
-        camera=camera,
-        pixels=LARGEST_OUTLINE_DISTANCE_PX,
-        percent=100 * share,
-    )
-
-
 def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
     """Return one concern, as a list, if a time shift of either sign exceeds `LATE` standard
     deviations of its prior; else empty.
@@ -674,74 +607,6 @@ def stability_concerns(instabilities: Iterable[Instability]) -> list[Concern]:
             grows, grossly, code="stability/grows", **vars(each)
         )
     return concerns
-
-
-def contact_concerns(
-    summaries: Iterable[ContactSummary], guess: str = ""
-) -> list[Concern]:
-    """Return concerns about obstacles that are never touched, or by too few faces to resolve the
-    contact.
-
-    For a simulation at the guess, also about obstacles that lose contact, or are in contact at the
-    first sample. A concern that several experiments share is returned once, for the worst of them.
-
-    Parameters
-    ----------
-    summaries : iterable of ContactSummary
-        Contact summaries.
-    guess : str
-        Text that refers to the guess, such as " at the guess"; empty for an answer.
-
-    Notes
-    -----
-    An obstacle that is never touched is "doubtful" for an answer and "check" at the guess; all
-    others are "check". One concern is returned for each code and name of an obstacle: that of the
-    experiment with the fewest faces in contact, with the number of the other experiments in its
-    message.
-    """
-    concerns: dict[tuple[str, str], list[Concern]] = {}
-    for each in sorted(summaries, key=lambda touch: touch.face_count):
-        data = {
-            "experiment": each.experiment,
-            "obstacle": each.obstacle,
-            "guess": guess,
-        }
-        coarse = 0 < each.face_count < FEWEST_FACES
-        sizes = {"faces": each.face_count, "face_mm": each.face_mm}
-        for one in (
-            *concern_if(
-                not each.face_count,
-                not guess,
-                code="contact/never",
-                mm=1e3 * each.gap_m,
-                **data,
-            ),
-            *concern_if(coarse, False, code="contact/coarse", **sizes, **data),
-            *concern_if(
-                bool(guess) and each.is_initially_in_contact,
-                False,
-                code="contact/pressed",
-                **data,
-            ),
-            *concern_if(
-                bool(guess and each.separation_s),
-                False,
-                code="contact/lost",
-                t_s=each.separation_s,
-                **data,
-            ),
-        ):
-            concerns.setdefault((one.code, each.obstacle), []).append(one)
-    return [
-        replace(
-            first,
-            data={
-                **first.data,
-                "more": f" and {len(others)} more" if others else "",
-            },
-        )
-        for first, *others in concerns.values()
-    ]
 
 
 def rotation_step_concerns(

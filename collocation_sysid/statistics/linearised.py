@@ -31,8 +31,8 @@ from ..program.least_squares import SquareRootInformation
 from ..program.linear_algebra.lapack import one_blas_thread
 from ..program.measurement_residual import huber_as_weights
 from ..program.observable_response import ObservableResponse
+from ..program.reaction_forces import GraspForces
 from ..program.sweep import Sweep
-from ..program.wrench.reaction_forces import GraspForces
 
 
 def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
@@ -152,7 +152,7 @@ class Channels(NamedTuple):
 class ResidualBlock:
     """Residuals of one measurement of an experiment, with derivatives at the answer.
 
-    Markers are the entities of the measurement; a wrench sensor has two, force and torque [N, N m],
+    Markers are the entities of the measurement; a sensor of a grasp has two, force and torque [N, N m],
     and a custom sensor one for each three numbers.
 
     Attributes
@@ -406,7 +406,7 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
 
     Notes
     -----
-    Residuals of user-defined sensors and wrenches are padded or grouped to three components. The
+    Residuals of user-defined sensors and of grasps are padded or grouped to three components. The
     fit has no `disturbances`, see `pose_noise.with_pose_noise`.
     """
     p = collocation.parameters_from(z)

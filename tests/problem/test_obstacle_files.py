@@ -25,7 +25,7 @@ from collocation_sysid.recording import (
     write_poses_csv,
     write_wrench_csv,
 )
-from collocation_sysid.result.pictures.shapes import contact_pictures
+from collocation_sysid.result.pictures.shapes import obstacle_pictures
 from collocation_sysid.result.replay import MotionRecord
 from collocation_sysid.result.web_page import write_page
 
@@ -266,11 +266,13 @@ def test_pictures_show_where_something_presses_and_how_far_the_rest_is(
         gaps_m[pressures_pa == 0] >= term.law_of_contact.largest_width_m
     )
     seen = MotionRecord.from_experiment(
-        cube, (motion.positions_m, motion.markers_m), contact=touched
+        cube,
+        (motion.positions_m, motion.markers_m),
+        recorded=dict(zip(("gaps_m", "pressures_pa"), touched, strict=True)),
     )
     kept = MotionRecord.from_arrays(cube.name, seen.to_arrays())
-    assert set(contact_pictures(kept)) == {"pressure", "gap"}
-    assert contact_pictures(MotionRecord.from_experiment(cube)) == {}
+    assert set(obstacle_pictures(kept)) == {"pressure", "gap"}
+    assert obstacle_pictures(MotionRecord.from_experiment(cube)) == {}
     page = write_page(kept, tmp_path / "page.html").read_text()
     (packed,) = re.findall('"outlines": "([^"]*)"', page)
     drawn = np.frombuffer(base64.b64decode(packed), dtype="<f4").reshape(

@@ -24,6 +24,10 @@ from scipy.ndimage import binary_erosion
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
+from collocation_sysid.features.depth_feature import (
+    camera_pose_concerns,
+    outline_concerns,
+)
 from collocation_sysid.methods.stiffness_scan import other_starts
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.collocation import Collocation
@@ -39,10 +43,6 @@ from collocation_sysid.recording.depth_camera import (
     samples_with_outlines,
 )
 from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
-from collocation_sysid.statistics.assessment import (
-    camera_pose_concerns,
-    outline_concerns,
-)
 
 UNKNOWN = cs.Nuisance.none(
     depth_turn_rad=0.09, depth_shift_m=0.02, depth_edge_px=1.0

@@ -29,6 +29,7 @@ LAYERS = (
     {"statistics"},
     {"problem"},
     {"datasets"},
+    {"features"},
     {"runs"},
     {"result"},
     {"pipeline", "installation_check"},
@@ -97,6 +98,7 @@ def test_no_imports_go_in_circles():
 # Packages with the mathematics of an identification, and those that use it; see docs/core.md.
 CORE = ("fem", "recording", "model", "program", "methods", "statistics")
 OUTER = (
+    "features",
     "runs",
     "result",
     "extras",

@@ -422,7 +422,7 @@ def test_a_camera_sees_right_and_up_as_they_are():
         camera.project(np.eye(3)), [[1, 0], [0, 0], [0, 1]], atol=1e-15
     )
     np.testing.assert_allclose(
-        camera.depths_m(np.eye(3)), [0, -1, 0], atol=1e-15
+        camera.coordinates_to_viewer_m(np.eye(3)), [0, -1, 0], atol=1e-15
     )
 
 

@@ -170,7 +170,8 @@ def image_predicted(young_pa: float) -> cs.Run:
 def test_predicted_depth_is_compared_with_the_image_and_graded():
     right, wrong = image_predicted(1.5e5), image_predicted(0.3e5)
     good, bad = (
-        each.rollouts["experiment"].depth["front"] for each in (right, wrong)
+        each.rollouts["experiment"].error.depth["front"]
+        for each in (right, wrong)
     )
     assert right.trust.verdict == "good"
     assert good.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.25)
@@ -190,7 +191,7 @@ def test_predicted_depth_is_compared_with_the_image_and_graded():
 
 
 def test_gate_and_rms_of_depth_belong_to_the_same_points():
-    bad = image_predicted(0.3e5).rollouts["experiment"].depth["front"]
+    bad = image_predicted(0.3e5).rollouts["experiment"].error.depth["front"]
     assert bad.gate_m == 0.01 < bad.reach_m
     assert bad.rms_within_gate_m <= bad.gate_m
     assert 0.1 < bad.share_beyond_gate < 0.9
@@ -228,7 +229,7 @@ def test_depth_of_a_validation_recording_is_compared_drawn_and_judged():
     finished = cs.run(
         cs.Problem([fitted, away, wrong], unknown), seek_causes=False
     )
-    (predicted,) = finished.rollouts["away"].depth.values()
+    (predicted,) = finished.rollouts["away"].error.depth.values()
     assert isinstance(predicted, DepthError)
     assert predicted.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.3)
     drawn = {

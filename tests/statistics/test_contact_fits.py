@@ -12,6 +12,7 @@ from kit.problems import GUESS, measured, pressed_cube
 
 import collocation_sysid as cs
 from collocation_sysid.common.display import plain_text
+from collocation_sysid.features.contact_feature import contact_concerns
 from collocation_sysid.program.contact.contact_summary import (
     ContactSummary,
     contact_summaries,
@@ -20,7 +21,6 @@ from collocation_sysid.recording import Experiment
 from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.result_content import Result
-from collocation_sysid.statistics.assessment import contact_concerns
 
 THERE_AND_BACK_M = np.concatenate([DEPTHS_M[:7], DEPTHS_M[:7][::-1]])
 

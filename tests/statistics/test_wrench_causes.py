@@ -16,10 +16,8 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import Nuisance, Wrench
 from collocation_sysid.runs.check import check_problem
+from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.assessment import cause_concerns
-from collocation_sysid.statistics.misspecification.fit_misspecifications import (
-    find_misspecifications,
-)
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
     rank,
 )

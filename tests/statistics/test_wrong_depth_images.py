@@ -13,13 +13,14 @@ import pytest
 from depth_twins import TRUTH, hanging_twin, swinging_twin
 from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
 
+from collocation_sysid.features.depth_feature import depth_image_hypotheses
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.check import (
     check_problem,
-    depth_image_hypotheses,
     misspecification_hypotheses,
 )
+from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.runs.solving import solve
 from collocation_sysid.statistics.misspecification.camera_clock_misspecifications import (
     camera_clock_hypotheses,
@@ -27,9 +28,6 @@ from collocation_sysid.statistics.misspecification.camera_clock_misspecification
 from collocation_sysid.statistics.misspecification.camera_image_misspecifications import (
     camera_image_hypotheses,
     equilibrium_shapes_m,
-)
-from collocation_sysid.statistics.misspecification.fit_misspecifications import (
-    find_misspecifications,
 )
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
     Hypothesis,

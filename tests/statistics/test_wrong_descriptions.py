@@ -26,11 +26,9 @@ from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp
 from collocation_sysid.runs.check import misspecification_hypotheses
 from collocation_sysid.runs.check.body_check import check_grasps, grasp_concerns
+from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.assessment import cause_concerns
 from collocation_sysid.statistics.misspecification import fit_misspecifications
-from collocation_sysid.statistics.misspecification.fit_misspecifications import (
-    find_misspecifications,
-)
 from collocation_sysid.statistics.misspecification.plausibility import (
     material_hypothesis,
     size_and_density_hypotheses,

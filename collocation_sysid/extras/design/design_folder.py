@@ -304,7 +304,7 @@ def _relative_to(value: Any, old: Path, new: Path) -> Any:
     """Return nested content of a problem with file names relative to the folder `new` instead of
     `old`, in new lists and dictionaries; whether the files exist does not matter.
 
-    File names are the texts at the keys in `OF_FILES`, at any depth; absolute ones become relative,
+    File names are the texts at the keys in `OF_FILES`, at any level; absolute ones become relative,
     too. What is at the key "columns" and all other values are returned as they are.
 
     Raises

@@ -37,7 +37,7 @@ from ...program.collocation import Collocation
 from ...program.forward.newton_solver import NewtonOptions
 from ...program.forward.scheme_simulation import continue_simulation
 from ...recording import Experiment, PoseSequence
-from ...recording.measured_wrench import Wrench
+from ...recording.measurement_selection import moved_grasp
 from ...statistics.estimates import UNDETERMINED, relative_derivatives
 from ...statistics.linearised import (
     DerivedModuli,
@@ -464,8 +464,8 @@ class FutureRecording:
         )
 
     def experiment(self, poses: PoseSequence) -> Experiment:
-        """Return the future experiment with given poses; all markers are at the origin, wrenches
-        zero, as placeholders for measurements.
+        """Return the future experiment with given poses; all markers are at the origin, and sensors
+        of the grasp have zeros, as placeholders for measurements.
         """
         template = self.template
         (grasp,) = self.template.grasps
@@ -474,11 +474,7 @@ class FutureRecording:
         return replace(
             template,
             t_s=t_s,
-            grasps=(
-                replace(
-                    grasp, poses=poses, wrench=_resampled(grasp.wrench, t_s)
-                ),
-            ),
+            grasps=(moved_grasp(grasp, poses, t_s=t_s),),
             markers=replace(template.markers, t_s=t_s, positions_m=nowhere),
         )
 
@@ -547,21 +543,6 @@ class FutureRecording:
         return linearise_fit(
             alone, alone.pack(np.append(q, segment.guess_phi), [x])
         ), x
-
-
-def _resampled(wrench: Wrench | None, t_s: Array) -> Wrench | None:
-    """Return a copy of a sensor with its own rate over the duration of the times `t_s` (T,) [s],
-    with zeros as values and NaN for components that it does not measure; None if `wrench` is None.
-    """
-    if wrench is None:
-        return None
-    rate_hz = (len(wrench.t_s) - 1) / max(np.ptp(wrench.t_s), 1e-300)
-    count = max(3, 1 + int(np.ptp(t_s) * rate_hz + 1e-6))
-    times = t_s[0] + np.arange(count) / rate_hz
-    values = np.tile(
-        np.where(wrench.measured_components, 0.0, np.nan), (count, 1)
-    )
-    return replace(wrench, t_s=times, values=values)
 
 
 # Heights of the pulses in translation [m] and rotation vector [rad]: small, for a linear response.

@@ -22,6 +22,7 @@ from ...fem.laws.moduli import engineering_constants
 from ...fem.laws.ogden import is_power_law, term_numbers
 from ...problem import Problem
 from ...recording import Experiment, Markers, Obstacle
+from ...recording.measurement_selection import NO_SENSORS
 from ...recording.obstacle_solids import solid_key
 from ...result.replay import MotionRecord, damaged_run_refused, read_arrays
 from ...runs.result_content import ReportedEstimate, Result
@@ -155,7 +156,7 @@ def without_obstacles(experiment: Experiment) -> Experiment:
         names=["corner"],
         places_m=body.nodes_m[:1],
     )
-    unmeasured: dict[str, Any] = {"markers": some, "readings": (), "depths": ()}
+    unmeasured: dict[str, Any] = {"markers": some, **NO_SENSORS}
     try:
         return replace(
             experiment, grasps=experiment.body_grasps, **started, **unmeasured

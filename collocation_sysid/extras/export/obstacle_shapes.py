@@ -149,12 +149,12 @@ class Facets:
 
     @classmethod
     def from_solid(
-        cls, solid: Solid, centre_m: Array, size_m: float, depth_m: float
+        cls, solid: Solid, centre_m: Array, size_m: float, tolerance_m: float
     ) -> Facets:
         """Return the facets of a solid; of a plane a square.
 
         On round surfaces the middles of facets are as deep below the surface as their corners are
-        above it: by `depth_m`, unless the facets would then be narrower or wider than
+        above it: by `tolerance_m`, unless the facets would then be narrower or wider than
         `FACET_WIDTH_LIMITS_RAD`.
 
         Parameters
@@ -165,7 +165,7 @@ class Facets:
             Centre of the square for a plane.
         size_m : float
             Side of the square for a plane.
-        depth_m : float
+        tolerance_m : float
             Allowed distance between facets and surface.
         """
         if isinstance(solid, Plane):
@@ -177,7 +177,7 @@ class Facets:
         places = _hull_points(
             Primitive.from_solid(solid),
             getattr(solid, "rounding_m", 0.0),
-            depth_m=depth_m,
+            tolerance_m=tolerance_m,
         )
         hull = ConvexHull(places)
         used, triangles = np.unique(hull.simplices, return_inverse=True)
@@ -241,7 +241,9 @@ def _unit_normals(corners: Array) -> Array:
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
-def _hull_points(shape: Primitive, rounding_m: float, depth_m: float) -> Array:
+def _hull_points(
+    shape: Primitive, rounding_m: float, tolerance_m: float
+) -> Array:
     """Return points (p, 3) of a solid that are the furthest along some direction; their hull is the
     solid, with round surfaces replaced by facets.
 
@@ -251,13 +253,13 @@ def _hull_points(shape: Primitive, rounding_m: float, depth_m: float) -> Array:
         Any shape but a plane.
     rounding_m : float
         Radius of rounded edges of a box or cylinder; 0 for sharp ones.
-    depth_m : float
+    tolerance_m : float
         Allowed distance between the hull and the surface.
     """
     radius_m = rounding_m if shape.kind == "box" else shape.size_m[0]
     wide = float(
         np.clip(
-            4 * np.sqrt(depth_m / max(radius_m, depth_m)),
+            4 * np.sqrt(tolerance_m / max(radius_m, tolerance_m)),
             *FACET_WIDTH_LIMITS_RAD,
         )
     )
@@ -370,7 +372,7 @@ def faceted_obstacles(body: IdentifiedBody) -> tuple[FacetedObstacle, ...]:
         strict=True,
     ):
         law = contact.law_of_contact
-        depth_m, normal = contact.deepest_point(shape.ravel())
+        penetration_m, normal = contact.deepest_point(shape.ravel())
         rotations, places = obstacle.poses.at(times)
         rigid_m = body.experiment.rigid_positions(times)
         ends = (
@@ -387,14 +389,14 @@ def faceted_obstacles(body: IdentifiedBody) -> tuple[FacetedObstacle, ...]:
         width_m = float(np.average(law.widths_m, weights=area_m2))
         solid = offset_solid(obstacle.shape, width_m / 2)
         facets = Facets.from_solid(
-            solid, box_m.mean(axis=0), size_m=size_m, depth_m=width_m / 2
+            solid, box_m.mean(axis=0), size_m=size_m, tolerance_m=width_m / 2
         )
         faces = law.surface.faces
         touching = np.unique(
             body.body.nodes.nodes_of_faces(body.body.mesh.surface[faces])
         )
         # Nodes may be deeper than the contact points of this package.
-        back_m = -max(depth_m, 0.0) * normal
+        back_m = -max(penetration_m, 0.0) * normal
         nearest = (rigid_m[0, touching] - places[0] - back_m) @ rotations[0]
         back_m -= facets.max_penetration_m(nearest) * normal
         of_node = stiffness * float(area_m2.sum()) / len(touching)

@@ -172,7 +172,7 @@ class FrameBuffer:
         tracks_m : (M, 3)
             Marker positions, NaN where missing.
         instrument_samples : sequence of InstrumentSample
-            Samples of custom sensors and wrenches, each with its own time; those farther than
+            Samples of the other instruments, each with its own time; those farther than
             `LARGEST_SAMPLE_DELAY` samples from t_s are discarded.
         """
         sample_s = self.interval_s

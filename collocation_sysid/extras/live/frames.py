@@ -607,7 +607,7 @@ def _parse_json(text: str) -> Mapping[str, Any]:
     except (
         ValueError,
         RecursionError,
-    ) as error:  # Python's limits of digits and of depth
+    ) as error:  # Python's limits of digits and of nesting
         raise InputError(
             "not a frame: a number is too long, or brackets are nested too deeply"
         ) from error

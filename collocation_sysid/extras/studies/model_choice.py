@@ -31,10 +31,8 @@ from ...common.array_types import Array
 from ...errors import InputError, SimulationError
 from ...methods.solution import Solution, pooled_wrench_rms
 from ...problem import Problem, RolloutOptions
-from ...program.simulation import with_markers
-from ...recording.custom_sensor import Gauge
 from ...recording.experiment import Experiment
-from ...recording.grasp import Grasp
+from ...recording.measurement_selection import without_later_measurements
 from ...recording.specimen import STRESS_UNIT
 from ...runs.forward_simulation import ForwardSimulation, simulate_experiment
 from ...runs.solving import solve
@@ -679,9 +677,8 @@ def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
     held-out sample [s].
 
     If it is the only fitted recording, the measurements after two thirds of its duration are
-    removed: markers and wrenches become NaN, depth images are left out, and custom sensors become
-    NaN unless nothing would remain. Otherwise the recording becomes one for validation, and the
-    time is −∞. `problem` is not modified.
+    removed, see `without_later_measurements`. Otherwise the recording becomes one for validation,
+    and the time is −∞. `problem` is not modified.
 
     Raises
     ------
@@ -694,51 +691,9 @@ def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
         start_s = -np.inf
     else:
         start_s = float(chosen.t_s[0] + FITTED * chosen.duration_s)
-        tracks = np.where(
-            (chosen.t_s > start_s)[:, None, None],
-            np.nan,
-            chosen.markers.positions_m,
-        )
-        grasps = tuple(
-            _without_later_wrench(grasp, start_s) for grasp in chosen.grasps
-        )
-        depths = [
-            each
-            for d in chosen.depths
-            if (each := d.until_time(start_s)) is not None
-        ]
-        readings = [
-            _without_later_values(gauge, start_s) for gauge in chosen.readings
-        ]
-        remaining = replace(
-            with_markers(chosen, tracks),
-            grasps=grasps,
-            depths=depths,
-            readings=readings,
-        )
+        remaining = without_later_measurements(chosen, start_s)
     experiments = [remaining if e is chosen else e for e in problem.experiments]
     return replace(problem, experiments=experiments), start_s
-
-
-def _without_later_wrench(grasp: Grasp, end_s: float) -> Grasp:
-    """Return a copy of the grasp with measurements of its sensor after `end_s` [s] replaced by NaN;
-    the grasp itself without a sensor.
-    """
-    wrench = grasp.wrench
-    if wrench is None:
-        return grasp
-    values = np.where((wrench.t_s > end_s)[:, None], np.nan, wrench.values)
-    return replace(grasp, wrench=replace(wrench, values=values))
-
-
-def _without_later_values(gauge: Gauge, end_s: float) -> Gauge:
-    """Return the custom sensor `gauge` with measurements after `end_s` [s] replaced by NaN; itself
-    if none would remain.
-    """
-    values = np.where(
-        (gauge.sample_times_s > end_s)[:, None], np.nan, gauge.measured_values
-    )
-    return replace(gauge, values=values) if np.isfinite(values).any() else gauge
 
 
 def _stress_residuals_pa(
@@ -809,13 +764,17 @@ def _prediction_error(
     residuals = rollout.trajectory.markers_m - markers.positions_m
     is_counted = markers.is_present
     if experiment.specimen is not None:
-        t_s, stresses_pa = _stress_residuals_pa(experiment, rollout.readings)
+        t_s, stresses_pa = _stress_residuals_pa(
+            experiment, rollout.predicted.readings
+        )
         unit = STRESS_UNIT
         residuals = stresses_pa[:, None, None]
         is_counted = np.isfinite(residuals[:, :, 0])
     elif not markers.sample_count:
         t_s = np.concatenate([sensor.t_s for sensor in experiment.wrenches])
-        pairs = zip(rollout.wrenches, experiment.wrenches, strict=True)
+        pairs = zip(
+            rollout.predicted.wrenches, experiment.wrenches, strict=True
+        )
         residuals = np.concatenate(
             [
                 sensor.symmetry * (read - sensor.values)[:, :3]

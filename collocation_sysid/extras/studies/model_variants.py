@@ -15,14 +15,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ...errors import InputError, require_among
 from ...fem.laws.constants import MOST_TERMS, usual_value, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import ELASTIC, elastic_names
 from ...problem import Problem
 from ...problem.problem_reading import read_problem_file
+from ...recording.measurement_selection import measured_count
 from .study_arguments import unique_items
 
 # Initial guess of a new branch's share of the stiffness.
@@ -319,12 +318,11 @@ def file_variants(
 
 
 def _measured_counts(problem: Problem) -> dict[str, int]:
-    """Return how many numbers (coordinates of markers, components of wrenches) are measured in each
-    fitted recording, by name.
+    """Return how many numbers are measured in each fitted recording, by name, see
+    `measured_count`.
     """
     return {
-        e.name: 3 * e.markers.sample_count
-        + sum(int(np.isfinite(wrench.values).sum()) for wrench in e.wrenches)
+        e.name: measured_count(e)
         for e in problem.experiments
         if not e.validation
     }

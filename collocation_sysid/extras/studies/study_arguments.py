@@ -281,15 +281,15 @@ def _split_values(text: str) -> list[str]:
     empty ones left out.
     """
     items = [""]
-    depth = 0
+    open_brackets = 0
     quote = ""
     for letter in text:
         if quote:
             quote = "" if letter == quote else quote
         elif letter in "\"'":
             quote = letter
-        depth += (letter in "[{") - (letter in "]}") if not quote else 0
-        if letter == "," and not depth and not quote:
+        open_brackets += (letter in "[{") - (letter in "]}") if not quote else 0
+        if letter == "," and not open_brackets and not quote:
             items.append("")
         else:
             items[-1] += letter

@@ -29,7 +29,7 @@ Inner = Literal["cg-descent", "scipy-cg", "l-bfgs-b", "levenberg-marquardt"]
 FIRST_ORDER = ("cg-descent", "scipy-cg", "l-bfgs-b")
 
 # Open bounds of a parameter are this many e-folds away where a smooth map needs two.
-LEAST_CONTACT_DISTANCE = 50.0
+LARGEST_OPEN_DISTANCE = 50.0
 # SciPy's line searches interpolate values, so that one out of the domain must be a number: this
 # many times the value so far.
 STEEP = 10.0
@@ -235,8 +235,8 @@ class _ScaledMerit:
             else []
         )
         at = z[self.free][self.mapped]
-        low = np.maximum(lower[self.mapped], at - LEAST_CONTACT_DISTANCE)
-        high = np.minimum(upper[self.mapped], at + LEAST_CONTACT_DISTANCE)
+        low = np.maximum(lower[self.mapped], at - LARGEST_OPEN_DISTANCE)
+        high = np.minimum(upper[self.mapped], at + LARGEST_OPEN_DISTANCE)
         self.middle = (low + high) / 2
         self.half = (high - low) / 2
         # At a bound the slope is zero: nothing would ever leave it.

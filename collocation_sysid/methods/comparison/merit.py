@@ -3,7 +3,7 @@
     m(z) = L(z) + yᵀ g(z) + ρ/2 ‖g(z)‖²,   ∇m = ∇L + Jᵀ (y + ρ g),
 
 with loss and constraints in the scaling of the NLP and y = 0 for a penalty. Positions of grasped
-nodes, history variables of materials with memory and measured wrenches are variables with
+nodes, history variables of materials with memory and lifted measurements are variables with
 constraints of their own (see `program.lifted.lifting`). Variables with equal bounds, such as a given
 start, are constant.
 """

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from ...common.array_types import Array, Index
 from ...fem.body import Body
-from ...fem.contact_surface import face_shape_functions
+from ...fem.elements import face_shape_functions
 from ...recording.depth_camera import Depth
 from ...recording.experiment import Experiment
 from ...recording.placement import nearest_points_of_triangles

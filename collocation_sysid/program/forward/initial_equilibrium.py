@@ -183,8 +183,8 @@ def _without_contact(forces: Forces, shape: Array) -> Array:
     for term in forces.external_terms:
         if isinstance(term, Contact):
             frame = term.law_of_contact.obstacle.nodes
-            depth_m, normal = term.deepest_point(shape.ravel())
-            places[frame] -= max(depth_m, 0.0) * normal
+            penetration_m, normal = term.deepest_point(shape.ravel())
+            places[frame] -= max(penetration_m, 0.0) * normal
     return places
 
 

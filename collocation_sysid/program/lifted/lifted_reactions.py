@@ -18,8 +18,8 @@ import numpy as np
 from ...common.array_types import Array, Index
 from ..experiment_iterate import ExperimentIterate
 from ..motion_jacobian import MotionJacobian
+from ..reaction_forces import reaction_forces
 from ..transcription import Transcription
-from ..wrench.reaction_forces import reaction_forces
 from .lifted_variables import LiftedVariables
 
 

@@ -1,7 +1,7 @@
 """Reaction forces of instrumented grasps, one time step after the other.
 
 The reaction is the residual of the equations of motion at the grasped dofs (see
-`program.wrench.reaction_forces`). It is available one time step late: the midpoint rule evaluates
+`program.reaction_forces`). It is available one time step late: the midpoint rule evaluates
 forces between two steps, and the acceleration of a tool needs the next pose.
 """
 
@@ -16,7 +16,7 @@ from ...common.array_types import Array, Index
 from ...model.equations_at_parameters import EquationsAtParameters
 from ...recording.poses import Poses
 from ..observables import ReactionForces
-from .reaction_forces import GraspForces
+from ..reaction_forces import GraspForces
 from .wrench_observable import GraspWrench, ReactionGrid
 
 # Number of time steps after which the wrench of a time is available.

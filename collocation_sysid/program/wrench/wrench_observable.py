@@ -43,7 +43,7 @@ from ..observables import (
     ReactionForces,
     VectorJacobianProduct,
 )
-from .reaction_forces import centred_rows
+from ..reaction_forces import centred_rows
 
 # Sizes of the data of the tool: the sensor's axes Q, the grasp's rotation and its second time
 # derivative, its translation from the sensor's origin, and the second derivative of that.

@@ -27,7 +27,7 @@ from .field_intervals import field_picture
 from .mesh_pictures import elements_picture, mesh_picture
 from .over_time import marker_errors, marker_tracks, sensor_picture
 from .search_pictures import convergence, scan_picture
-from .shapes import contact_pictures, shapes_picture
+from .shapes import obstacle_pictures, shapes_picture
 from .spectrum import spectrum_picture
 from .stress_strain import strain_picture
 
@@ -168,7 +168,7 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
         yield f"depth_{replay.name}_{name}", depth_picture(points)
     if replay.has_shapes:
         yield f"shapes_{replay.name}", shapes_picture(replay)
-        for name, figure in contact_pictures(replay).items():
+        for name, figure in obstacle_pictures(replay).items():
             yield f"{name}_{replay.name}", figure
 
 

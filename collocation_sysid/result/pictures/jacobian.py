@@ -14,7 +14,7 @@ from matplotlib.image import AxesImage
 
 from ...common.array_types import Array
 from ...program.collocation import Collocation
-from ...runs.check.derivatives import shortened_experiment
+from ...recording.measurement_selection import shortened_experiment
 from ..figure_style import (
     PAGE_MM,
     SMALL_PT,
@@ -126,7 +126,7 @@ def _first_steps(
     """
     count = -(-SHOWN_STEPS // collocation.substeps) + SPARE_SAMPLES
     few = [
-        shortened_experiment(segment.experiment, count)
+        shortened_experiment(segment.experiment, count, shortens_sensors=True)
         for segment in collocation.transcriptions
     ]
     short = replace(collocation, experiments=few, associations={})

@@ -269,7 +269,10 @@ def _are_named_in_front(
         camera.are_hidden(places_m, nodes_m, surface=surface)
         for camera in (front, behind)
     ]
-    is_in_front = front.depths_m(places_m) >= front.depths_m(nodes_m).mean()
+    is_in_front = (
+        front.coordinates_to_viewer_m(places_m)
+        >= front.coordinates_to_viewer_m(nodes_m).mean()
+    )
     return np.where(hidden[0] == hidden[1], is_in_front, ~hidden[0])
 
 

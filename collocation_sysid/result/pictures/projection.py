@@ -16,7 +16,7 @@ from ...common.array_types import Array
 
 Triangles = NDArray[np.integer]
 
-# Angle between the view and the normal of the plane of motion, to show depth.
+# Angle between the view and the normal of the plane of motion, to show its third axis.
 AZIMUTH_DEG = 25.0
 # Angle by which the view looks down.
 ELEVATION_DEG = 18.0
@@ -125,7 +125,7 @@ class ParallelCamera:
         """Return the positions (…, 2) [m] in the picture of points (…, 3) [m]."""
         return np.asarray(points_m) @ self.axes[:2].T
 
-    def depths_m(self, points_m: ArrayLike) -> Array:
+    def coordinates_to_viewer_m(self, points_m: ArrayLike) -> Array:
         """Return the coordinate (…) [m] of points (…, 3) [m] towards the viewer."""
         return np.asarray(points_m) @ self.axes[2]
 
@@ -187,7 +187,7 @@ class ParallelCamera:
         b = b[facing]
         c = c[facing]
         area = area[facing]
-        depth = corners[facing, :, 2]
+        to_viewer = corners[facing, :, 2]
         behind = np.zeros(len(points), dtype=bool)
         for k, point in enumerate(points):
             place = point[:2]
@@ -196,11 +196,13 @@ class ParallelCamera:
             weights = np.stack([opposite_a, opposite_b], axis=1) / area[:, None]
             weights = np.column_stack([weights, 1 - weights.sum(axis=1)])
             is_inside = (weights >= 0).all(axis=1)
-            surface_depth = np.einsum(
-                "kc,kc->k", weights[is_inside], depth[is_inside]
+            surface_coordinate = np.einsum(
+                "kc,kc->k", weights[is_inside], to_viewer[is_inside]
             )
             # A marker on the surface, or a noise's breadth below, is not hidden by it.
-            behind[k] = bool((surface_depth > point[2] + 0.05 * size).any())
+            behind[k] = bool(
+                (surface_coordinate > point[2] + 0.05 * size).any()
+            )
         return behind
 
 

@@ -202,8 +202,8 @@ def _draw_colour_bar(axes: Axes, field: SurfaceField, samples: Index) -> Array:
     return scale.to_rgba(values)[..., :3]
 
 
-def contact_pictures(replay: MotionRecord) -> dict[str, Figure]:
-    """Return the pictures of `shapes_picture` coloured by contact pressure and by gap, as
+def obstacle_pictures(replay: MotionRecord) -> dict[str, Figure]:
+    """Return the pictures of `shapes_picture` coloured by pressure of obstacles and by gap, as
     "pressure" and "gap".
 
     The viewing direction is the one from which most of the pressure is visible. Empty without

@@ -10,10 +10,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar
 
 from ...common.array_types import Array
 from ...common.serialisation import content
+from ...features.feature import SimulatedCheck
+from ...features.registry import FEATURES
 from ...methods.initial_trajectories import initial_variables
 from ...methods.reduced_space import ReducedSpace
 from ...methods.stiffness_scan import (
@@ -24,30 +27,18 @@ from ...methods.stiffness_scan import (
 )
 from ...model.schemes import as_scheme
 from ...problem import Problem
-from ...program.collocation import Collocation, ExperimentIterate
-from ...program.contact.contact_summary import contact_summaries_of_parts
+from ...program.collocation import Collocation
 from ...program.lifted.lifted_collocation import (
     lifted_count,
     with_lifted_variables,
 )
 from ...program.modes.stability import Instability, find_instabilities
-from ...recording.experiment import Experiment
 from ...statistics.assessment import (
-    contact_concerns,
     rotation_step_concerns,
     stability_concerns,
 )
 from ...statistics.budget.discretisation_error import MOST_SUBSTEPS
 from ...statistics.concerns import Concern
-from ...statistics.misspecification.camera_clock_misspecifications import (
-    camera_clock_hypotheses,
-)
-from ...statistics.misspecification.camera_image_misspecifications import (
-    camera_image_hypotheses,
-)
-from ...statistics.misspecification.camera_misspecifications import (
-    camera_hypotheses,
-)
 from ...statistics.misspecification.misspecification_hypothesis import (
     Hypothesis,
     rank,
@@ -55,16 +46,8 @@ from ...statistics.misspecification.misspecification_hypothesis import (
 from ...statistics.misspecification.modal_misspecifications import (
     find_misspecifications_by_modes,
 )
-from ...statistics.misspecification.obstacle_misspecifications import (
-    obstacle_hypotheses,
-)
-from ...statistics.misspecification.placement_causes import placement_mistakes
 from ...statistics.misspecification.plausibility import (
     size_and_density_hypotheses,
-)
-from ...statistics.misspecification.wrench_causes import (
-    CHECKED_SAMPLES,
-    wrench_mistakes,
 )
 from ...statistics.scale_identifiability import scale_concerns, static_concerns
 from ...statistics.stability_concerns import strain_stability_concerns
@@ -112,11 +95,8 @@ __all__ = [
 LONGEST_SIMULATION_S = 10.0
 # Time of a fit of the first samples to the markers, in simulations of these samples.
 FIT_SIMULATIONS = 15.0
-# Most nodes of a body whose equilibria for many stiffnesses take seconds.
-NODES = 2000
 # Largest relative deviation from fourth-order central differences that rounding explains.
 DERIVATIVE_TOLERANCE = 1e-6
-AT_THE_GUESS = ", at the guess"
 SUBSTEPS_NOTE = (
     "check assumes one time step per sample. If transcription.substeps is not given, solve uses "
     f"as many as the error bars require, up to {MOST_SUBSTEPS}"
@@ -328,29 +308,22 @@ def check_problem(
         (z, start_notes) = initial_variables(collocation)
     report_progress("computing natural modes and testing the description")
     causes = misspecification_hypotheses(problem)
-    has_images = any(e.depths for e in problem.experiments)
-    if has_images and may_be_images(causes):
-        report_progress("comparing depth images with equilibria and motion")
-        mistakes = depth_image_hypotheses(
-            problem, simulated.iterates(z), most_nodes=None if full else NODES
-        )
-        causes = rank((*causes, *mistakes))
-        notes += _depth_notes(problem) if not full else []
-    has_both = any(
-        e.wrenches and e.markers.sample_count for e in problem.experiments
+    check = SimulatedCheck(
+        problem,
+        collocation,
+        parts=simulated.iterates(z),
+        causes=causes,
+        is_full=full,
+        fit_s=partial(_fit_to_markers_s, collocation, total_s),
+        report_progress=report_progress,
     )
-    if has_both and not causes:
-        fit_s = _wrench_comparison_s(collocation, total_s)
-        if full or fit_s <= LONGEST_SIMULATION_S:
-            report_progress(
-                "comparing the wrenches with the prediction from the markers"
-            )
-            causes = rank(wrench_mistakes(collocation))
-        else:
-            notes.append(
-                "the wrenches were not compared with the prediction from the markers, which would "
-                f"take about {fit_s:.2g} s; check --full does it"
-            )
+    # In reverse order, because comparisons that need a fit are made only if no other is likely.
+    for feature in reversed(FEATURES):
+        found, found_notes = feature.simulated_hypotheses(check)
+        if found:
+            causes = rank((*causes, *found))
+            check = replace(check, causes=causes)
+        notes += found_notes
     findings = CheckResult(
         **_simulated_fields(problem, simulated, z=z),
         timesteps=_grid_rows(collocation),
@@ -363,18 +336,20 @@ def check_problem(
         hessian_error=hessian_error,
         causes=causes,
     )
-    # Nothing is said of contact by a body that was only carried.
-    touching = (
-        ()
-        if start_notes
-        else _contact_concerns(simulated, z, is_complete=simulated is not first)
-    )
+    parts = simulated.iterates(z)
+    # Forces on a body that was only carried by its grasps mean nothing.
+    at_guess = [
+        concern
+        for feature in FEATURES
+        if not start_notes
+        for concern in feature.guess_concerns(parts, simulated is not first)
+    ]
     concerns = (
         *_concerns(
             problem, findings, unstable=find_instabilities(simulated, z)
         ),
-        *strain_stability_concerns(simulated.iterates(z)),
-        *touching,
+        *strain_stability_concerns(parts),
+        *at_guess,
     )
     notes += [
         *start_notes,
@@ -398,11 +373,13 @@ def check_problem(
     return replace(findings, notes=(*known, *notes))
 
 
-def _wrench_comparison_s(collocation: Collocation, total_s: float) -> float:
-    """Return the estimated time [s] to fit the first samples to the markers alone, for the
-    comparison with the wrenches; `total_s` is the time to simulate the complete recordings.
+def _fit_to_markers_s(
+    collocation: Collocation, total_s: float, samples: int
+) -> float:
+    """Return the estimated time [s] to fit the first `samples` to the markers alone; `total_s` is
+    the time to simulate the complete recordings.
     """
-    share = min(1.0, CHECKED_SAMPLES / _grid_rows(collocation))
+    share = min(1.0, samples / _grid_rows(collocation))
     return FIT_SIMULATIONS * total_s * share
 
 
@@ -577,24 +554,6 @@ def _concerns(
     )
 
 
-def _contact_concerns(
-    simulated: Collocation, z: Array, is_complete: bool
-) -> list[Concern]:
-    """Return concerns about contact in the simulation with the variables z at the guess.
-
-    `is_complete` is false if only the first samples were simulated: then there are only concerns
-    about penetration at the start.
-    """
-    concerns = contact_concerns(
-        contact_summaries_of_parts(simulated.iterates(z)), AT_THE_GUESS
-    )
-    return [
-        each
-        for each in concerns
-        if is_complete or each.code == "contact/pressed"
-    ]
-
-
 def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
     """Return the finding of each body at the guess, with the names of its experiments; every
     parameter must have a guess.
@@ -632,54 +591,6 @@ def _body_concerns(body: BodyCheck, alone: bool) -> tuple[Concern, ...]:
     return body.concerns if alone else tuple(named)
 
 
-def _depth_notes(problem: Problem) -> list[str]:
-    """Return one note if a body with depth images has too many nodes for a comparison with the
-    equilibria of many stiffnesses; otherwise an empty list.
-    """
-    large = any(
-        e.depths and len(e.body.nodes_m) > NODES for e in problem.experiments
-    )
-    return [
-        "depth images were not compared with equilibria of many stiffnesses, which takes long for "
-        f"more than {NODES} nodes; check --full does it"
-    ] * large
-
-
-def may_be_images(causes: Sequence[Hypothesis]) -> bool:
-    """Return whether depth images may be described wrongly: no other cause explains a
-    recording, although a camera may see hardly anything of the body.
-    """
-    return all(cause.code == "camera" for cause in causes)
-
-
-def depth_image_hypotheses(
-    problem: Problem,
-    parts: Sequence[ExperimentIterate],
-    most_nodes: int | None = NODES,
-) -> tuple[Hypothesis, ...]:
-    """Return likely errors of times, order, orientation and matrices of depth images.
-
-    Parameters
-    ----------
-    problem : Problem
-    parts : sequence of ExperimentIterate
-        Experiments simulated at the guess.
-    most_nodes : int or None
-        Largest bodies whose equilibria for many stiffnesses are computed; None for any size.
-    """
-    constants = typical_constants(problem.parameters)
-    clocks = (
-        cause for part in parts for cause in camera_clock_hypotheses(part)
-    )
-    shapes = (
-        cause
-        for e in problem.experiments
-        if most_nodes is None or len(e.body.nodes_m) <= most_nodes
-        for cause in camera_image_hypotheses(e, constants)
-    )
-    return rank((*clocks, *shapes))
-
-
 def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
     """Return likely errors in the description of a problem; mostly none.
 
@@ -704,17 +615,10 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
             e, constants, huber=problem.huber
         )
     )
-    blind = (
-        cause for e in problem.experiments for cause in camera_hypotheses(e)
+    by_feature = (
+        cause
+        for feature in FEATURES
+        for e in problem.experiments
+        for cause in feature.hypotheses(e)
     )
-    placed = (
-        cause for e in problem.experiments for cause in _contact_causes(e)
-    )
-    return (*odd, *rank((*placed, *blind, *doubtful)))
-
-
-def _contact_causes(experiment: Experiment) -> tuple[Hypothesis, ...]:
-    """Return likely errors in the placement of a body, or else in its obstacles and their loads."""
-    return tuple(placement_mistakes(experiment)) or tuple(
-        obstacle_hypotheses(experiment)
-    )
+    return (*odd, *rank((*by_feature, *doubtful)))

@@ -465,7 +465,7 @@ def _check_grasp(
     )
     # Behind faces of the box that the body goes on beyond, as far as the nearest held node.
     inner = (outside_m > 0).any(axis=0)
-    depth_m = np.concatenate([grasped_m - low, high - grasped_m], axis=1)[
+    inside_m = np.concatenate([grasped_m - low, high - grasped_m], axis=1)[
         :, inner
     ]
     least_m = ROUND_OFF_EDGES * mean_edge_m
@@ -473,7 +473,7 @@ def _check_grasp(
     slightly_outside = (
         (outside_m > least_m) & (outside_m < reach_m) & is_neighbour[:, None]
     )
-    slightly_inside = (depth_m > least_m) & (depth_m < reach_m)
+    slightly_inside = (inside_m > least_m) & (inside_m < reach_m)
     return GraspCheck(
         name,
         len(nodes),

@@ -22,12 +22,9 @@ from ...program.lifted.lifted_collocation import (
 )
 from ...program.linear_algebra.factorisation import Choice
 from ...program.sweep import Sweep
+from ...recording.measurement_selection import shortened_experiment
 from ...statistics.concerns import Concern
-from .derivatives import (
-    first_sample_count,
-    shortened_experiment,
-    shortened_problem,
-)
+from .derivatives import first_sample_count, shortened_problem
 
 # Memory per nonzero [bytes]: IPOPT with MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps.
 BYTES_PER_NONZERO = 280.0
@@ -108,7 +105,9 @@ def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
         if not experiment.validation:
             parts = list(short.experiments)
             parts[k] = shortened_experiment(
-                experiment, first_sample_count(experiment) + 1
+                experiment,
+                first_sample_count(experiment) + 1,
+                shortens_sensors=True,
             )
             more = _count_nonzeros(replace(problem, experiments=parts)) - least
             total = (

@@ -10,18 +10,15 @@ from functools import partial
 import numpy as np
 
 from ...common.array_types import Array
-from ...common.time_dependence import at_times
-from ...model.contact import contact_terms
+from ...features.registry import FEATURES
 from ...problem import Problem
 from ...program.collocation import Collocation, convert_variables
 from ...program.lifted.lifted_collocation import (
     lifted_nonzeros,
     with_lifted_variables,
 )
-from ...recording.depth_camera import until_all_cameras_see
 from ...recording.experiment import Experiment
-from ...recording.measured_wrench import Wrench
-from ...recording.time_tables import FEWEST_SHARED_SAMPLES
+from ...recording.measurement_selection import shortened_experiment
 
 # First samples of a motion that contain all kinds of equations; more would not change derivatives.
 SAMPLES = 12
@@ -29,8 +26,6 @@ SAMPLES = 12
 STATIC_SAMPLES = 3
 # Step of the differences, which balances truncation and rounding of fourth-order differences.
 STEP = 1e-5
-# Largest step in contact, relative to the gap over which the pressure rises: it must stay within.
-STEP_PER_CONTACT_WIDTH = 1e-3
 # Huber threshold of the check [σ]: differences must not cross the kink of the second derivative.
 LARGE_HUBER = 1e9
 # Most nonzeros of lifted variables for which the whole program is laid out and checked.
@@ -47,62 +42,10 @@ def shortened_problem(problem: Problem) -> Problem:
     validation.
     """
     short = tuple(
-        shortened_experiment(e, first_sample_count(e))
+        shortened_experiment(e, first_sample_count(e), shortens_sensors=True)
         for e in problem.experiments
     )
     return replace(problem, experiments=short)
-
-
-def shortened_experiment(experiment: Experiment, samples: int) -> Experiment:
-    """Return the experiment with its first samples, and more if cameras begin to see later.
-
-    If no marker is measured in these samples, their positions are set to zero. Sensors of grasps
-    without enough measurements there are removed.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Experiment to shorten; not modified.
-    samples : int
-        Least number of samples.
-    """
-    fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
-    samples, depths = until_all_cameras_see(
-        experiment.depths, experiment.t_s, count=samples, fewest=fewest
-    )
-    markers = experiment.markers
-    if not np.isfinite(markers.positions_m[:samples]).any():
-        # At least one sample has to be there.
-        markers = replace(
-            markers, positions_m=np.nan_to_num(markers.positions_m)
-        )
-    t_s = experiment.t_s[:samples]
-    grasps = [
-        replace(g, wrench=_shortened_wrench(g.wrench, t_s, fewest=fewest))
-        for g in experiment.grasps
-    ]
-    return replace(
-        experiment,
-        t_s=t_s,
-        markers=at_times(markers, slice(samples)),
-        grasps=grasps,
-        depths=depths,
-    )
-
-
-def _shortened_wrench(
-    wrench: Wrench | None, t_s: Array, fewest: int
-) -> Wrench | None:
-    """Return the samples of a wrench from the first to the last of the times `t_s` (T,) [s].
-
-    None if there is no wrench, or fewer than `fewest` samples or no measured component there.
-    """
-    if wrench is None:
-        return None
-    here = (wrench.t_s >= t_s[0]) & (wrench.t_s <= t_s[-1])
-    if here.sum() < fewest or not wrench.is_measured[here].any():
-        return None
-    return at_times(wrench, here)
 
 
 def derivative_errors(
@@ -127,7 +70,7 @@ def derivative_errors(
     second : float
         Error of the Hessian; 0 if the program with lifted variables is too large to be laid out.
     """
-    if any(segment.depths for segment in collocation.transcriptions):
+    if any(s.association.correspondences for s in collocation.transcriptions):
         collocation = replace(collocation, huber=LARGE_HUBER)
     rng = np.random.default_rng(0)
     of_slopes = 0.0
@@ -179,20 +122,14 @@ def derivative_errors(
 
 
 def _difference_step(collocation: Collocation) -> float:
-    """Return the step of the differences: `STEP`, or less if the gap range in which a contact
-    begins is narrow.
-    """
-    touching = (
-        t
-        for s in collocation.transcriptions
-        for t in contact_terms(s.experiment)
-    )
+    """Return the step of the differences: `STEP`, or less where a feature needs smaller ones."""
     return min(
         (
             STEP,
             *(
-                STEP_PER_CONTACT_WIDTH * term.law_of_contact.largest_width_m
-                for term in touching
+                feature.largest_difference_step(segment.experiment)
+                for segment in collocation.transcriptions
+                for feature in FEATURES
             ),
         )
     )

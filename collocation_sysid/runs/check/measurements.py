@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...common.array_types import Array
+from ...features.registry import FEATURES
 from ...recording.experiment import Experiment
 from ...statistics.concerns import Concern, concern_if
 from .body_check import BodyCheck
@@ -138,13 +139,10 @@ def check_recording(
         samples=markers.sample_count,
         missing=int(missing.sum()),
         markers=tuple(findings),
-        instruments=(
-            *["the wrench"] * bool(experiment.wrenches),
-            *(gauge.name for gauge in experiment.readings),
-            *(
-                f"{sum(map(len, d.clouds)):,} points of '{d.name}'"
-                for d in experiment.depths
-            ),
+        instruments=tuple(
+            text
+            for feature in FEATURES
+            for text in feature.instruments(experiment)
         ),
         air_density_kg_m3=experiment.air_density_kg_m3,
         test=""

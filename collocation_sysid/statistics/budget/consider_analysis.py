@@ -21,13 +21,13 @@ from ...program.linear_algebra.lapack import one_blas_thread
 from ...program.measurement_residual import MeasurementResidual
 from ...program.observable_response import ObservableResponse
 from ...program.observables import ObservedMotion
+from ...program.reaction_forces import GraspForces
 from ...program.sweep import (
     ForwardSubstitution,
     PrescribedColumns,
     Sweep,
     SweepColumns,
 )
-from ...program.wrench.reaction_forces import GraspForces
 from ...recording.experiment import Experiment
 from ...recording.nuisance import KINDS
 from ..linearised import linearise_fit

@@ -18,6 +18,7 @@ from ...common.array_types import Array, Index
 from ...program.experiment_iterate import ExperimentIterate
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
+from ...recording.measurement_selection import is_load_only
 
 # Relative tolerance of the flatness of a face, and of a node that lies in a plane: rounding of mesh
 # files in single precision, over the longest extent of the body.
@@ -53,7 +54,7 @@ def slip_displacements_m(
     Returns
     -------
     (N, g) array or None
-        None if no face may slide (see `sliding_faces`), if obstacles touch the body, whose contact
+        None if no face may slide (see `sliding_faces`), if obstacles touch the body, whose
         stiffness these equations lack, or if the linearised equations are singular.
     """
     experiment = iterate.segment.experiment
@@ -87,19 +88,6 @@ def slip_displacements_m(
             return None
         displacements_m[row, columns] = moved_m[released]
     return displacements_m
-
-
-def is_load_only(experiment: Experiment) -> bool:
-    """Return whether a static experiment measures wrenches only, so that no measurement shows the
-    shape of the body between the faces.
-    """
-    return bool(
-        experiment.is_static
-        and experiment.wrenches
-        and not experiment.markers.sample_count
-        and not experiment.depths
-        and not experiment.readings
-    )
 
 
 def pressed_axis(dofs: Index, positions_m: Array) -> int | None:

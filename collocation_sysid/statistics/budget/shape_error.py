@@ -73,7 +73,7 @@ def surface_modes(
     body : Body
         The body.
     known : (k,) array
-        Nodes of the mesh near which the surface is known, such as contact areas.
+        Nodes of the mesh near which the surface is known, such as those that touch an obstacle.
     correlation : float
         Correlation length over the longest extent.
 

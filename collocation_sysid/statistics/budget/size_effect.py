@@ -1,10 +1,10 @@
 """Displacements of obstacles if the body is larger than its mesh, such that first contact is
 preserved.
 
-The depth of an indentation counts from first contact, and the prior of an obstacle's offset refers
+An indentation counts from first contact, and the prior of an obstacle's offset refers
 to the surface of the body. A larger body would penetrate obstacles that do not move, by its
 relative size times its distance from the grasps: for an indentation of 1 mm into a block of 15 mm,
-15 % of the depth for a size error of 1 %.
+15 % of the indentation for a size error of 1 %.
 """
 
 from __future__ import annotations

@@ -6,12 +6,12 @@ worst: it is fitted again with each mistake corrected, and the factor by which i
 is the strength of the hypothesis. Of the directions of gravity, the natural modes choose the one
 that is refitted.
 
-Hypotheses about measured wrenches are in `wrench_causes`.
+Hypotheses about sensors and obstacles are in modules of their own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,30 +26,19 @@ from ...program.modes.modal_prediction import DeclaredMotion
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.poses import PoseSequence
-from .camera_clock_misspecifications import camera_clock_hypotheses
-from .camera_image_misspecifications import camera_image_hypotheses
-from .camera_misspecifications import camera_hypotheses
 from .misspecification_hypothesis import (
     Hypothesis,
     HypothesisTest,
     clock_hypothesis,
-    rank,
 )
 from .modal_misspecifications import (
     ModalComparison,
     find_misspecifications_by_modes,
     gravity_hypotheses,
 )
-from .obstacle_misspecifications import obstacle_hypotheses
-from .plausibility import load_sign_hypotheses
-from .specimen_misspecifications import find_specimen_misspecifications
-from .wrench_causes import wrench_causes
 
 # RMS residual in standard deviations up to which there is nothing to explain.
 NOISE = 1.15
-# RMS distance of depth points in standard deviations up to which there is nothing to explain: noise
-# along the normal is rarely known better.
-DEPTH_NOISE = 1.5
 # Factor by which the misfit of a refit must decrease, unless only noise remains.
 BETTER = 1.5
 # Factor by which two means, before and after, must explain residuals better than one.
@@ -76,28 +65,24 @@ SAME_LAG_S = 5e-4
 SHORTEST = 4
 
 
-def find_misspecifications(
-    solution: Solution, budget: int | None = None
-) -> tuple[Hypothesis, ...]:
-    """Return hypotheses of what is described wrongly, likeliest first; empty where the residuals
-    are noise.
-
-    Hypotheses about wrenches, signs of loads and specimens are always tested; others only if the
-    markers of an experiment miss by more than `NOISE` σ, for the one with the largest misfit, and
-    refits only if none of these hypotheses is nearly certain (`CERTAIN`).
+def motion_misspecifications(
+    solution: Solution,
+    known: Sequence[Hypothesis],
+    budget: int | None = None,
+) -> list[Hypothesis]:
+    """Return hypotheses about the motion of the experiment with the largest misfit, by natural
+    modes and refits; empty if its markers miss by at most `NOISE` σ.
 
     Parameters
     ----------
     solution : Solution
         The fit.
+    known : sequence of Hypothesis
+        Other hypotheses; nothing is fitted again if one of these, or of the natural modes, is
+        nearly certain (`CERTAIN`).
     budget : int, optional
         Largest number of sweeps over the first samples for all refits together; by default three
         times the work of the fit, at most 150.
-
-    Returns
-    -------
-    tuple of Hypothesis
-        `strength` is the factor by which the misfit decreases without the mistake.
     """
     fitted = [
         segment.experiment for segment in solution.collocation.transcriptions
@@ -106,47 +91,20 @@ def find_misspecifications(
         _misfit(e, read)
         for e, read in zip(fitted, solution.readings_m, strict=True)
     ]
-    hypotheses = [
-        *wrench_causes(solution),
-        *(cause for e in fitted for cause in load_sign_hypotheses(e)),
-        *(cause for e in fitted for cause in obstacle_hypotheses(e)),
-        *find_specimen_misspecifications(solution),
-        *_camera_hypotheses(solution),
-    ]
-    if max(misfits) > NOISE:
-        worst = fitted[int(np.argmax(misfits))]
-        hypotheses += find_misspecifications_by_modes(
+    if max(misfits) <= NOISE:
+        return []
+    worst = fitted[int(np.argmax(misfits))]
+    hypotheses = list(
+        find_misspecifications_by_modes(
             worst, solution.parameters, huber=solution.collocation.huber
         )
-        if max((each.strength for each in hypotheses), default=0.0) < CERTAIN:
-            hypotheses += _refit_hypotheses(solution, worst, budget=budget)
-    return rank(hypotheses)
-
-
-def _camera_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
-    """Yield hypotheses about the depth cameras of those experiments that do not fit."""
-    constants = solution.parameters
-    for part in solution.parts:
-        if not any(
-            _misses_surface(
-                reading.signed_distances_m(observation, part.phi)
-                / reading.correspondences.camera.depth.sigma_m
-            )
-            for reading, observation in part.depth_residuals
-        ):
-            continue
-        experiment = part.segment.experiment
-        yield from camera_hypotheses(experiment)
-        yield from camera_clock_hypotheses(part)
-        yield from camera_image_hypotheses(experiment, constants)
-
-
-def _misses_surface(distances: Array) -> bool:
-    """Whether the distances of depth points from the surface, in standard deviations, are larger
-    than noise; also if none is compared (all NaN).
-    """
-    compared = distances[np.isfinite(distances)]
-    return not len(compared) or root_mean(compared**2) > DEPTH_NOISE
+    )
+    certainty = max(
+        (each.strength for each in (*known, *hypotheses)), default=0.0
+    )
+    if certainty < CERTAIN:
+        hypotheses += _refit_hypotheses(solution, worst, budget=budget)
+    return hypotheses
 
 
 def _refit_hypotheses(
@@ -162,7 +120,7 @@ def _refit_hypotheses(
     experiment : Experiment
     budget : int or None
         Largest number of sweeps for all refits together; None for the default, see
-        `find_misspecifications`.
+        `motion_misspecifications`.
 
     Notes
     -----

@@ -1,8 +1,8 @@
 """Misspecification hypotheses: what may be described wrongly, how it is tested, and its message.
 
 A hypothesis is tested by the misfit with the mistake corrected: by natural modes for many
-stiffnesses (`modal_misspecifications`), by another fit, or by the wrench of a fit to the markers
-alone (`wrench_causes`). Contradictions and jumps need no test (`plausibility`). All are ranked by
+stiffnesses (`modal_misspecifications`), by another fit, or by other measurements than those of a
+fit to the markers alone. Contradictions and jumps need no test (`plausibility`). All are ranked by
 the factor by which the misfit decreases. An accepted hypothesis becomes a concern of the topic
 "description".
 """

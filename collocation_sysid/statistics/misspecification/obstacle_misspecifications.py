@@ -26,7 +26,7 @@ CALIBRATION = 0.1
 FEWEST_SAMPLES = 2
 # Distance over the body's diagonal that need not be known.
 PLACE = 0.05
-# Depth in the undeformed body, over its motion, up to which an obstacle does not press on it.
+# Penetration of the undeformed body, over the motion of the obstacle, up to which it does not press.
 PRESSING = 0.05
 # Motion of an obstacle over the body's diagonal that no static test has.
 LARGEST_STROKE = 10.0

@@ -16,7 +16,7 @@ from ...recording.obstacle_solids import Plane
 from .misspecification_hypothesis import Hypothesis
 from .obstacle_misspecifications import signed_distances_m
 
-# Depth in a solid from which on a node is inside, over the body's diagonal.
+# Penetration of a solid from which on a node is inside, over the body's diagonal.
 DEEP = 0.01
 # Largest share of the nodes that may be inside.
 MOST_INSIDE = 0.5

@@ -1,4 +1,4 @@
-"""Errors of a depth camera that are correlated over the surface.
+"""Errors of a camera that are correlated over the surface.
 
 Errors due to lens, model or neighbouring pixels are similar in neighbouring patches of the surface.
 Their covariance is modelled as

@@ -1,6 +1,6 @@
 """Reaction forces of grasps: the residual of the equations of motion at the prescribed dofs.
 
-On the dofs g of grasps whose wrench is measured,
+On the dofs g of grasps whose force or torque is measured,
 
     R_t = M a_t − Σ_j w_j F_{t−j} = −c_{t,g},
 
@@ -25,12 +25,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.array_types import Array, Index
-from ...model.dynamics import Dynamics
-from ...model.equations_at_parameters import EquationsAtParameters
-from ...model.internal_variables import AnyHistory
-from ..linear_algebra.block_band import Submatrix
-from ..observables import ReactionForces
+from ..common.array_types import Array, Index
+from ..model.dynamics import Dynamics
+from ..model.equations_at_parameters import EquationsAtParameters
+from ..model.internal_variables import AnyHistory
+from .linear_algebra.block_band import Submatrix
+from .observables import ReactionForces
 
 
 def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:

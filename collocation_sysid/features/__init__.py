@@ -1,0 +1,12 @@
+"""Features: kinds of measurements and forces, each with all that it contributes to checks and runs.
+
+Runs, checks, verdicts, results and reports iterate over the features and name none of them. To add
+one, write a module with a `Feature` and add it to the registry; its residual, its force or its
+recording belong into the packages `program`, `model` and `recording`.
+
+- `feature`: `Feature`, the functions that a feature may declare.
+- `registry`: the features, in the order of the residuals.
+- `measurement_results`: predictions and errors of measurements, as in ``result.json``.
+- `marker_feature`, `wrench_feature`, `custom_sensor_feature`, `depth_feature`: measurements.
+- `contact_feature`: contact with obstacles.
+"""

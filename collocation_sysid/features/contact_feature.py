@@ -1,0 +1,209 @@
+"""Contact with obstacles in checks and runs: likely errors, concerns and friction."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from math import inf
+from typing import Any
+
+import numpy as np
+
+from ..common.array_types import Array
+from ..common.display import short
+from ..methods.complementarity import with_contact_energy
+from ..methods.solution import Solution
+from ..model.contact import contact_terms
+from ..program.collocation import ExperimentIterate
+from ..program.contact.contact_summary import (
+    ContactSummary,
+    contact_summaries_of_parts,
+    friction_summaries,
+    surface_gaps_and_pressures,
+)
+from ..recording.experiment import Experiment
+from ..statistics.concerns import Concern, concern_if
+from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
+from ..statistics.misspecification.obstacle_misspecifications import (
+    obstacle_hypotheses,
+)
+from ..statistics.misspecification.placement_causes import placement_mistakes
+from .feature import Feature
+from .measurement_results import FittedExperiment, InstrumentPrediction
+
+# Number of faces below which the mesh determines the width of a contact.
+FEWEST_FACES = 4.0
+# Largest step of differences, relative to the gap over which the pressure rises: it must stay
+# within.
+STEP_PER_WIDTH = 1e-3
+AT_THE_GUESS = ", at the guess"
+
+
+def hypotheses(experiment: Experiment) -> tuple[Hypothesis, ...]:
+    """Return likely errors in the placement of a body, or else in its obstacles and their loads."""
+    return tuple(placement_mistakes(experiment)) or tuple(
+        obstacle_hypotheses(experiment)
+    )
+
+
+def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
+    """Yield likely errors in the obstacles of the fitted experiments and their loads."""
+    for segment in solution.collocation.transcriptions:
+        yield from obstacle_hypotheses(segment.experiment)
+
+
+def guess_concerns(
+    parts: Sequence[ExperimentIterate], is_complete: bool
+) -> list[Concern]:
+    """Return concerns about contact in a simulation at the guess.
+
+    `is_complete` is false if only the first samples were simulated: then there are only concerns
+    about penetration at the start.
+    """
+    concerns = contact_concerns(contact_summaries_of_parts(parts), AT_THE_GUESS)
+    return [
+        each
+        for each in concerns
+        if is_complete or each.code == "contact/pressed"
+    ]
+
+
+def concerns(parts: Sequence[ExperimentIterate]) -> list[Concern]:
+    """Return concerns about contact in the fit, see `contact_concerns`."""
+    return contact_concerns(contact_summaries_of_parts(parts))
+
+
+def contact_concerns(
+    summaries: Iterable[ContactSummary], guess: str = ""
+) -> list[Concern]:
+    """Return concerns about obstacles that are never touched, or by too few faces to resolve the
+    contact.
+
+    For a simulation at the guess, also about obstacles that lose contact, or are in contact at the
+    first sample. A concern that several experiments share is returned once, for the worst of them.
+
+    Parameters
+    ----------
+    summaries : iterable of ContactSummary
+        Contact summaries.
+    guess : str
+        Text that refers to the guess, such as " at the guess"; empty for an answer.
+
+    Notes
+    -----
+    An obstacle that is never touched is "doubtful" for an answer and "check" at the guess; all
+    others are "check". One concern is returned for each code and name of an obstacle: that of the
+    experiment with the fewest faces in contact, with the number of the other experiments in its
+    message.
+    """
+    concerns: dict[tuple[str, str], list[Concern]] = {}
+    for each in sorted(summaries, key=lambda touch: touch.face_count):
+        data = {
+            "experiment": each.experiment,
+            "obstacle": each.obstacle,
+            "guess": guess,
+        }
+        coarse = 0 < each.face_count < FEWEST_FACES
+        sizes = {"faces": each.face_count, "face_mm": each.face_mm}
+        for one in (
+            *concern_if(
+                not each.face_count,
+                not guess,
+                code="contact/never",
+                mm=1e3 * each.gap_m,
+                **data,
+            ),
+            *concern_if(coarse, False, code="contact/coarse", **sizes, **data),
+            *concern_if(
+                bool(guess) and each.is_initially_in_contact,
+                False,
+                code="contact/pressed",
+                **data,
+            ),
+            *concern_if(
+                bool(guess and each.separation_s),
+                False,
+                code="contact/lost",
+                t_s=each.separation_s,
+                **data,
+            ),
+        ):
+            concerns.setdefault((one.code, each.obstacle), []).append(one)
+    return [
+        replace(
+            first,
+            data={
+                **first.data,
+                "more": f" and {len(others)} more" if others else "",
+            },
+        )
+        for first, *others in concerns.values()
+    ]
+
+
+def recorded(
+    experiment: Experiment,
+    solution: Solution,
+    _: InstrumentPrediction | None,
+    positions_m: Array,
+) -> dict[str, Any]:
+    """Return gap [m] and pressure [Pa] on the boundary triangles at the estimates, (T, F) each;
+    nothing without obstacles.
+
+    Poses are corrected by the nuisance parameters if the experiment was fitted.
+    """
+    if not experiment.obstacles:
+        return {}
+    if (part := solution.part_of(experiment.name)) is not None:
+        experiment = part.segment.corrected_experiment(part.phi)
+    theta = experiment.body.theta_from_values(solution.parameters)
+    gaps_m, pressures_pa = surface_gaps_and_pressures(
+        experiment, np.array(theta), x=positions_m.reshape(len(positions_m), -1)
+    )
+    return {"gaps_m": gaps_m, "pressures_pa": pressures_pa}
+
+
+def largest_difference_step(experiment: Experiment) -> float:
+    """Return a small share of the narrowest gap range over which a pressure rises; infinity without
+    obstacles.
+    """
+    widths_m = (
+        term.law_of_contact.largest_width_m
+        for term in contact_terms(experiment)
+    )
+    return STEP_PER_WIDTH * min(widths_m, default=inf)
+
+
+def fit_fields(part: ExperimentIterate, _: Solution) -> dict[str, Any]:
+    """Return the friction with each obstacle; None without friction."""
+    friction = friction_summaries(
+        part.segment.experiment, part.equations.dynamics, x=part.x
+    )
+    return {"friction": friction or None}
+
+
+def fit_lines(
+    name: str, fitted: FittedExperiment, is_symmetric: bool
+) -> Iterator[str]:
+    """Yield the friction with each obstacle; its energy is that of the modelled part."""
+    unit = "J in the modelled part" if is_symmetric else "J"
+    for obstacle, friction in (fitted.friction or {}).items():
+        energy = f"{short(friction.dissipated_j)} {unit}"
+        yield (
+            f"friction of {obstacle} in '{name}': at most {friction.used:.0%} of its limit, "
+            f"slip during {friction.slipping:.0%} of the time, {energy} dissipated"
+        )
+
+
+CONTACT = Feature(
+    "contact",
+    hypotheses=hypotheses,
+    fit_hypotheses=fit_hypotheses,
+    guess_concerns=guess_concerns,
+    concerns=concerns,
+    for_simulation=with_contact_energy,
+    largest_difference_step=largest_difference_step,
+    recorded=recorded,
+    fit_fields=fit_fields,
+    fit_lines=fit_lines,
+)

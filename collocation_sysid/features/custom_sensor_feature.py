@@ -1,0 +1,250 @@
+"""Custom sensors in checks and runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from ..common.array_types import Array
+from ..common.display import number, short
+from ..methods.solution import Solution, custom_sensor_rms
+from ..program.collocation import ExperimentIterate
+from ..program.custom_sensor_residual import custom_sensor_residuals
+from ..program.observables import ObservedMotion, ReactionForces
+from ..program.simulation import Trajectory
+from ..program.transcription import Transcription
+from ..program.wrench.wrench_observable import ReactionGrid
+from ..recording.experiment import Experiment
+from .feature import Feature, Units
+from .measurement_results import (
+    FittedExperiment,
+    InstrumentMisfit,
+    InstrumentPrediction,
+    PredictionErrors,
+    comparison_columns,
+    misfit,
+)
+
+
+def instruments(experiment: Experiment) -> list[str]:
+    """Return the names of the sensors."""
+    return [gauge.name for gauge in experiment.readings]
+
+
+def predict(
+    segment: Transcription, trajectory: Trajectory, phi: Array
+) -> dict[str, Any]:
+    """Return the predicted values (S, m) by name."""
+    positions_m = trajectory.positions_m
+    predicted = _predict_sensors(
+        segment,
+        positions_m.reshape(len(positions_m), -1),
+        reactions=trajectory.reactions,
+        phi=phi,
+    )
+    return {
+        "readings": {
+            gauge.sensor.name: gauge.without_padding(values)
+            for gauge, values in zip(
+                segment.custom_sensors, predicted, strict=True
+            )
+        }
+    }
+
+
+def copied(_: Experiment, other: Experiment) -> dict[str, Any]:
+    """Return the measured values of another recording by name."""
+    return {
+        "readings": {
+            gauge.name: gauge.measured_values for gauge in other.readings
+        }
+    }
+
+
+def copied_times_s(
+    experiment: Experiment, other: Experiment
+) -> Iterable[tuple[Array, Array]]:
+    """Return the sample times of each sensor in both recordings."""
+    pairs = zip(experiment.readings, other.readings, strict=True)
+    return [
+        (own.sample_times_s, theirs.sample_times_s) for own, theirs in pairs
+    ]
+
+
+def reason_against_copy(experiment: Experiment, other: Experiment) -> str:
+    """Return that the recordings have different sensors; "" if the same."""
+    own = [gauge.name for gauge in experiment.readings]
+    theirs = [gauge.name for gauge in other.readings]
+    return "other readings" if own != theirs else ""
+
+
+def errors(
+    experiment: Experiment, predicted: InstrumentPrediction
+) -> dict[str, Any]:
+    """Return the RMS differences by name, in the units of the sensors; None without sensors."""
+    rms = custom_sensor_rms(experiment, predicted.readings)
+    return {"reading_rms": rms or None}
+
+
+def misfits(
+    experiment: Experiment, predicted: InstrumentPrediction
+) -> Iterator[InstrumentMisfit]:
+    """Yield the differences of each sensor over its σ."""
+    for gauge in experiment.readings:
+        difference = predicted.readings[gauge.name] - gauge.measured_values
+        yield misfit(gauge.name, "its sigma", ratio=difference / gauge.sigma)
+
+
+def step_differences(
+    part: ExperimentIterate,
+    trajectory: Trajectory,
+    _: InstrumentPrediction,
+    share: float,
+) -> Iterator[Array]:
+    """Yield the changes (S, G, 3) of the residuals of each sensor; zero where not predicted."""
+    if not (segment := part.segment).custom_sensors:
+        return
+    fitted_x = part.x[segment.markers.sample_rows]
+    fitted = _predict_sensors(
+        segment,
+        fitted_x,
+        reactions=(
+            ReactionGrid.from_dynamics(segment.dynamics),
+            part.reactions,
+        ),
+        phi=part.phi,
+    )
+    simulated = _predict_sensors(
+        segment,
+        trajectory.positions_m.reshape(len(fitted_x), -1),
+        reactions=trajectory.reactions,
+        phi=part.phi,
+    )
+    rows = zip(segment.custom_sensors, fitted, simulated, strict=True)
+    for gauge, of_fit, of_simulation in rows:
+        change = share * np.nan_to_num(of_simulation - of_fit)
+        yield change / gauge.sigmas[:, None]
+
+
+def _predict_sensors(
+    segment: Transcription,
+    x: Array,
+    reactions: tuple[ReactionGrid, ReactionForces],
+    phi: Array,
+) -> list[Array]:
+    """Return the predictions of custom sensors, for each (S, G, 3) at S samples of G points or
+    wrenches.
+
+    Parameters
+    ----------
+    segment : Transcription
+    x : (T, 3n) array
+        Positions at the samples [m].
+    reactions : (ReactionGrid, ReactionForces)
+        Grid and values of the reactions of grasps, for sensors of forces.
+    phi : (k,) array
+        Nuisance parameters of the recording.
+    """
+    grid, reaction_forces = reactions
+    motion = ObservedMotion(x, reaction_forces)
+    gauges = custom_sensor_residuals(
+        segment.experiment,
+        segment.experiment.t_s,
+        grid=grid,
+        nuisance=segment.nuisance,
+    )
+    return [gauge.predict_motion(motion, phi) for gauge in gauges]
+
+
+def recorded(
+    experiment: Experiment,
+    solution: Solution,
+    predicted: InstrumentPrediction | None,
+    _: Array,
+) -> dict[str, Any]:
+    """Return an array (S, 1 + 3m) for each sensor, by name.
+
+    The columns are the time [s], and its m numbers as measured, fitted and simulated; NaN where the
+    experiment was not fitted or not simulated.
+    """
+    fitted = solution.readings.get(experiment.name, {})
+    simulated = {} if predicted is None else predicted.readings
+    return {
+        "readings": {
+            gauge.name: comparison_columns(
+                gauge.sample_times_s,
+                gauge.measured_values,
+                *(each.get(gauge.name) for each in (fitted, simulated)),
+            )
+            for gauge in experiment.readings
+        }
+    }
+
+
+def units_by_name(experiment: Experiment) -> dict[str, str] | None:
+    """Return the units of the custom sensors that state one, by name; None if none does."""
+    return {
+        gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit
+    } or None
+
+
+def fit_fields(part: ExperimentIterate, solution: Solution) -> dict[str, Any]:
+    """Return RMS residuals, stated σ and units by name; None without sensors."""
+    experiment = part.segment.experiment
+    rms = custom_sensor_rms(experiment, solution.readings[experiment.name])
+    sigma = {gauge.name: gauge.sigma for gauge in experiment.readings}
+    return {
+        "reading_rms": rms or None,
+        "reading_sigma": sigma or None,
+        "reading_unit": units_by_name(experiment),
+    }
+
+
+def fit_lines(name: str, fitted: FittedExperiment, _: bool) -> Iterator[str]:
+    """Yield the RMS residual of each sensor with its σ."""
+    for reading, rms in (fitted.reading_rms or {}).items():
+        unit = _unit_text(fitted.reading_unit, reading)
+        sigma = short((fitted.reading_sigma or {})[reading])
+        yield (
+            f"{reading} of '{name}': {short(rms)}{unit} RMS (sigma {sigma}{unit})"
+        )
+
+
+def error_texts(error: PredictionErrors, units: Units) -> Iterator[str]:
+    """Yield the RMS difference of each sensor."""
+    for reading, rms in (error.reading_rms or {}).items():
+        yield f"{reading} {rms:.2g}{_unit_text(units, reading)} RMS"
+
+
+def brief_texts(error: PredictionErrors) -> Iterator[str]:
+    """Yield the RMS difference of each sensor, without its unit."""
+    for name, rms in (error.reading_rms or {}).items():
+        yield f"{name}: {number(rms, 3)} RMS"
+
+
+def _unit_text(units: Units, reading: str) -> str:
+    """Return the unit of the custom sensor `reading` after a space; "" if it states none or `units`
+    is None.
+    """
+    unit = (units or {}).get(reading, "")
+    return f" {unit}" if unit else ""
+
+
+CUSTOM_SENSORS = Feature(
+    "custom sensors",
+    instruments=instruments,
+    predict=predict,
+    copied=copied,
+    copied_times_s=copied_times_s,
+    reason_against_copy=reason_against_copy,
+    errors=errors,
+    misfits=misfits,
+    step_differences=step_differences,
+    recorded=recorded,
+    fit_fields=fit_fields,
+    fit_lines=fit_lines,
+    error_texts=error_texts,
+    brief_texts=brief_texts,
+)

@@ -1,0 +1,476 @@
+"""Depth cameras in checks and runs: points and outlines compared with the surface of a motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..common.array_types import Array, root_mean
+from ..common.display import number
+from ..methods.solution import Solution
+from ..methods.stiffness_scan import typical_constants
+from ..problem import Problem
+from ..program.collocation import ExperimentIterate
+from ..program.depth.depth_comparison import DepthError, SurfaceComparison
+from ..program.simulation import Trajectory
+from ..program.transcription import Transcription
+from ..recording.experiment import Experiment
+from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
+from ..statistics.assessment import forward_simulation_concerns
+from ..statistics.concerns import Concern, concern_if
+from ..statistics.misspecification.camera_clock_misspecifications import (
+    camera_clock_hypotheses,
+)
+from ..statistics.misspecification.camera_image_misspecifications import (
+    camera_image_hypotheses,
+)
+from ..statistics.misspecification.camera_misspecifications import (
+    camera_hypotheses,
+    require_depth_units,
+)
+from ..statistics.misspecification.misspecification_hypothesis import (
+    Hypothesis,
+    rank,
+)
+from .feature import Feature, SimulatedCheck, Units
+from .measurement_results import (
+    FittedExperiment,
+    InstrumentMisfit,
+    InstrumentPrediction,
+    PredictionErrors,
+)
+
+# Pose of a depth camera in standard deviations of its prior: "check", because it compensates wrong
+# shapes.
+LARGEST_CAMERA_OFFSET = 2.0
+# Distance of outline points from the edge [pixels] that needs an explanation: edges of pixels
+# scatter by 0.3, lenses and wrong depths at edges by one.
+LARGEST_OUTLINE_DISTANCE_PX = 3.0
+# Share of outline points that may be farther.
+OUTLINE_SHARE = 0.1
+# RMS distance of depth points in standard deviations up to which there is nothing to explain: noise
+# along the normal is rarely known better.
+LARGEST_NOISE = 1.5
+# Most nodes of a body whose equilibria for many stiffnesses take seconds.
+NODES = 2000
+
+
+# Predictions --------------------------------------------------------------------------------------
+
+
+def instruments(experiment: Experiment) -> list[str]:
+    """Return the number of points of each camera."""
+    return [
+        f"{sum(map(len, depth.clouds)):,} points of '{depth.name}'"
+        for depth in experiment.depths
+    ]
+
+
+def predict(
+    segment: Transcription, trajectory: Trajectory, phi: Array
+) -> dict[str, Any]:
+    """Return the comparison of each camera with the simulated surface, by name."""
+    return {
+        "surfaces": {
+            reading.correspondences.camera.depth.name: SurfaceComparison.from_motion(
+                reading,
+                trajectory.t_s,
+                positions_m=trajectory.positions_m,
+                phi=phi,
+            )
+            for reading in segment.depths
+        }
+    }
+
+
+def reason_against_copy(experiment: Experiment, _: Experiment) -> str:
+    """Return that points cannot be compared if nothing else is measured; else ""."""
+    is_compared = (
+        experiment.markers.sample_count
+        or experiment.wrenches
+        or experiment.readings
+    )
+    if is_compared:
+        return ""
+    return "points of depth cameras cannot be compared between recordings"
+
+
+def errors(_: Experiment, predicted: InstrumentPrediction) -> dict[str, Any]:
+    """Return the distances of each camera's points from the surface; None without cameras."""
+    by_camera = {
+        name: surface.error for name, surface in predicted.surfaces.items()
+    }
+    return {"depth": by_camera or None}
+
+
+def misfits(
+    _: Experiment, predicted: InstrumentPrediction
+) -> Iterator[InstrumentMisfit]:
+    """Yield the distances of each camera with a point near the body, over its σ."""
+    for name, surface in predicted.surfaces.items():
+        error = surface.error
+        if error.rms_m is not None:
+            yield InstrumentMisfit(
+                f"the depth of {name}",
+                "its sigma_m",
+                sigmas=error.sigmas,
+                robust_sigmas=error.tame_sigmas,
+                count=error.points,
+                size=f"{1e3 * error.rms_m:.3g} mm RMS",
+            )
+
+
+def step_differences(
+    part: ExperimentIterate,
+    trajectory: Trajectory,
+    _: InstrumentPrediction,
+    share: float,
+) -> list[Array]:
+    """Return the changes (S, M, 3) of the residuals of each camera and outline, at the
+    correspondences of the fit.
+    """
+    if not (residuals := part.surface_residuals):
+        return []
+    known_s = part.segment.experiment.t_s
+    rows_s = part.segment.dynamics.t_s
+    fitted = part.x[part.segment.markers.sample_rows]
+    way_m = share * (trajectory.positions_m.reshape(len(fitted), -1) - fitted)
+    way_rows_m = np.array(
+        [np.interp(rows_s, known_s, each) for each in way_m.T]
+    )
+    displacements_m = way_rows_m.T.reshape(len(rows_s), -1, 3, 1)
+    return [
+        reading.residual_changes(
+            observation,
+            displacements_m[:, reading.correspondences.surface.nodes],
+            phi=part.phi,
+        )[..., 0]
+        for reading, observation in residuals
+    ]
+
+
+# Likely errors ------------------------------------------------------------------------------------
+
+
+def simulated_hypotheses(
+    check: SimulatedCheck,
+) -> tuple[Sequence[Hypothesis], Sequence[str]]:
+    """Return likely errors of images, and a note if equilibria of large bodies were left out;
+    nothing without cameras, or if another error explains a recording.
+    """
+    experiments = check.problem.experiments
+    has_images = any(each.depths for each in experiments)
+    if not has_images or not may_be_images(check.causes):
+        return (), ()
+    check.report_progress("comparing depth images with equilibria and motion")
+    found = depth_image_hypotheses(
+        check.problem, check.parts, most_nodes=None if check.is_full else NODES
+    )
+    is_omitted = not check.is_full and any(
+        each.depths and len(each.body.nodes_m) > NODES for each in experiments
+    )
+    note = (
+        "depth images were not compared with equilibria of many stiffnesses, which takes long for "
+        f"more than {NODES} nodes; check --full does it"
+    )
+    return found, (note,) * is_omitted
+
+
+def may_be_images(causes: Sequence[Hypothesis]) -> bool:
+    """Return whether depth images may be described wrongly: no other cause explains a
+    recording, although a camera may see hardly anything of the body.
+    """
+    return all(cause.code == "camera" for cause in causes)
+
+
+def depth_image_hypotheses(
+    problem: Problem,
+    parts: Sequence[ExperimentIterate],
+    most_nodes: int | None = NODES,
+) -> tuple[Hypothesis, ...]:
+    """Return likely errors of times, order, orientation and matrices of depth images.
+
+    Parameters
+    ----------
+    problem : Problem
+    parts : sequence of ExperimentIterate
+        Experiments simulated at the guess.
+    most_nodes : int or None
+        Largest bodies whose equilibria for many stiffnesses are computed; None for any size.
+    """
+    constants = typical_constants(problem.parameters)
+    clocks = (
+        cause for part in parts for cause in camera_clock_hypotheses(part)
+    )
+    shapes = (
+        cause
+        for e in problem.experiments
+        if most_nodes is None or len(e.body.nodes_m) <= most_nodes
+        for cause in camera_image_hypotheses(e, constants)
+    )
+    return rank((*clocks, *shapes))
+
+
+def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
+    """Yield hypotheses about the cameras of those experiments that do not fit."""
+    for part in solution.parts:
+        if not any(
+            _misses_surface(
+                reading.signed_distances_m(observation, part.phi)
+                / reading.correspondences.camera.depth.sigma_m
+            )
+            for reading, observation in part.depth_residuals
+        ):
+            continue
+        experiment = part.segment.experiment
+        yield from camera_hypotheses(experiment)
+        yield from camera_clock_hypotheses(part)
+        yield from camera_image_hypotheses(experiment, solution.parameters)
+
+
+def _misses_surface(distances: Array) -> bool:
+    """Whether the distances of points from the surface, in standard deviations, are larger than
+    noise; also if none is compared (all NaN).
+    """
+    compared = distances[np.isfinite(distances)]
+    return not len(compared) or root_mean(compared**2) > LARGEST_NOISE
+
+
+# Concerns -----------------------------------------------------------------------------------------
+
+
+def part_concerns(part: ExperimentIterate) -> Iterator[Concern]:
+    """Yield concerns about the estimated poses of the cameras, and about outlines."""
+    experiment = part.segment.experiment
+    nuisance = part.segment.nuisance
+    for camera in range(len(experiment.depths)):
+        pose = nuisance.indices_of_rows(
+            DEPTH_TURN, DEPTH_SHIFT, component=camera
+        )
+        yield from camera_pose_concerns(
+            [nuisance.names[k] for k in pose], part.phi[pose].tolist()
+        )
+    for reading, distance_px in part.outline_distances_px:
+        name = reading.correspondences.camera.depth.name
+        yield from outline_concerns(
+            f"'{name}' of '{experiment.name}'", distance_px
+        )
+
+
+def camera_pose_concerns(
+    names: Sequence[str], deviations: Sequence[float]
+) -> list[Concern]:
+    """Return one concern, as a list, if a component of a depth camera's pose error exceeds
+    `LARGEST_CAMERA_OFFSET` standard deviations, about the largest component; else empty, also
+    without components.
+
+    A wrong shape of the body often fits with a camera that is rotated and translated to match.
+
+    Parameters
+    ----------
+    names : (k,) sequence of str
+        Labels of the rotation and translation errors of one camera.
+    deviations : (k,) sequence of float
+        Their values in standard deviations of their priors.
+    """
+    if not len(names):
+        return []
+    worst = int(np.argmax(np.abs(deviations)))
+    deviation = abs(float(deviations[worst]))
+    return concern_if(
+        deviation > LARGEST_CAMERA_OFFSET,
+        False,
+        code="nuisance/camera",
+        name=names[worst],
+        deviations=deviation,
+    )
+
+
+def outline_concerns(camera: str, distances_px: Array) -> list[Concern]:
+    """Return one concern, as a list, if more than `OUTLINE_SHARE` of the outline points are farther
+    than `LARGEST_OUTLINE_DISTANCE_PX` from the edges in a camera's images; else empty, also
+    without points.
+
+    Parameters
+    ----------
+    camera : str
+        Name of the depth camera and of its experiment, for the message.
+    distances_px : (n,) array
+        Distances of outline points from the edges in the images, of either sign [pixels].
+    """
+    share = (
+        float(np.mean(np.abs(distances_px) > LARGEST_OUTLINE_DISTANCE_PX))
+        if len(distances_px)
+        else 0.0
+    )
+    return concern_if(
+        share > OUTLINE_SHARE,
+        False,
+        code="residuals/outline",
+        camera=camera,
+        pixels=LARGEST_OUTLINE_DISTANCE_PX,
+        percent=100 * share,
+    )
+
+
+def simulation_concerns(
+    name: str, error: PredictionErrors
+) -> Iterator[Concern]:
+    """Yield a concern for each camera of the experiment `name` without a point within its gate of
+    the simulated surface.
+    """
+    for camera, distances in (error.depth or {}).items():
+        if not distances.points:
+            data = {
+                "experiment": name,
+                "camera": camera,
+                "seen": distances.compared_points,
+            }
+            yield Concern("prediction/unseen", "doubtful", data=data)
+
+
+def validation_concerns(
+    name: str, error: PredictionErrors, solution: Solution
+) -> Iterator[Concern]:
+    """Yield concerns about the predicted distances, in stated σ without outliers, against the larger
+    of the fitted residuals of all cameras and the noise.
+    """
+    fitted = [
+        distances.tame_sigmas
+        for part in solution.parts
+        for distances in fitted_errors(part).values()
+    ]
+    yardstick = max(1.0, root_mean(np.square(fitted)) if fitted else 0.0)
+    for camera, distances in (error.depth or {}).items():
+        yield from forward_simulation_concerns(
+            f"{name}/{camera}",
+            distances.tame_sigmas,
+            fit_rms_m=yardstick,
+            noise_rms_m=0.0,
+            is_fitted=False,
+        )
+
+
+# Results ------------------------------------------------------------------------------------------
+
+
+def fitted_surfaces(part: ExperimentIterate) -> dict[str, SurfaceComparison]:
+    """Return the points of each camera compared with the fitted surface, by name of the camera."""
+    return {
+        reading.correspondences.camera.depth.name: SurfaceComparison.from_fit(
+            reading, part.x, values=observation, phi=part.phi
+        )
+        for reading, observation in part.depth_residuals
+    }
+
+
+def fitted_errors(part: ExperimentIterate) -> dict[str, DepthError]:
+    """Return the distances of each camera's points from the fitted surface, by name."""
+    return {
+        name: surface.error for name, surface in fitted_surfaces(part).items()
+    }
+
+
+def fit_fields(part: ExperimentIterate, _: Solution) -> dict[str, Any]:
+    """Return the distances of each camera's points; None without cameras."""
+    return {"depth": fitted_errors(part) or None}
+
+
+def excluded_loss(part: ExperimentIterate) -> float:
+    """Return the loss of the points beyond the gate, each counted like one at the gate."""
+    return sum(
+        reading.loss_of_distant_points for reading, _ in part.depth_residuals
+    )
+
+
+def notes(part: ExperimentIterate) -> Iterator[str]:
+    """Yield notes on the distances of points and outlines from the fitted surface, per camera;
+    first on all points, then on all outlines.
+    """
+    name = part.segment.experiment.name
+    for reading, observation in part.depth_residuals:
+        distance_m = reading.signed_distances_m(observation, part.phi)
+        correspondences = reading.correspondences
+        excluded = ", ".join(
+            f"{count} {why}"
+            for why, count in correspondences.excluded_counts.items()
+            if count
+        )
+        distances = "are compared, because none is near enough to the body"
+        if correspondences.is_compared.any():
+            distances = (
+                f"deviate from the surface by {1e3 * np.sqrt(np.nanmean(distance_m**2)):.3g} "
+                f"mm (RMS; median {1e3 * np.nanmedian(np.abs(distance_m)):.3g} mm)"
+            )
+        yield (
+            f"experiment '{name}': {correspondences.is_compared.sum()} "
+            f"points of '{correspondences.camera.depth.name}' {distances}; excluded: "
+            f"{excluded or 'none'}"
+        )
+    for outline, distance_px in part.outline_distances_px:
+        if len(distance_px):
+            yield (
+                f"experiment '{name}': {len(distance_px)} points of "
+                "the model's outline deviate from the edges in "
+                f"'{outline.correspondences.camera.depth.name}' by "
+                f"{np.sqrt(np.mean(distance_px**2)):.2g} pixels (RMS)"
+            )
+
+
+def fit_lines(name: str, fitted: FittedExperiment, _: bool) -> Iterator[str]:
+    """Yield the distances of each camera's points from the fitted surface."""
+    for camera, error in (fitted.depth or {}).items():
+        yield f"depth of {camera} in '{name}': {_distance_text(error)}"
+
+
+def error_texts(error: PredictionErrors, _: Units) -> Iterator[str]:
+    """Yield the distances of each camera's points from a predicted surface."""
+    for camera, distances in (error.depth or {}).items():
+        yield f"depth of {camera} {_distance_text(distances)}"
+
+
+def brief_texts(error: PredictionErrors) -> Iterator[str]:
+    """Yield the RMS distance of each camera with points near the body."""
+    for name, distances in (error.depth or {}).items():
+        if distances.rms_m is not None:
+            yield f"{name}: {number(1e3 * distances.rms_m, 3)} mm RMS"
+
+
+def _distance_text(error: DepthError) -> str:
+    """Return the distances of a depth camera's points from the surface, in words."""
+    if error.rms_m is None:
+        return "no point near the body"
+    sentence = f"{1e3 * error.rms_m:.3g} mm RMS of {error.points} points"
+    gate = f"the gate of {1e3 * error.gate_m:.3g} mm"
+    if not error.share_beyond_gate:
+        return f"{sentence}, all within {gate}"
+    beyond = f"{sentence}, {error.share_beyond_gate:.0%} beyond {gate}"
+    if error.rms_within_gate_m is None:
+        return beyond
+    return f"{beyond}, the others {1e3 * error.rms_within_gate_m:.3g} mm RMS"
+
+
+DEPTH = Feature(
+    "depth",
+    instruments=instruments,
+    require_valid=require_depth_units,
+    predict=predict,
+    reason_against_copy=reason_against_copy,
+    errors=errors,
+    misfits=misfits,
+    step_differences=step_differences,
+    hypotheses=camera_hypotheses,
+    simulated_hypotheses=simulated_hypotheses,
+    fit_hypotheses=fit_hypotheses,
+    part_concerns=part_concerns,
+    simulation_concerns=simulation_concerns,
+    validation_concerns=validation_concerns,
+    notes=notes,
+    excluded_loss=excluded_loss,
+    fit_fields=fit_fields,
+    fit_lines=fit_lines,
+    error_texts=error_texts,
+    brief_texts=brief_texts,
+)

@@ -1,0 +1,131 @@
+"""Markers in checks and runs: predicted positions and their errors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from ..common.array_types import Array, root_mean
+from ..program.collocation import ExperimentIterate
+from ..program.simulation import Trajectory
+from ..program.transcription import Transcription
+from ..recording.experiment import Experiment
+from .feature import Feature, Units
+from .measurement_results import (
+    InstrumentMisfit,
+    InstrumentPrediction,
+    PredictionErrors,
+    misfit,
+)
+
+
+def predict(
+    segment: Transcription, trajectory: Trajectory, phi: Array
+) -> dict[str, Any]:
+    """Return the predicted marker positions (T, M, 3) [m]."""
+    return {
+        "markers_m": segment.markers.predict_samples(
+            trajectory.positions_m, phi
+        )
+    }
+
+
+def copied(experiment: Experiment, other: Experiment) -> dict[str, Any]:
+    """Return the measured positions of another recording in the order of the experiment's markers;
+    NaN where missing.
+    """
+    markers = other.markers
+    order = [markers.names.index(name) for name in experiment.markers.names]
+    known_m = np.where(
+        markers.is_present[..., None], markers.positions_m, np.nan
+    )
+    return {"markers_m": known_m[:, order]}
+
+
+def copied_times_s(
+    experiment: Experiment, other: Experiment
+) -> Iterable[tuple[Array, Array]]:
+    """Return the times of both recordings if the experiment has a marker sample."""
+    if experiment.markers.sample_count:
+        return ((experiment.t_s, other.t_s),)
+    return ()
+
+
+def reason_against_copy(experiment: Experiment, other: Experiment) -> str:
+    """Return that the recordings have different markers; "" if they have the same."""
+    own = set(experiment.markers.names)
+    return "other markers" if own != set(other.markers.names) else ""
+
+
+def errors(
+    experiment: Experiment, predicted: InstrumentPrediction
+) -> dict[str, Any]:
+    """Return RMS and largest distance of the markers [m]; None without any."""
+    markers = experiment.markers
+    distance_m = np.linalg.norm(
+        predicted.markers_m - markers.positions_m, axis=2
+    )
+    present_m = distance_m[markers.is_present & np.isfinite(distance_m)]
+    return {
+        "rms_m": root_mean(present_m**2) if present_m.size else None,
+        "max_m": float(present_m.max()) if present_m.size else None,
+    }
+
+
+def misfits(
+    experiment: Experiment, predicted: InstrumentPrediction
+) -> Iterator[InstrumentMisfit]:
+    """Yield the differences of all markers together, over their σ; nothing without a sample."""
+    markers = experiment.markers
+    if not markers.is_present.any():
+        return
+    difference_m = (predicted.markers_m - markers.positions_m)[
+        markers.is_present
+    ]
+    sigma_m = np.broadcast_to(markers.sigma_m, markers.is_present.shape)[
+        markers.is_present
+    ]
+    rms_m = root_mean(np.sum(difference_m**2, axis=1))
+    yield misfit(
+        "the markers",
+        "sigma_m",
+        ratio=difference_m / sigma_m[:, None],
+        size=f"{1e3 * rms_m:.3g} mm RMS",
+    )
+
+
+def step_differences(
+    part: ExperimentIterate,
+    trajectory: Trajectory,
+    _: InstrumentPrediction,
+    share: float,
+) -> Iterator[Array]:
+    """Yield the changes (T, M, 3) of the residuals of the markers; zero where not predicted."""
+    segment = part.segment
+    fitted_m = segment.markers.predict_positions(part.x, part.phi)
+    way_m = share * (trajectory.markers_m - fitted_m)
+    yield np.nan_to_num(way_m / segment.experiment.markers.sigma_m[:, None])
+
+
+def error_texts(error: PredictionErrors, _: Units) -> Iterator[str]:
+    """Yield RMS and largest distance in words; nothing without markers."""
+    if error.rms_m:
+        yield (
+            f"{1e3 * error.rms_m:.3f} mm RMS, at most "
+            f"{1e3 * (error.max_m or 0.0):.2f} mm"
+        )
+
+
+MARKERS = Feature(
+    "markers",
+    predict=predict,
+    copied=copied,
+    copied_times_s=copied_times_s,
+    reason_against_copy=reason_against_copy,
+    errors=errors,
+    misfits=misfits,
+    step_differences=step_differences,
+    error_texts=error_texts,
+)

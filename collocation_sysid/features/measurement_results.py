@@ -1,0 +1,304 @@
+"""Predictions of measurements and their errors, as simulations and `result.json` contain them.
+
+The fields of each class name the kinds of measurements; which functions compute them is declared by
+the features, see `feature`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..common.array_types import Array, root_mean
+from ..common.serialisation import optional
+from ..program.contact.contact_summary import FrictionSummary
+from ..program.depth.depth_comparison import DepthError, SurfaceComparison
+
+
+@dataclass(frozen=True)
+class PredictionErrors:
+    """Differences between a prediction and the measurements; None for what is not measured.
+
+    Attributes
+    ----------
+    rms_m, max_m : float or None
+        RMS and largest distance of the markers from their measurements.
+    wrench_rms_n, wrench_rms_nm : float or None
+        Root mean square of the components of force and torque.
+    reading_rms : mapping of name to float, or None
+        RMS difference of custom sensors, in their units.
+    depth : mapping of the camera's name to DepthError, or None
+        Distances of the points of depth cameras from the predicted surface.
+    """
+
+    rms_m: float | None = None
+    max_m: float | None = None
+    wrench_rms_n: float | None = None
+    wrench_rms_nm: float | None = None
+    reading_rms: Mapping[str, float] | None = None
+    depth: Mapping[str, DepthError] | None = None
+
+
+@dataclass(frozen=True)
+class CopyError:
+    """Differences between the measurements of a recording and those of a fitted one.
+
+    Attributes
+    ----------
+    copied : str
+        The name of the fitted recording that is nearest.
+    error : PredictionErrors
+        Errors of its measurements as a prediction.
+    """
+
+    copied: str
+    error: PredictionErrors
+
+
+@dataclass(frozen=True)
+class InstrumentMisfit:
+    """Differences between a prediction and the measurements of one kind, in stated σ.
+
+    Attributes
+    ----------
+    what : str
+        What is measured, for people.
+    sigma_key : str
+        Key of σ in the problem, for people.
+    sigmas : float
+        Root mean square of the differences over σ.
+    robust_sigmas : float
+        The same without outliers of depth, see `DepthError`; predictions are judged by it.
+    count : int
+        Number of measured values.
+    size : str
+        Root mean square in a unit, for people; empty if units differ.
+    """
+
+    what: str
+    sigma_key: str
+    sigmas: float
+    robust_sigmas: float
+    count: int
+    size: str = ""
+
+
+@dataclass(frozen=True)
+class InstrumentPrediction:
+    """Predictions of a recording's instruments by a simulation, or by another recording.
+
+    Attributes
+    ----------
+    markers_m : (T, M, 3)
+        Marker positions; NaN where nothing is predicted.
+    wrenches : sequence of (S, 6)
+        Force [N] and torque [N m] of each sensor, at its own times.
+    readings : mapping of name to (S, m)
+        Values of custom sensors.
+    surfaces : mapping of the name of a depth camera to SurfaceComparison
+        Points of depth cameras against the predicted surface; empty for another recording.
+    """
+
+    markers_m: Array
+    wrenches: Sequence[Array] = ()
+    readings: Mapping[str, Array] = field(default_factory=dict)
+    surfaces: Mapping[str, SurfaceComparison] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FittedExperiment:
+    """Residuals of the fit of an experiment.
+
+    Attributes
+    ----------
+    rms_m : float
+        RMS distance of the markers from the fit [m]; 0 without markers.
+    samples, missing : int
+        Numbers of marker samples that are present, and that are missing.
+    static : bool
+        Whether it is a series of equilibria.
+    notes : tuple of str
+        Sentences on the nuisance parameters of this recording.
+    wrench_rms_n, wrench_rms_nm : float or None
+        RMS differences of forces [N] and torques [N m]; None if not measured.
+    reading_rms : mapping of name to float, or None
+        RMS differences of custom sensors in their units; None without any.
+    wrench_sigma_n, wrench_sigma_nm : float or None
+        Stated standard deviations of the noise of forces [N] and torques [N m]; None if not
+        measured.
+    reading_sigma : mapping of name to float, or None
+        Stated standard deviations of the noise of custom sensors; None without any.
+    reading_unit : mapping of name to str, or None
+        Units of the custom sensors that state one; None if none does.
+    friction : mapping of obstacle to FrictionSummary, or None
+        Friction of the obstacles that have some; None without any.
+    depth : mapping of depth camera to DepthError, or None
+        Distances of its points from the fitted surface; None without depth cameras.
+    air_density_kg_m3 : float
+        Density of the air around the body in the model; zero in a vacuum.
+    test : str or None
+        Kind of material test of a specimen without a mesh; None for other experiments.
+    """
+
+    rms_m: float
+    samples: int
+    missing: int
+    static: bool
+    notes: tuple[str, ...]
+    wrench_rms_n: float | None = optional()
+    wrench_rms_nm: float | None = optional()
+    reading_rms: Mapping[str, float] | None = optional()
+    wrench_sigma_n: float | None = optional()
+    wrench_sigma_nm: float | None = optional()
+    reading_sigma: Mapping[str, float] | None = optional()
+    reading_unit: Mapping[str, str] | None = optional()
+    friction: Mapping[str, FrictionSummary] | None = optional()
+    depth: Mapping[str, DepthError] | None = optional()
+    air_density_kg_m3: float = 0.0
+    test: str | None = optional()
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """Residuals of the fit of all experiments.
+
+    Attributes
+    ----------
+    rms_m, noise_rms_m : float
+        RMS distance of all markers, and that expected from the stated noise.
+    experiments : mapping of name to FittedExperiment
+        Residuals of each fitted experiment.
+    wrench_rms_n, wrench_rms_nm : float or None
+        RMS differences of all forces and torques.
+    symmetry : mapping of experiment to int, optional
+        Of experiments whose loads are reported for the whole specimen: ratio of these to the loads
+        of the modelled part. Energies of friction and nuisance parameters are those of the modelled
+        part.
+    """
+
+    rms_m: float
+    noise_rms_m: float
+    experiments: Mapping[str, FittedExperiment]
+    wrench_rms_n: float | None = optional()
+    wrench_rms_nm: float | None = optional()
+    symmetry: Mapping[str, int] | None = optional()
+
+
+@dataclass(frozen=True)
+class SimulatedExperiment:
+    """Errors of the forward simulation of an experiment; if `failed` is set, all else but `fitted`
+    is None.
+
+    Attributes
+    ----------
+    fitted : bool
+        Whether the experiment was fitted, not only predicted.
+    failed : str or None
+        Why there is no simulation; None if there is one.
+    rms_m, max_m : float or None
+        RMS and largest distance of the markers [m]; 0 without markers.
+    wrench_rms_n, wrench_rms_nm : float or None
+        RMS differences of forces [N] and torques [N m]; None if not measured.
+    reading_rms : mapping of name to float, or None
+        RMS differences of custom sensors in their units; None without any.
+    reading_unit : mapping of name to str, or None
+        Units of the custom sensors that state one; None if none does.
+    nuisance, places_m : mapping or None
+        Nuisance parameters and marker places that were fitted to a recording for validation; empty
+        for fitted experiments.
+    depth : mapping of depth camera to DepthError, or None
+        Distances of its points from the simulated surface; None without depth cameras.
+    blind : PredictionErrors or None
+        Of an experiment for validation, with the nuisance parameters of the fitted recordings in
+        place of its own; None where that cannot be simulated, and for fitted experiments.
+    copied : CopyError or None
+        Of an experiment for validation, with the measurements of the nearest fitted recording as
+        the prediction; None if there is no such copy.
+    not_copied : str or None
+        Why there is no such copy; empty for fitted experiments.
+    """
+
+    fitted: bool
+    failed: str | None = optional()
+    rms_m: float | None = optional()
+    max_m: float | None = optional()
+    reading_unit: Mapping[str, str] | None = optional()
+    nuisance: Mapping[str, float] | None = optional()
+    places_m: Mapping[str, tuple[float, ...]] | None = optional()
+    wrench_rms_n: float | None = optional()
+    wrench_rms_nm: float | None = optional()
+    reading_rms: Mapping[str, float] | None = optional()
+    depth: Mapping[str, DepthError] | None = optional()
+    blind: PredictionErrors | None = optional()  # noqa: RUF009, it returns a field
+    copied: CopyError | None = optional()  # noqa: RUF009, it returns a field
+    not_copied: str | None = optional()
+
+
+@dataclass(frozen=True)
+class ForwardResult:
+    """Forward simulations with the estimates.
+
+    Attributes
+    ----------
+    rms_m, max_m : float or None
+        RMS and largest distance of the markers of all fitted experiments; None without any.
+    experiments : mapping of name to SimulatedExperiment
+        Results of each experiment, also of those for validation.
+    """
+
+    rms_m: float | None
+    max_m: float | None
+    experiments: Mapping[str, SimulatedExperiment]
+
+
+def misfit(
+    what: str, declared_size: str, ratio: Array, size: str = ""
+) -> InstrumentMisfit:
+    """Return the misfit of one instrument; its RMS is that of the values that are finite.
+
+    Parameters
+    ----------
+    what : str
+        The instrument, for messages.
+    declared_size : str
+        Name of its stated σ, for messages.
+    ratio : array
+        Differences over σ; NaN is ignored.
+    size : str
+        RMS with its unit, for messages; "" if there is none.
+    """
+    known = ratio[np.isfinite(ratio)]
+    sigmas = root_mean(known**2)
+    return InstrumentMisfit(
+        what,
+        declared_size,
+        sigmas=sigmas,
+        robust_sigmas=sigmas,
+        count=known.size,
+        size=size,
+    )
+
+
+def main_error(error: PredictionErrors) -> float:
+    """Return the RMS distance of the markers [m], without markers the RMS difference of the forces
+    [N]; infinity if neither is compared.
+    """
+    return error.rms_m or error.wrench_rms_n or float("inf")
+
+
+def comparison_columns(
+    t_s: Array, measured: Array, *models: Array | None
+) -> Array:
+    """Return the columns time, measured values and the values of each model, as one array (S, 1 + m
+    (1 + number of models)).
+
+    `t_s` is (S,), `measured` and each of `models` (S, m); the columns of a model that is None are
+    NaN.
+    """
+    columns = (
+        np.full_like(measured, np.nan) if each is None else each
+        for each in models
+    )
+    return np.column_stack([t_s, measured, *columns])

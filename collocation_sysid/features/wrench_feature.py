@@ -1,0 +1,268 @@
+"""Measured wrenches of grasps and obstacles in checks and runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..common.array_types import Array, root_mean
+from ..common.display import number, short
+from ..methods.solution import Solution, pooled_wrench_rms, wrench_rms
+from ..program.collocation import ExperimentIterate
+from ..program.simulation import Trajectory
+from ..program.transcription import Transcription
+from ..recording.experiment import Experiment
+from ..statistics.assessment import forward_simulation_concerns
+from ..statistics.concerns import Concern
+from ..statistics.misspecification.misspecification_hypothesis import (
+    Hypothesis,
+    rank,
+)
+from ..statistics.misspecification.plausibility import load_sign_hypotheses
+from ..statistics.misspecification.wrench_causes import (
+    CHECKED_SAMPLES,
+    wrench_causes,
+    wrench_mistakes,
+)
+from .feature import Feature, SimulatedCheck, Units
+from .measurement_results import (
+    FittedExperiment,
+    InstrumentMisfit,
+    InstrumentPrediction,
+    PredictionErrors,
+    comparison_columns,
+    misfit,
+)
+
+# Longest fit of the first samples to the markers that needs no request [s].
+LONGEST_FIT_S = 10.0
+
+
+def instruments(experiment: Experiment) -> list[str]:
+    """Return one text if any wrench is measured."""
+    return ["the wrench"] * bool(experiment.wrenches)
+
+
+def predict(
+    segment: Transcription, trajectory: Trajectory, phi: Array
+) -> dict[str, Any]:
+    """Return the predicted force and torque (S, 6) of each sensor."""
+    grid, reactions = trajectory.reactions
+    return {
+        "wrenches": [
+            sensor.on_grid(grid).predict_reactions(reactions, phi)
+            for sensor in segment.sensors
+        ]
+    }
+
+
+def copied(_: Experiment, other: Experiment) -> dict[str, Any]:
+    """Return the measured wrenches of another recording."""
+    return {"wrenches": [each.values for each in other.wrenches]}
+
+
+def copied_times_s(
+    experiment: Experiment, other: Experiment
+) -> Iterable[tuple[Array, Array]]:
+    """Return the sample times of each sensor in both recordings."""
+    pairs = zip(experiment.wrenches, other.wrenches, strict=True)
+    return [(own.t_s, theirs.t_s) for own, theirs in pairs]
+
+
+def reason_against_copy(experiment: Experiment, other: Experiment) -> str:
+    """Return that the recordings have different numbers of sensors; "" if the same."""
+    differ = len(experiment.wrenches) != len(other.wrenches)
+    return "other wrenches" if differ else ""
+
+
+def errors(
+    experiment: Experiment, predicted: InstrumentPrediction
+) -> dict[str, Any]:
+    """Return the RMS differences of force [N] and torque [N m]; None where not measured."""
+    force_n, torque_nm = wrench_rms(experiment, predicted.wrenches)
+    return {"wrench_rms_n": force_n, "wrench_rms_nm": torque_nm}
+
+
+def misfits(
+    experiment: Experiment, predicted: InstrumentPrediction
+) -> Iterator[InstrumentMisfit]:
+    """Yield the differences of each sensor over its σ."""
+    pairs = zip(predicted.wrenches, experiment.wrenches, strict=True)
+    for values, sensor in pairs:
+        ratio = (values - sensor.values) / sensor.sigmas
+        yield misfit("the wrench", "sigma_n", ratio=ratio)
+
+
+def step_differences(
+    part: ExperimentIterate,
+    _: Trajectory,
+    predicted: InstrumentPrediction,
+    share: float,
+) -> Iterator[Array]:
+    """Yield the changes (S, 2, 3) of the residuals of each sensor, force and torque; zero where not
+    predicted.
+    """
+    sensors = part.segment.sensors
+    fitted = part.predict_wrenches() if sensors else []
+    rows = zip(sensors, fitted, predicted.wrenches, strict=True)
+    for sensor, of_fit, of_simulation in rows:
+        way = share * np.nan_to_num(
+            (of_simulation - of_fit) / sensor.wrench.sigmas
+        )
+        yield way.reshape(-1, 2, 3)
+
+
+def simulated_hypotheses(
+    check: SimulatedCheck,
+) -> tuple[Sequence[Hypothesis], Sequence[str]]:
+    """Return likely errors of wrenches, by a fit of the first samples to the markers.
+
+    Nothing is compared without wrenches and markers in one recording, or if another error is
+    likely; if the fit takes long, a note says so.
+    """
+    has_both = any(
+        each.wrenches and each.markers.sample_count
+        for each in check.problem.experiments
+    )
+    if not has_both or check.causes:
+        return (), ()
+    fit_s = check.fit_s(CHECKED_SAMPLES)
+    if not check.is_full and fit_s > LONGEST_FIT_S:
+        note = (
+            "the wrenches were not compared with the prediction from the markers, which would "
+            f"take about {fit_s:.2g} s; check --full does it"
+        )
+        return (), (note,)
+    check.report_progress(
+        "comparing the wrenches with the prediction from the markers"
+    )
+    return rank(wrench_mistakes(check.collocation)), ()
+
+
+def fit_hypotheses(solution: Solution) -> list[Hypothesis]:
+    """Return likely errors of wrenches, by the residuals of a fit and by the signs of loads."""
+    return [
+        *wrench_causes(solution),
+        *(
+            hypothesis
+            for segment in solution.collocation.transcriptions
+            for hypothesis in load_sign_hypotheses(segment.experiment)
+        ),
+    ]
+
+
+def recorded(
+    experiment: Experiment,
+    solution: Solution,
+    predicted: InstrumentPrediction | None,
+    _: Array,
+) -> dict[str, Any]:
+    """Return an array (S, 19) for each sensor: time, and the wrench measured, fitted and simulated.
+
+    The wrenches are those of the whole specimen also where symmetry reduces the model to a part of
+    it. NaN where the experiment was not fitted or not simulated.
+    """
+    sensors = experiment.wrenches
+    unknown = [None] * len(sensors)
+    fitted = solution.wrenches.get(experiment.name, unknown)
+    simulated = unknown if predicted is None else predicted.wrenches
+    series = []
+    for sensor, *models in zip(sensors, fitted, simulated, strict=True):
+        columns = comparison_columns(sensor.t_s, sensor.values, *models)
+        columns[:, 1:] *= sensor.symmetry
+        series.append(columns)
+    return {"wrenches": series}
+
+
+def validation_concerns(
+    name: str, error: PredictionErrors, solution: Solution
+) -> list[Concern]:
+    """Return a concern if the predicted force is much worse than the forces of the fit."""
+    fit_n = pooled_wrench_rms(solution)[0]
+    if error.wrench_rms_n is None or fit_n is None:
+        return []
+    return forward_simulation_concerns(
+        f"{name}/force",
+        error.wrench_rms_n,
+        fit_rms_m=fit_n,
+        noise_rms_m=0.0,
+        is_fitted=False,
+    )
+
+
+def fit_fields(part: ExperimentIterate, solution: Solution) -> dict[str, Any]:
+    """Return RMS residuals and stated σ of force [N] and torque [N m], of the whole specimen."""
+    name = part.segment.experiment.name
+    force_n, torque_nm = solution.wrench_rms.get(name, (None, None))
+    squares = [
+        (sensor.wrench.symmetry * sensor.wrench.sigmas) ** 2
+        * np.where(sensor.wrench.measured_components, 1.0, np.nan)
+        for sensor in part.segment.sensors
+    ]
+    of_force, of_torque = (
+        root_mean(each[np.isfinite(each)]) or None
+        for each in np.array(squares).reshape(-1, 2, 3).swapaxes(0, 1)
+    )
+    return {
+        "wrench_rms_n": force_n,
+        "wrench_rms_nm": torque_nm,
+        "wrench_sigma_n": of_force,
+        "wrench_sigma_nm": of_torque,
+    }
+
+
+def pooled_fields(solution: Solution) -> dict[str, Any]:
+    """Return the RMS residuals of all forces [N] and torques [N m]."""
+    force_n, torque_nm = pooled_wrench_rms(solution)
+    return {"wrench_rms_n": force_n, "wrench_rms_nm": torque_nm}
+
+
+def fit_lines(name: str, fitted: FittedExperiment, _: bool) -> Iterator[str]:
+    """Yield RMS residuals with σ; nothing without sensors."""
+    if sizes := _forces_text(fitted.wrench_rms_n, fitted.wrench_rms_nm):
+        sigma = _forces_text(fitted.wrench_sigma_n, fitted.wrench_sigma_nm)
+        yield f"wrench of '{name}': {sizes} RMS (sigma {sigma})"
+
+
+def error_texts(error: PredictionErrors, _: Units) -> Iterator[str]:
+    """Yield the RMS differences of force and torque; nothing without any."""
+    if forces := _forces_text(error.wrench_rms_n, error.wrench_rms_nm):
+        yield f"{forces} RMS"
+
+
+def brief_texts(error: PredictionErrors) -> Iterator[str]:
+    """Yield the RMS difference of the force; nothing without any."""
+    if error.wrench_rms_n is not None:
+        yield f"force: {number(error.wrench_rms_n, 3)} N RMS"
+
+
+def _forces_text(*sizes: float | None) -> str:
+    """Return RMS or σ of a force [N] and a torque [N m], in this order, in words; sizes that are
+    None or zero are left out.
+    """
+    pairs = zip(sizes, ("N", "N m"), strict=True)
+    return ", ".join(f"{short(size)} {unit}" for size, unit in pairs if size)
+
+
+WRENCH = Feature(
+    "wrench",
+    instruments=instruments,
+    predict=predict,
+    copied=copied,
+    copied_times_s=copied_times_s,
+    reason_against_copy=reason_against_copy,
+    errors=errors,
+    misfits=misfits,
+    step_differences=step_differences,
+    simulated_hypotheses=simulated_hypotheses,
+    fit_hypotheses=fit_hypotheses,
+    validation_concerns=validation_concerns,
+    recorded=recorded,
+    fit_fields=fit_fields,
+    pooled_fields=pooled_fields,
+    fit_lines=fit_lines,
+    error_texts=error_texts,
+    brief_texts=brief_texts,
+)
