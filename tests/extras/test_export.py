@@ -1288,7 +1288,7 @@ def pressed_block(
 @pytest.mark.parametrize("name", SOLIDS)
 def test_facets_lie_on_the_surface_of_their_solid_and_look_out_of_it(name):
     solid, about_m = SOLIDS[name], np.array([0.02, 0.02, 0.02])
-    facets = Facets.from_solid(solid, about_m, 0.1, depth_m=2e-5)
+    facets = Facets.from_solid(solid, about_m, 0.1, tolerance_m=2e-5)
     gap = ca.Function(
         "gap", [place := ca.SX.sym("p", 3)], [solid.signed_distance(place)]
     )

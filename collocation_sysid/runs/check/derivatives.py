@@ -77,9 +77,7 @@ def derivative_errors(
     step = _difference_step(collocation)
     program = with_lifted_variables(collocation)
     plain = collocation
-    if (
-        program is not collocation
-    ):  # methods use these without memory and wrenches as variables
+    if program is not collocation:  # gradients alone need no such variables
         of_slopes = _slope_error(
             plain.objective, plain.gradient, z=z, rng=rng, step=step
         )
