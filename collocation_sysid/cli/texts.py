@@ -302,7 +302,10 @@ def _allowed_values_text(option: Mapping[str, Any]) -> str:
     0"; for an array the words are about its items.
     """
     if "enum" in option:
-        return ", ".join(option["enum"])
+        return ", ".join(
+            each if isinstance(each, str) else json.dumps(each)
+            for each in option["enum"]
+        )
     if option["type"] == "array":
         return f"list, each a {_allowed_values_text(option['items'])}"
     limits = {"exclusiveMinimum": "above", "minimum": "of at least"}

@@ -170,6 +170,7 @@ def test_an_option_is_told_with_its_default_and_what_it_can_be():
         in told
     )
     assert "by more than 10 %" in told
+    assert "coarse_start auto auto, false; " in told
     reference = " ".join(run_command("methods", "interior-point").out.split())
     assert (
         "all of them once parameters move by less than `warm_up`" in reference

@@ -284,7 +284,7 @@ def test_starts_are_the_best_stiffness_its_neighbours_and_other_minima():
 
 @pytest.mark.long
 def test_a_soft_bar_is_found_without_a_guess_from_a_camera_that_is_off():
-    """Its scan is best at 13.9 kPa, from where the search ended at 16 kPa instead of 25."""
+    """Its scan is best at 13.9 kPa, from where a search without outlines ends at 16 kPa, not 25."""
     from study_depth import SOFT_TRUTH, soft_problem  # pyright: ignore[reportMissingImports]
 
     solution = cs.solve(soft_problem(0))
@@ -296,11 +296,8 @@ def test_a_soft_bar_is_found_without_a_guess_from_a_camera_that_is_off():
     (said,) = (
         note for note in solution.notes if "initial values of the scan" in note
     )
-    assert "local minima" in said
+    assert "were solved to the end" in said
     assert solution.scan is not None
-    assert solution.scan.young_pa[solution.scan.best] == pytest.approx(
-        3.16e4, rel=0.01
-    )
 
 
 @pytest.mark.long
