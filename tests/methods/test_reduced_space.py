@@ -210,7 +210,7 @@ def test_a_guess_that_cannot_be_simulated_is_a_status_that_tells_what_to_change(
     assert solution.status is Status.NOT_SIMULABLE
     for part in (
         "stiffer or less damped parameters",
-        "rest state",
+        "loses its stability",
         "t = 0 s, element ",
     ):
         assert part in solution.message
