@@ -125,10 +125,13 @@ class IntervalCoordinate:
             return value if self.is_linear else float(np.log(value))
 
     def to_value(self, x: float) -> float:
-        """Return the value of a coordinate x: the inverse of `from_value`."""
-        if self.is_odds:
-            return float(0.5 / (1 + np.exp(-x)))
-        return x if self.is_linear else float(np.exp(x))
+        """Return the value of a coordinate x: the inverse of `from_value`. Beyond the range of
+        floats it is the end of the domain, 0 or infinity; for Poisson's ratio 0 or 0.5.
+        """
+        with np.errstate(over="ignore"):
+            if self.is_odds:
+                return float(0.5 / (1 + np.exp(-x)))
+            return x if self.is_linear else float(np.exp(x))
 
 
 def correlation_from_covariance(covariance: Array) -> Array:

@@ -323,7 +323,8 @@ def test_noise_that_persists_from_image_to_image_widens_the_interval():
             .statistical95
         )
         widths.append(np.log(high / low))
-    assert 2 < widths[1] / widths[0] < 4.4
+    # Both autocorrelations are estimated, which moves the ratio by some percent.
+    assert 2 < widths[1] / widths[0] < 5.0
 
 
 @pytest.mark.slow
