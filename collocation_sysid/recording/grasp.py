@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING, Literal, Self, get_args
@@ -236,21 +236,7 @@ def free_rigid_motions(
     """
     if not is_prescribed.any():
         return ["translate and rotate as a rigid body"]
-    about = points_m[is_prescribed.any(axis=1)].mean(axis=0)
-    arms = points_m - about
-    size_m = (
-        float(np.linalg.norm(arms[is_prescribed.any(axis=1)], axis=1).max())
-        or 1.0
-    )
-    turned = np.stack(
-        [np.cross(axis, arms / size_m) for axis in np.eye(3)], axis=2
-    )
-    modes = np.concatenate(
-        [np.broadcast_to(np.eye(3), turned.shape), turned], axis=2
-    )[is_prescribed]
-    _, values, directions = np.linalg.svd(modes)
-    rank = int((values > SMALLEST_SINGULAR_VALUE * values[0]).sum())
-    free = directions[rank:]
+    free = free_rigid_modes(points_m, is_prescribed).coordinates
     if not len(free):
         return []
     # Free motions without rotation, and the axes of the free rotations.
@@ -266,6 +252,51 @@ def free_rigid_motions(
             for d in _axis_aligned_basis(rotations)
         ),
     ]
+
+
+@dataclass(frozen=True, eq=False)
+class FreeRigidModes:
+    """Infinitesimal rigid motions that do not move prescribed coordinates.
+
+    Attributes
+    ----------
+    coordinates : (k, 6) array
+        Orthonormal basis of the free motions: translations along the axes, then rotations about
+        them, those over the distance of the farthest held node from the centre of the held nodes.
+    displacements : (n, 3, k) array
+        Displacements of all nodes in these motions.
+    """
+
+    coordinates: Array
+    displacements: Array
+
+
+def free_rigid_modes(
+    points_m: Array, is_prescribed: NDArray[np.bool_]
+) -> FreeRigidModes:
+    """Return the rigid motions that prescribed coordinates leave free, to first order.
+
+    Parameters
+    ----------
+    points_m : (n, 3) array
+        Node positions [m].
+    is_prescribed : (n, 3) array of bool
+        Whether each coordinate is prescribed; at least one is.
+    """
+    held = is_prescribed.any(axis=1)
+    arms_m = points_m - points_m[held].mean(axis=0)
+    size_m = float(np.linalg.norm(arms_m[held], axis=1).max()) or 1.0
+    rotations = np.stack(
+        [np.cross(axis, arms_m / size_m) for axis in np.eye(3)], axis=2
+    )
+    translations = np.broadcast_to(np.eye(3), rotations.shape)
+    modes = np.concatenate([translations, rotations], axis=2)
+    # The triangular factor has the same singular values and at most six rows.
+    factor = np.linalg.qr(modes[is_prescribed], mode="r")
+    _, values, directions = np.linalg.svd(factor)
+    rank = int((values > SMALLEST_SINGULAR_VALUE * values[0]).sum())
+    free = directions[rank:]
+    return FreeRigidModes(free, displacements=modes @ free.T)
 
 
 def _null_space(matrix: Array) -> Array:

@@ -7,8 +7,6 @@ tangential reactions of the faces vanish, linearised about the equilibrium with 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
@@ -17,7 +15,7 @@ from scipy.sparse.linalg import splu
 from ...common.array_types import Array, Index
 from ...program.experiment_iterate import ExperimentIterate
 from ...recording.experiment import Experiment
-from ...recording.grasp import Grasp
+from ...recording.grasp import Grasp, free_rigid_modes
 from ...recording.measurement_selection import is_load_only
 
 # Relative tolerance of the flatness of a face, and of a node that lies in a plane: rounding of mesh
@@ -26,9 +24,6 @@ FLATNESS = 1e-4
 # Largest tensile reaction of a face over its largest compressive one for which it may slide: above,
 # the face is bonded, since a platen does not pull. Errors of the zero remain below.
 LARGEST_TENSION = 0.2
-# Singular values of the prescribed components of rigid motions, relative to the largest, below
-# which a rigid motion is free: rounding.
-SMALLEST_SINGULAR_VALUE = 1e-6
 
 
 def slip_displacements_m(
@@ -187,9 +182,12 @@ def _relaxed(
         If the equations are singular.
     """
     moving = np.setdiff1d(np.arange(len(force_n)), kept)
-    modes = np.array(list(_free_rigid_motions(positions_m, kept))).reshape(
-        -1, len(force_n)
-    )[:, moving]
+    is_kept: NDArray[np.bool_] = np.zeros(len(force_n), dtype=bool)
+    is_kept[kept] = True
+    free = free_rigid_modes(
+        positions_m.reshape(-1, 3), is_kept.reshape(-1, 3)
+    ).displacements.reshape(len(force_n), -1)
+    modes = (free / np.linalg.norm(free, axis=0)).T[:, moving]
     # Units of the border: a stiffness, so that pivots are comparable.
     scale = float(np.abs(stiffness.diagonal()).mean())
     border = sp.csc_array(scale * modes)
@@ -201,23 +199,3 @@ def _relaxed(
     moved_m = np.zeros(len(force_n))
     moved_m[moving] = splu(matrix).solve(right)[: len(moving)]
     return moved_m
-
-
-def _free_rigid_motions(positions_m: Array, kept: Index) -> Iterator[Array]:
-    """Yield rigid motions (3n,) of unit length that do not move the kept dofs, to first order about
-    the positions (3n,) [m].
-    """
-    points_m = positions_m.reshape(-1, 3)
-    arms_m = points_m - points_m.mean(axis=0)
-    size_m = float(np.abs(arms_m).max())
-    translations = np.tile(np.eye(3), (len(points_m), 1))
-    rotations = np.stack(
-        [np.cross(axis, arms_m / size_m).ravel() for axis in np.eye(3)], axis=1
-    )
-    modes = np.concatenate([translations, rotations], axis=1)
-    _, values, directions = np.linalg.svd(modes[kept])
-    is_held: NDArray[np.bool_] = np.zeros(6, dtype=bool)
-    is_held[: len(values)] = values > SMALLEST_SINGULAR_VALUE * values.max()
-    for direction in directions[~is_held]:
-        mode = modes @ direction
-        yield mode / np.linalg.norm(mode)
