@@ -6,11 +6,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from .experiment import Experiment
-from .placement import place_markers
+from .experiment_on_body import experiment_on_body
 from .pressure import Pressure
 
 if TYPE_CHECKING:
-    from ..common.array_types import Array, Index
+    from ..common.array_types import Index
     from ..fem.coarse_body import CoarseBody
 
 
@@ -49,38 +49,17 @@ def coarse_experiment(
     InputError
         If the coarse body lacks what the experiment needs, such as a face of a pressure.
     """
-    body = experiment.body
-    coarse = relation.coarse
-    markers = experiment.markers
 
     def on_coarse_nodes(load):
         """Return a grasp, point mass or force with its nodes on the coarse body."""
         return replace(load, nodes=relation.coarse_nodes(load.nodes))
 
-    placement = place_markers(
-        markers.predict_positions(body.nodes_m),
-        coarse.nodes.points_m,
-        body=coarse,
-        attach="embedded",
-        max_distance_m=float("inf"),
-    )
-    return replace(
+    return experiment_on_body(
         experiment,
-        body=coarse,
-        grasps=(
-            *map(on_coarse_nodes, experiment.body_grasps),
-            *experiment.obstacles,
-        ),
-        masses=tuple(map(on_coarse_nodes, experiment.masses)),
-        forces=tuple(map(on_coarse_nodes, experiment.forces)),
-        pressures=tuple(
-            _coarse_pressure(each, relation) for each in experiment.pressures
-        ),
-        markers=replace(markers, placement=placement, places_m=None),
-        start_positions_m=_coarse_state(experiment.start_positions_m, relation),
-        start_velocities_m_s=_coarse_state(
-            experiment.start_velocities_m_s, relation
-        ),
+        relation.coarse,
+        move_load=on_coarse_nodes,
+        move_pressure=lambda pressure: _coarse_pressure(pressure, relation),
+        move_state=relation.coarse_values,
     )
 
 
@@ -92,8 +71,3 @@ def _coarse_pressure(pressure: Pressure, relation: CoarseBody) -> Pressure:
     return replace(
         pressure, faces=relation.coarse_faces(corners), body_measure=None
     )
-
-
-def _coarse_state(state: Array | None, relation: CoarseBody) -> Array | None:
-    """Return nodal vectors (n, 3) at the nodes of the coarse body, (m, 3); None for None."""
-    return None if state is None else relation.coarse_values(state)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from ..common.array_types import Array
 from ..fem.meshes.refinement import refine_nodes
 from .experiment import Experiment
+from .experiment_on_body import experiment_on_body
 from .placement import place_markers
 
 if TYPE_CHECKING:
@@ -29,7 +30,6 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
         Refined body of the same shape.
     """
     body = experiment.body
-    markers = experiment.markers
 
     def refined_load(load):
         """Return a grasp, point mass or force with its nodes on the finer body."""
@@ -40,42 +40,19 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
             ),
         )
 
-    placement = place_markers(
-        markers.predict_positions(body.nodes_m),
-        finer.nodes.points_m,
-        body=finer,
-        attach="embedded",
-        max_distance_m=float("inf"),
-    )
-    return replace(
+    return experiment_on_body(
         experiment,
-        body=finer,
-        grasps=(
-            *map(refined_load, experiment.body_grasps),
-            *experiment.obstacles,
-        ),
-        masses=tuple(map(refined_load, experiment.masses)),
-        forces=tuple(map(refined_load, experiment.forces)),
-        pressures=tuple(
-            pressure.on_refined_body(body, finer)
-            for pressure in experiment.pressures
-        ),
-        markers=replace(markers, placement=placement, places_m=None),
-        start_positions_m=_interpolated(
-            experiment.start_positions_m, body, finer=finer
-        ),
-        start_velocities_m_s=_interpolated(
-            experiment.start_velocities_m_s, body, finer=finer
-        ),
+        finer,
+        move_load=refined_load,
+        move_pressure=lambda pressure: pressure.on_refined_body(body, finer),
+        move_state=lambda state: _interpolated(state, body, finer=finer),
     )
 
 
-def _interpolated(state: Array | None, body: Body, finer: Body) -> Array | None:
+def _interpolated(state: Array, body: Body, finer: Body) -> Array:
     """Return nodal vectors `state` (n, 3) of a body, interpolated to the nodes (n', 3) of the finer
-    body by the shape functions; None for None.
+    body by the shape functions.
     """
-    if state is None:
-        return None
     here_m = finer.nodes.points_m
     there_m = body.nodes.points_m
     places = place_markers(here_m, there_m, body=body, attach="embedded")
