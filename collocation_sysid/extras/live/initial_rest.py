@@ -49,6 +49,7 @@ class InitialRest:
     body_size_m: float
     sigma_m: Array
     is_over: bool = False
+    _largest_rest_m: float = 0.0
     _first: list[Frame] = field(default_factory=list)
     _recent: deque[Frame] = field(
         default_factory=lambda: deque(maxlen=REPLAYED_FRAMES)
@@ -64,6 +65,7 @@ class InitialRest:
             self._first.append(frame)
             self._recent.append(frame)
             if len(self._first) == LONG_REST_FRAMES:
+                self._largest_rest_m = self._largest_displacement_at_rest_m()
                 self.is_over = not self._is_at_rest(self._first)
             return []
         if self._is_at_rest([frame]):
@@ -74,21 +76,26 @@ class InitialRest:
 
     def _is_at_rest(self, frames: list[Frame]) -> bool:
         """Return whether no grasp of these frames is displaced from the first frame by more than
-        noise, which the first frames show by the differences between consecutive poses.
+        noise; the first frames must be complete.
         """
         first = self._first[0]
+        return all(
+            self._displacement_m(frame, reference=first) <= self._largest_rest_m
+            for frame in frames
+        )
+
+    def _largest_displacement_at_rest_m(self) -> float:
+        """Return the largest displacement that is noise [m], from the differences between
+        consecutive poses of the first frames.
+        """
         steps_m = [
             self._displacement_m(after, reference=before)
             for before, after in pairwise(self._first)
         ]
         noise_m = float(np.sqrt(np.mean(np.square(steps_m)) / 2))
-        largest_m = max(
+        return max(
             LARGEST_REST_BODY_SIZES * self.body_size_m,
             LARGEST_REST_DEVIATIONS * noise_m,
-        )
-        return all(
-            self._displacement_m(frame, reference=first) <= largest_m
-            for frame in frames
         )
 
     def _displacement_m(self, frame: Frame, reference: Frame) -> float:
