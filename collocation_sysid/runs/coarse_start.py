@@ -83,21 +83,29 @@ class CoarseStart:
         )
 
     def given_collocation(
-        self, problem: Problem, solution: Solution
+        self, problem: Problem, solution: Solution, undetermined: Sequence[str]
     ) -> Collocation:
         """Return the program of the given problem with the parameters of a coarse solution as
-        guesses, within their bounds; of those that the coarse mesh does not determine, see
-        `undetermined_names`, the guess of the coarse solve.
+        guesses, within their bounds; of those that the coarse mesh does not determine, the guess of
+        the coarse solve.
+
+        Parameters
+        ----------
+        problem : Problem
+            Given problem.
+        solution : Solution
+            Solution on the coarse meshes.
+        undetermined : sequence of str
+            Parameters that it does not determine, see `undetermined_names`.
         """
         parameters = solution.collocation.parameters
-        excluded = undetermined_names(solution)
         estimates = solution.parameters
         values = {
             item.name: float(
                 np.clip(estimates[item.name], item.lower, item.upper)
             )
             for item in parameters.free
-            if item.name not in excluded
+            if item.name not in undetermined
         }
         return replace(
             problem.collocation(), parameters=parameters.with_guess(values)
@@ -234,7 +242,9 @@ def interrupted_solution(
     Its history has one entry, the evaluation at that point; no iteration was done on the given
     mesh.
     """
-    collocation = start.given_collocation(problem, coarse)
+    collocation = start.given_collocation(
+        problem, coarse, undetermined=undetermined_names(coarse)
+    )
     collocation = WarmStart.of(coarse).apply_to_places(collocation)
     z = start.variables(collocation, coarse)
     recorder = Recorder(ReducedSpace.name, collocation)
@@ -283,11 +293,11 @@ def undetermined_names(solution: Solution) -> tuple[str, ...]:
     return tuple(item.name for item, excluded in names if excluded)
 
 
-def require_plausible(solution: Solution) -> None:
-    """Raise `NoCoarseStartError` if a modulus of a coarse solution is not determined, see
-    `undetermined_names`: the coarse mesh then does not describe the motion.
+def require_determined_moduli(undetermined: Sequence[str]) -> None:
+    """Raise `NoCoarseStartError` if a modulus is among the parameters that a coarse solution does
+    not determine, see `undetermined_names`: the coarse mesh then does not describe the motion.
     """
-    for name in undetermined_names(solution):
+    for name in undetermined:
         if is_modulus(name):
             raise NoCoarseStartError(
                 f"the coarse mesh does not determine {symbol_of(name)}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -29,8 +29,9 @@ from .coarse_start import (
     interrupted_solution,
     mesh_error_note,
     plan_coarse_start,
-    require_plausible,
+    require_determined_moduli,
     start_note,
+    undetermined_names,
 )
 from .several_starts import follow_starts
 from .two_phases import solve_two_phases
@@ -206,11 +207,13 @@ def _solve_once(
             raise NoCoarseStartError(
                 f"the solve on {coarse_start.size} ended with: {coarse.message}"
             )
-        require_plausible(coarse)
+        undetermined = undetermined_names(coarse)
+        require_determined_moduli(undetermined)
         return _solve_from_coarse(
             problem,
             coarse_start,
             coarse=coarse,
+            undetermined=undetermined,
             solver=solver,
             watch=watch,
             workers=workers,
@@ -255,6 +258,7 @@ def _solve_from_coarse(
     coarse_start: CoarseStart,
     *,
     coarse: Solution,
+    undetermined: Sequence[str],
     solver: ReducedSpace,
     watch: Watch | None,
     workers: ExperimentExecutor | None,
@@ -270,6 +274,8 @@ def _solve_from_coarse(
     coarse_start : CoarseStart
     coarse : Solution
         Converged solution of `coarse_start.problem`.
+    undetermined : sequence of str
+        Parameters that it does not determine, see `undetermined_names`.
     solver, watch, workers
         See `_solve_directly`.
 
@@ -280,7 +286,9 @@ def _solve_from_coarse(
     InputError
         If the machine lacks memory.
     """
-    collocation = coarse_start.given_collocation(problem, coarse)
+    collocation = coarse_start.given_collocation(
+        problem, coarse, undetermined=undetermined
+    )
     try:
         require_memory(problem, collocation, method=solver)
     except InputError as error:
