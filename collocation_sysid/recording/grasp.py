@@ -290,7 +290,7 @@ def free_rigid_modes(
         [np.cross(axis, arms_m / size_m) for axis in np.eye(3)], axis=2
     )
     translations = np.broadcast_to(np.eye(3), rotations.shape)
-    modes = np.concatenate([translations, rotations], axis=2)
+    modes = np.concatenate([translations, rotations], axis=2).astype(float)
     # The triangular factor has the same singular values and at most six rows.
     factor = np.linalg.qr(modes[is_prescribed], mode="r")
     _, values, directions = np.linalg.svd(factor)
