@@ -509,8 +509,8 @@ class FilmFigure:
         )
 
     def show_sample(self, sample: int) -> None:
-        """Change the figure in place to the sample with index `sample`: bodies, markers, distances in
-        the titles, time, and the line in the panel of errors.
+        """Change the figure in place to the sample with index `sample`: bodies, markers, distances
+        in the titles, time, and the line in the panel of errors.
         """
         replay = self.replay
         measured = replay.measured_m[sample]
@@ -580,16 +580,16 @@ def _points_to_show_m(
 
 
 def _with_even_pixels(height_mm: float) -> float:
-    """Return the least height [mm], not below `height_mm`, that is an even number of pixels in an MP4
-    film, as H.264 needs.
+    """Return the least height [mm], not below `height_mm`, that is an even number of pixels in an
+    MP4 film, as H.264 needs.
     """
     per_mm = PIXELS_WIDE[".mp4"] / FILM_WIDTH_MM
     return float(2 * np.ceil(height_mm * per_mm / 2) / per_mm)
 
 
 def _frame_writer(fps: float, ffmpeg: str | None) -> AbstractMovieWriter:
-    """Return the writer of frames with `fps` frames per second: for GIF if `ffmpeg` is None, else for
-    H.264; the path of ffmpeg has to be in matplotlib's ``animation.ffmpeg_path`` then.
+    """Return the writer of frames with `fps` frames per second: for GIF if `ffmpeg` is None, else
+    for H.264; the path of ffmpeg has to be in matplotlib's ``animation.ffmpeg_path`` then.
     """
     if ffmpeg is None:
         return PillowWriter(fps=fps)  # type: ignore[arg-type]

@@ -348,8 +348,8 @@ class ParameterSliders:
         return self._shapes_figure(simulation)
 
     def _shapes_figure(self, simulation: ForwardSimulation) -> Figure:
-        """Return the picture of the simulated shapes of the body at several times, with the measured
-        markers.
+        """Return the picture of the simulated shapes of the body at several times, with the
+        measured markers.
         """
         from .pictures.shapes import shapes_picture
         from .replay import MotionRecord

@@ -425,8 +425,8 @@ def _obstacle_outlines(experiment: Experiment) -> Array | None:
 
 
 def _join_polylines(lines_m: Sequence[Array]) -> Array | None:
-    """Return polylines (P, 3), with any number of points P each, joined into one array (p, 3) with a
-    row of NaN after each; None without lines.
+    """Return polylines (P, 3), with any number of points P each, joined into one array (p, 3) with
+    a row of NaN after each; None without lines.
     """
     if not lines_m:
         return None

@@ -138,8 +138,8 @@ def run_summary(
 
 
 def estimate_sections(result: Result) -> list[Shown]:
-    """Return the verdict, the command that explains its remedies, the advice of a deeper check where
-    that is worthwhile, and the table of parameters with their intervals.
+    """Return the verdict, the command that explains its remedies, the advice of a deeper check
+    where that is worthwhile, and the table of parameters with their intervals.
     """
     sections = [
         verdict_section(result.trust),

@@ -400,8 +400,8 @@ def part_legend_handle(part: int, name: str) -> Line2D:
 def draw_legend(
     axes: Axes, entries: Sequence[Line2D], corner_mm: ArrayLike
 ) -> None:
-    """Draw a legend with these entries, which have labels, in one line into the axes of a sheet; its
-    upper left corner is at `corner_mm` (2,), and earlier legends stay.
+    """Draw a legend with these entries, which have labels, in one line into the axes of a sheet;
+    its upper left corner is at `corner_mm` (2,), and earlier legends stay.
     """
     names = [str(entry.get_label()) for entry in entries]
     place: Any = tuple(np.asarray(corner_mm))

@@ -96,7 +96,8 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
     Returns
     -------
     hertz, density : (k,)
-        The density is NaN where it is zero, or if no marker is present often enough.
+        Frequencies above zero up to half the sampling rate. The density is NaN where it is zero, or
+        if no marker is present often enough.
     """
     present = np.asarray(np.isfinite(tracks_m).all(axis=2))
     markers = np.flatnonzero(present.mean(axis=0) >= MIN_PRESENT_SHARE)
