@@ -98,7 +98,9 @@ def _size_and_gain(probe: Probe) -> str:
 
 
 def is_routine(result: Result) -> bool:
-    """Return whether only the probes of every solve were made, not those of a deeper check."""
+    """Return whether only the probes of every solve were made, not those of a deeper check; true if
+    there are no probes.
+    """
     return all(probe.routine for probe in result.probes)
 
 
@@ -208,7 +210,9 @@ def _conclusions(result: Result) -> Iterator[str]:
 
 
 def _named_change(probe: Probe, result: Result, name: str) -> str:
-    """Return the change of the estimate `name` in a refit, with its symbol; the refit must have it."""
+    """Return the symbol of the estimate `name` and its change in a refit, as text such as
+    "λ +1.20 %"; KeyError if the refit or the result does not have it.
+    """
     return f"{symbol_of(name)} {_change_text(probe.moves[name], result.values[name].value)}"
 
 

@@ -138,8 +138,8 @@ def run_summary(
 
 
 def estimate_sections(result: Result) -> list[Shown]:
-    """Return the verdict, the recommended remedies, and the table of parameters with their
-    intervals.
+    """Return the verdict, the command that explains its remedies, the advice of a deeper check
+    where that is worthwhile, and the table of parameters with their intervals.
     """
     sections = [
         verdict_section(result.trust),
@@ -150,7 +150,8 @@ def estimate_sections(result: Result) -> list[Shown]:
 
 
 def run_report(run: str | Path) -> TitledParts:
-    """Return the complete report of a run folder, with its pictures.
+    """Return the complete report of a run folder, with the pictures that this program wrote there;
+    nothing is written.
 
     Raises
     ------
@@ -628,7 +629,7 @@ def _notes_section(result: Result) -> TitledParts:
 
 def _cards(result: Result) -> Cards:
     """Return the three main numbers: the most important stiffness (or else the first estimate), the
-    misfit of the markers, and that of the forward simulation.
+    misfit of the markers, and that of the forward simulation. The result must have an estimate.
     """
     values = result.values
     fit = result.fit
@@ -679,7 +680,9 @@ def _error_bars(result: Result) -> Iterator[Shown]:
 
 
 def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
-    """Yield for each experiment a table of the estimated places of its markers [mm]."""
+    """Yield for each experiment a table of the estimated places of its markers [mm]; an experiment
+    without markers is left out.
+    """
     explanation = (
         "Positions on the undeformed body in millimetres, each with its standard error. "
         "Positions that were not given have a prior as wide as the body."
@@ -737,7 +740,14 @@ def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
 
 def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
     """Yield a table with the diagnosis of each marker's residuals, and a headed table of the
-    largest errors in the folder `run`; a table without rows is left out.
+    largest marker errors in the arrays of the folder `run`; a table without rows is left out.
+
+    Raises
+    ------
+    InputError
+        If the folder has no file of arrays.
+    ValueError
+        If that file is damaged.
     """
     if result.residuals:
         rows = tuple(
@@ -766,12 +776,16 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
     """Return the largest marker residuals of a run folder as (error [m], time [s], marker), largest
     first.
 
-    Of each marker, two listed errors are more than `ERROR_SPACING_SAMPLES` samples apart.
+    At most `SHOWN_ERRORS` are returned; empty without fitted markers. Of each marker, two listed
+    errors are more than `ERROR_SPACING_SAMPLES` samples apart.
 
     Raises
     ------
+    InputError
+        If the folder has no file of arrays.
     ValueError
-        If an array of residuals does not have the size of its times and markers.
+        If that file is damaged, or an array of residuals does not have the size of its times and
+        markers.
     """
     arrays = read_arrays(run)
     worst = []
@@ -862,8 +876,8 @@ def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:
 
 
 def _size_text(value: float | None, unit: str) -> str:
-    """Return a value, given in `unit`, in a readable unit, such as millimetres for "m"; "–" for
-    None.
+    """Return a value in `unit` as text in a readable unit, see `in_readable_unit`, such as "1.2 mm"
+    for 0.0012 in "m"; a unit that it does not know is kept, and None becomes "–".
     """
     factor, shown = in_readable_unit(1.0, unit)
     # No powers of ten for the sizes of bodies.

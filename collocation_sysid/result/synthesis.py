@@ -71,12 +71,13 @@ class Recipe(Options):
     timestep_s : float
         Time step of newmark [s]; by default so small that the motion does not depend on it.
     noise_m : float
-        Standard deviation of the markers' noise.
+        Standard deviation of the noise of each coordinate of a marker [m].
     noise_n : float
         Standard deviation of the noise of measured forces [N]. If a quarter of the specimen is
         modelled (``symmetry = 4``), that of the force on the whole specimen.
     noise_nm : float
-        Standard deviation of the noise of measured torques.
+        Standard deviation of the noise of measured torques [N m]; with ``symmetry``, of the torque
+        on the whole specimen.
     noise_own : float
         Standard deviation of the noise of custom sensors, in multiples of their sigma.
     seed : int

@@ -175,7 +175,7 @@ def _draw_panel(
     ----------
     axes : Axes
     image_points : (P, 2)
-        u and v of the points.
+        u and v of the points, at least one.
     values : (P,)
         Values that colour the points.
     lines : (k, 2)
