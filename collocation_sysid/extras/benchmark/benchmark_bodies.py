@@ -71,7 +71,9 @@ class BenchmarkBody:
 
     @property
     def licence_file(self) -> Path | None:
-        """Text of the licence of the recordings; None if there is none in the repository."""
+        """Path of the licence of the recordings in a checkout of the repository; None if
+        `licence_path` is empty. Whether the file exists is not checked.
+        """
         return CHECKOUT / self.licence_path if self.licence_path else None
 
     @property

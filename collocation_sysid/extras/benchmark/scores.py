@@ -156,11 +156,13 @@ def score(recording: StoredRecording, source: str, predicted: Signal) -> Score:
     Parameters
     ----------
     recording : StoredRecording
-        Recording with at least one measured value.
+        Recording with at least one measured value, which must not all equal those of the undeformed
+        body (otherwise `ZeroDivisionError`).
     source : str
         Who predicted it, see `Score`.
     predicted : Signal
-        Prediction at the samples of the measured signal, with the same columns.
+        Prediction at the samples of the measured signal, with the same columns; a NaN counts as not
+        measured.
     """
     signals = recording.signals
     measured = signals.measured
@@ -195,8 +197,15 @@ def _errors(predicted: Signal, measured: Signal) -> Array:
 
 
 def _distances(errors: Array, measured: Signal) -> Array:
-    """Return the distances (k,) of markers, or the magnitudes of the differences of loads, from
-    errors (T, C); those that are NaN are left out.
+    """Return the distances (k,) of markers [m], or the magnitudes of the differences of loads, of
+    all samples in one array; those that are NaN are left out.
+
+    Parameters
+    ----------
+    errors : (T, C) array
+        Predicted minus measured values; three columns for each marker.
+    measured : Signal
+        The measured signal, whose quantity decides.
     """
     sizes = np.abs(errors)
     if measured.quantity == "markers":
@@ -207,5 +216,5 @@ def _distances(errors: Array, measured: Signal) -> Array:
 
 
 def _rms(values: Array) -> float:
-    """Return the root of the mean square of values."""
+    """Return the root of the mean square of at least one value, of any shape; NaN if one is NaN."""
     return float(np.sqrt(np.mean(values**2)))

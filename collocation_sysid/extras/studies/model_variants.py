@@ -96,12 +96,13 @@ def _parse_names(
 
 
 def parse_branches(text: str) -> tuple[int, ...]:
-    """Return numbers of Prony branches from text separated by commas, each once.
+    """Return numbers of Prony branches from text separated by commas, such as "0,1,2", each once,
+    in the order of the text.
 
     Raises
     ------
     InputError
-        For anything but whole numbers from 0 to `MOST_BRANCHES`.
+        For anything but whole numbers from 0 to `MOST_BRANCHES`, and without any number.
     """
     items = [item.strip() for item in text.split(",") if item.strip()]
     counts = [
@@ -194,6 +195,9 @@ def variants(
     """Return a model for every combination of material, damping law and number of branches, in this
     order; the last changes fastest.
 
+    A label joins the names of what varies, such as "yeoh, 1 branch" ("no memory" for 0 branches),
+    after the region if there is one, such as "tip: yeoh". Nothing is written.
+
     Parameters
     ----------
     path : Path
@@ -215,8 +219,8 @@ def variants(
     Raises
     ------
     InputError
-        For an unknown region, and if branches are compared and the file has branches of another
-        region.
+        If the file cannot be read or is invalid with the overrides, for an unknown region, and if
+        branches are compared and the file has branches of another region.
     """
     file, _ = read_problem_file(path, overrides)
     content = file.model_dump(mode="json", exclude_unset=True, by_alias=True)
@@ -623,7 +627,8 @@ def _with_memory(
 
 def as_inline_toml(value: Any) -> str:
     """Return a value in TOML's inline syntax, on one line; mappings, lists, tuples, texts, booleans
-    and numbers are supported, None is not.
+    and numbers are supported. None and other types are not: their text is no TOML, without an
+    error.
     """
     if isinstance(value, Mapping):
         return (

@@ -22,7 +22,7 @@ RANGE = "such as 50:5000:log:9 or 0:1:5"
 
 def unique_items(text: str) -> tuple[str, ...]:
     """Return the items of text separated by commas, stripped, each once, in their order; empty ones
-    are left out.
+    are left out, so that the result may be empty.
     """
     return tuple(
         dict.fromkeys(item.strip() for item in text.split(",") if item.strip())

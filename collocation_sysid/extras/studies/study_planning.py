@@ -86,7 +86,7 @@ class PlannedRun:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the run as a dictionary for JSON."""
+        """Return the fields of the run as a dictionary, which JSON can represent."""
         return asdict(self)
 
 
@@ -424,6 +424,13 @@ def _planned_run(
 def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
     """Return hashes by name of the files that the content of a problem names, so that changed data
     give another run; names of missing files are left out.
+
+    Parameters
+    ----------
+    content : Any
+        Nested mappings, lists and texts; every text is tried as the name of a file.
+    folder : Path
+        Folder of the problem file, to which names are relative.
     """
     hashes = {}
     for text in _texts(content):

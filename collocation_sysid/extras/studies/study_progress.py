@@ -141,7 +141,9 @@ class DesignProgress(Watched):
         )
 
     def show_activity(self, what: str) -> None:
-        """Show `what` is being computed, such as a stage of the design."""
+        """Show what is being computed, such as a stage of the design, with a hint at Ctrl-C; `what`
+        is a text.
+        """
         self.update(
             Text(f"{what} (Ctrl-C stops and keeps the best)", style="dim"), what
         )
