@@ -28,7 +28,8 @@ from .motion_design import Design
 
 def design_summary(design: Design, folder: Path) -> list[Shown]:
     """Return a design on one screen, as lines and tables: whether the search was interrupted, the
-    error bars, the limits that are reached, and the `folder` to which it was written.
+    error bars, which recordings they refer to, the limits that are reached, and the `folder` to
+    which it was written. Nothing is written here.
     """
     tried = len(design.best.history)
     interrupted = Line(
@@ -44,7 +45,11 @@ def design_summary(design: Design, folder: Path) -> list[Shown]:
 
 
 def _error_table(design: Design) -> Table:
-    """Return the table of error bars before and after."""
+    """Return the table of error bars before and after the design, a line for each parameter or
+    modulus: value, relative errors in percent, their range over the draws of θ, and the factor by
+    which the error is reduced. Without error bars before the design, "error before" and the factor
+    are empty.
+    """
     heads = (
         "",
         "value",
@@ -83,8 +88,11 @@ def _percent(share: float) -> str:
 
 
 def _column_note(design: Design) -> str:
-    """Return a sentence that says which recordings the columns "before" and "after" refer to;
-    without error bars before the design it is on "after" alone.
+    """Return a sentence that says what the columns "before" and "after" of the error bars refer to.
+
+    If existing recordings are used (`Design.added`) they are these alone, and with the designed
+    motion in addition. Otherwise they are the motion in the problem, with its duration, and the
+    designed motion alone; if `Design.before` is None, the sentence is on "after" alone.
     """
     duration = f"{design.experiment.duration_s:.4g} s"
     after = f"after: the designed motion of {duration}"
@@ -97,7 +105,7 @@ def _column_note(design: Design) -> str:
 
 
 def design_figures(design: Design) -> dict[str, Figure]:
-    """Return the figures of a design by file name without suffix."""
+    """Return the figures of a design by file name without suffix: "motion" and "error_bars"."""
     return {
         "motion": motion_picture(design),
         "error_bars": error_bars_picture(design),

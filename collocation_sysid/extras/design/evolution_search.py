@@ -174,7 +174,7 @@ class EvolutionStrategy:
 
     def point(self, step: Array) -> Array:
         """Return the coefficients (d,) for a sample `step` (d,) of the standard normal
-        distribution.
+        distribution, at the present mean and deviations; the strategy is not changed.
         """
         return self.mean + self.deviation * np.sqrt(self.variances) * step
 
