@@ -290,21 +290,24 @@ class LiveEstimator:
         wrench: Any = None,
         readings: Mapping[str, Any] | None = None,
     ) -> LiveUpdate:
-        """Process a frame and return the result.
+        """Process a frame and return the result, which is also stored in `last`.
+
+        Frames should be in order of time; late, doubled and missing ones are allowed, see
+        `process_frame`.
 
         Parameters
         ----------
         t_s : float
-            Time of the frame.
+            Time of the frame [s].
         pose : 4×4 matrix, (position, quaternion x y z w), or None
             Pose of the moving grasp, None if it is missing; for several grasps a mapping by their
-            number from "1" on, or a list in the order of the problem.
+            number, as text from "1" on, or a list in the order of the problem.
         markers : (M, 3) array, or mapping of name to (3,)
-            Marker positions; NaN, or omitted, where missing.
+            Marker positions [m]; NaN, or omitted, where missing.
         wrench : (6,) or (3,) array, optional
             Wrench of the grasp on the body: fx, fy, fz [N], tx, ty, tz [N m], at the time of the
             frame; or a mapping with ``t_s`` and ``values``, or a list of such mappings; for several
-            sensors a mapping by the number of their grasp. NaN, or None, where missing.
+            sensors a mapping by the number of their grasp, as text. NaN, or None, where missing.
         readings : mapping of name to numbers, optional
             Values of custom sensors at the time of the frame; or mappings with ``t_s`` and
             ``values``, or lists of such mappings. NaN, or None, where missing.
@@ -340,12 +343,16 @@ class LiveEstimator:
     def process_frame(self, frame: Frame) -> LiveUpdate:
         """Process a validated frame and return the result, which is also stored in `last`.
 
-        Frames that are ignored, and those before the first pose, give a result as well, with a
-        note where there is a reason. After a gap in the poses the estimator restarts from rest with
-        the information of the samples so far as a prior. When the motion begins after a long rest,
-        it starts as if the stream had begun with the last frames at rest, see `InitialRest`. Rows
-        that cannot be simulated raise no
-        error: the verdict of the result says so.
+        Frames that are ignored, and those before the first pose, give a result as well, with a note
+        where there is a reason. After a gap in the poses the estimator restarts from rest with the
+        information of the samples so far as a prior. When the motion begins after a long rest, it
+        starts as if the stream had begun with the last frames at rest, see `InitialRest`. Rows that
+        cannot be simulated raise no error: the verdict of the result says so.
+
+        Parameters
+        ----------
+        frame : Frame
+            Frame with the moving grasps, markers and instruments of the problem, in its order.
         """
         began = self.clock()
         frame, notes = self._checked_frame(frame)
@@ -427,7 +434,8 @@ class LiveEstimator:
     def finish(self) -> LiveUpdate | None:
         """Return the final result of all frames, however long that takes.
 
-        Call it after the last frame.
+        Call it once, after the last frame: the state of the estimator may change, but `last` does
+        not.
 
         If the window holds the whole recording, this is the run of the batch. Otherwise, and if
         markers were measured between samples, the rows in the window are computed again until the
@@ -439,7 +447,7 @@ class LiveEstimator:
             The update of the last frame with new estimates, and after a batch run the root mean
             square distance of all markers; its notes are those of this function. The last update
             itself if no row could be computed since the start or a restart, and None if there was
-            no frame. `last` is not changed.
+            no frame.
         """
         began = self.clock()
         notes = ["final estimate after the last frame"]
@@ -474,8 +482,9 @@ class LiveEstimator:
     def _solve_batch(self, track: WindowPass, notes: list[str]) -> Run | None:
         """Return the run of the batch solve of the complete recording.
 
-        None if the window does not hold the whole recording, or if the solve is refused, which adds
-        to `notes`.
+        None if the window does not hold the whole recording, if that cannot be solved as a batch
+        (see `recording_from_log`), or if the solve is refused, which adds a sentence to `notes`, in
+        place. `track` is the first pass; the estimator is not changed.
         """
         recording = (
             None
@@ -496,11 +505,22 @@ class LiveEstimator:
 
     def _repeat_until_settled(self, began: float, notes: list[str]) -> int:
         """Compute the rows in the window again, without a time limit, until no further pass is
-        needed or `FINAL_PASSES` passes are done.
+        needed or `FINAL_PASSES` times as many rows as the window has are computed.
 
-        The number of rows that were computed is returned; rows computed in several passes count
-        in each. The state of the estimator is changed as by `_repeat_rows`, its option `rows` is
-        not. `began` is the time at which the work began, by `clock`; `notes` are extended in place.
+        The state of the estimator is changed as by `_repeat_rows`: passes are accepted or rejected
+        and the estimate moves. The attribute `rows` is the same afterwards.
+
+        Parameters
+        ----------
+        began : float
+            Time at which the work began, by `clock` [s].
+        notes : list of str
+            Events of the passes; extended in place.
+
+        Returns
+        -------
+        int
+            Number of rows that were computed; rows computed in several passes count in each.
         """
         rows_per_frame, self.rows = self.rows, FINAL_PASSES * len(self.log)
         try:
@@ -509,11 +529,12 @@ class LiveEstimator:
             self.rows = rows_per_frame
 
     def _checked_frame(self, frame: Frame) -> tuple[Frame, list[str]]:
-        """Return the frame with NaN for markers that are farther than `REACH_BODY_SIZES` allows
-        from the last known position of every moving grasp, and notes; counts are updated.
+        """Return the frame with NaN for markers that are implausibly far from the last known
+        position of every moving grasp, and notes on them; the frame itself is not changed.
 
-        Before the first pose no marker is excluded. A wrench without a sensor in the problem is
-        noted once.
+        Markers are excluded beyond a distance that follows from `REACH_BODY_SIZES`; before the
+        first pose none is. A wrench without a sensor in the problem is noted once. `counts`,
+        `samples` and the last known positions are updated.
         """
         notes = []
         if frame.has_wrench and not self.model.wrenches:
@@ -540,8 +561,8 @@ class LiveEstimator:
         return frame, notes
 
     def _note_outliers(self, wild: NDArray[np.bool_]) -> str:
-        """Add the outliers, given by a mask (M,) of the markers with at least one true value, to
-        the counts; return a note with their names.
+        """Add the number of outliers to the counts, and return a note with their names; `wild` is a
+        mask (M,) of the markers with at least one true value.
         """
         self.counts["wild"] += int(wild.sum())
         names = ", ".join(self.names[m] for m in np.flatnonzero(wild))
@@ -642,9 +663,16 @@ class LiveEstimator:
         return notes
 
     def _outliers(self, residual: Array) -> NDArray[np.bool_]:
-        """Return a mask (M,) of markers whose residuals (M, 3), in standard deviations, are far
-        larger than usual; all false while the estimate has not settled, or if most markers would be
-        outliers.
+        """Return a mask (M,) of markers whose residuals are far larger than usual
+        (`OUTLIER_RATIO`).
+
+        It is false for all markers while the estimate has not settled or residuals are gross, if
+        most markers would be outliers, and for missing ones. Nothing is changed.
+
+        Parameters
+        ----------
+        residual : (M, 3) array
+            Residuals of one sample, in standard deviations of the markers; NaN where missing.
         """
         if (
             self.linearisation_distance > LARGEST_SETTLED_DISTANCE
@@ -660,19 +688,27 @@ class LiveEstimator:
     # Beginnings -------------------------------------------------------------------------------
 
     def _set_bounds(self) -> None:
-        """Set the bounds of p, `lower` and `upper`, from the model."""
+        """Set the attributes `lower` and `upper`, bounds (P,) of the parameters p in the solver's
+        coordinates, from the model.
+        """
         self.lower, self.upper = self.model.collocation.parameter_bounds
 
     def _new_search(self) -> StiffnessSearch:
-        """Return a new search for initial values."""
+        """Return a new search for initial values over a range of stiffness, with the present
+        nuisance parameters; it has not begun, and the estimator is not changed.
+        """
         return StiffnessSearch(self.model, self.p[self.model.collocation.nq :])
 
     def _warm_up(self) -> tuple[Poses, Array] | None:
-        """Compile the kernels before the first frame, and measure computing times for `budget`.
+        """Compile the kernels before the first frame with rows at the first pose of the problem's
+        recording, and set `budget` to their measured computing times.
 
-        Return the poses of all grasps and the positions (3n,) at the start of the problem's
-        recording. None if it cannot be computed at the initial parameters; `budget` then stays
-        without times.
+        Returns
+        -------
+        tuple or None
+            The first poses of all grasps of the problem's recording, each a rotation (3, 3) and a
+            position (3,) [m], and the node positions (3n,) [m] in equilibrium there. None if these
+            cannot be computed at the initial parameters; `budget` then stays without times.
         """
         poses = self.model.first_poses
         moving_poses = tuple(poses[k] for k in self.model.moving_grasps)
@@ -797,7 +833,18 @@ class LiveEstimator:
         self, frame: Frame, notes: list[str]
     ) -> list[LoggedRow]:
         """Start anew if the motion begins with this frame after a long rest, and return the rows of
-        the last frames at rest; otherwise an empty list. `notes` are extended in place.
+        the last frames at rest, with their samples.
+
+        Otherwise, and while there is no first pass, the list is empty. Starting anew discards
+        estimate and information, see `_start_anew`, and the frames at rest are added to the buffer
+        again; this frame is not.
+
+        Parameters
+        ----------
+        frame : Frame
+            Next frame, whose pose may be None.
+        notes : list of str
+            Extended in place if the motion begins.
         """
         frames = self._initial_rest.frames_before_motion(frame)
         if not frames or self.first_pass is None:
@@ -815,7 +862,9 @@ class LiveEstimator:
         return rows
 
     def _buffered(self, frame: Frame) -> BufferedFrame:
-        """Add a frame to the buffer and return the rows that it completes."""
+        """Add a frame to the buffer, which is changed, and return the rows that it completes, late
+        samples and notes; no row is computed.
+        """
         return self.intake.add_frame(
             frame.t_s,
             frame.pose,
@@ -847,7 +896,8 @@ class LiveEstimator:
 
     @property
     def linearisation_distance(self) -> float:
-        """Largest distance of the estimate from the linearisation points, in standard errors.
+        """Largest distance of the estimate from the linearisation points of the rows in the window,
+        in standard errors of single material parameters.
 
         Infinite if there is no pass, or if it failed.
         """
@@ -871,7 +921,7 @@ class LiveEstimator:
         track : WindowPass
             Pass whose standard errors are used.
         p : (P,)
-            Parameters, not transformed.
+            Parameters in the solver's coordinates, not transformed.
         points : sequence of (P,)
             Points in transformed parameters, see `StreamingModel.transformed`.
         """
@@ -899,8 +949,15 @@ class LiveEstimator:
     def _constrained_minimum(
         self, track: WindowPass, known: SquareRootInformation
     ) -> Array:
-        """Return the p (P,) that minimises the quadratic loss of `known`, within the bounds and the
-        trust region about the linearisation point of a pass.
+        """Return the parameters p (P,), in the solver's coordinates, that minimise a quadratic loss
+        within the bounds and the trust region about the linearisation point of a pass.
+
+        Parameters
+        ----------
+        track : WindowPass
+            Pass whose linearisation point is the centre of the trust region.
+        known : SquareRootInformation
+            Quadratic loss, in transformed parameters.
         """
         reach = self._trust * self.model.collocation.reach_p
         low = np.maximum(self.lower, track.linearisation_point - reach)
@@ -911,11 +968,18 @@ class LiveEstimator:
         return np.clip(self.model.physical(best), low, high)
 
     def _next_linearisation_point(self, track: WindowPass) -> Array:
-        """Return the next linearisation point p (P,) of a pass.
+        """Return the next linearisation point p (P,) of a pass, in the solver's coordinates
+        (logarithms, or values of linear parameters; not transformed).
 
-        It minimises the joint quadratic loss of both passes, with a weak prior at the last
-        linearisation point, which keeps poorly determined parameters there, within bounds and trust
-        region.
+        It minimises the joint quadratic loss of the first and the second pass, plus a prior about
+        the linearisation point of `track`, within the bounds and the trust region about that point.
+        The prior keeps poorly determined parameters there, and is weaker the more rows are in the
+        window. Nothing is changed.
+
+        Parameters
+        ----------
+        track : WindowPass
+            First pass.
         """
         size = self.model.parameter_count
         samples = len(self.log) / self.model.substeps
@@ -970,7 +1034,8 @@ class LiveEstimator:
     def _estimates_at(
         self, known: SquareRootInformation, p: Array
     ) -> dict[str, Estimate]:
-        """Return estimates with intervals by name, without the coefficients of fields.
+        """Return estimates with standard errors and 95 % intervals by name, in the units of the
+        problem, without the coefficients of fields.
 
         Their variances are scaled by `variance_factor` with the present scatter of the residuals.
 
@@ -979,7 +1044,8 @@ class LiveEstimator:
         known : SquareRootInformation
             Information in transformed parameters, including the priors.
         p : (P,)
-            Parameters, not transformed; those within `AT_BOUND` of a bound count as at it.
+            Parameters in the solver's coordinates, not transformed; those within `AT_BOUND` of a
+            bound count as at it.
         """
         collocation = self.model.collocation
         nq = self.model.collocation.nq
@@ -1010,15 +1076,16 @@ class LiveEstimator:
     def _repeat_rows(
         self, began: float, notes: list[str], done: int = 0
     ) -> int:
-        """Continue or start a second pass within the rest of the budget.
+        """Continue the second pass, or start one, within the rest of the frame's budget.
 
         Passes follow one another, the trials of a search included, until none is needed or no
-        further row is affordable. Without effect before the first pass.
+        further row is affordable. Passes, estimate and budget are changed. Without effect before
+        the first pass.
 
         Parameters
         ----------
         began : float
-            Time at which the frame began.
+            Time at which the frame began, by `clock` [s].
         notes : list of str
             Extended in place.
         done : int
@@ -1027,7 +1094,7 @@ class LiveEstimator:
         Returns
         -------
         int
-            Number of rows computed again in this frame.
+            Number of rows computed again in this frame, `done` included.
         """
         while self.first_pass is not None:
             pass_began = self.clock()
@@ -1088,12 +1155,26 @@ class LiveEstimator:
     def _advance_second_pass(
         self, again: WindowPass, count: int, notes: list[str]
     ) -> int:
-        """Compute up to `count` rows of the second pass; if it has caught up or failed, accept or
-        reject it, or record it as a trial of the search.
+        """Compute further rows of the second pass; if it has caught up or failed, accept or reject
+        it, or record it as a trial of the search.
 
         While trials of a search are left, the pass is such a trial, which ends after
-        `StiffnessSearch.rows` rows. A row that cannot be solved marks the pass as failed. Return
-        the number of rows that were computed. `notes` are extended in place.
+        `StiffnessSearch.rows` rows. A row that cannot be solved marks the pass as failed. The
+        computing time is recorded in `budget`.
+
+        Parameters
+        ----------
+        again : WindowPass
+            The second pass, changed in place.
+        count : int
+            Largest number of rows, at least 1; those of the log that follow the rows of the pass.
+        notes : list of str
+            Extended in place.
+
+        Returns
+        -------
+        int
+            Number of rows that were computed.
         """
         before = self.clock()
         first_row = again.rows
@@ -1116,7 +1197,8 @@ class LiveEstimator:
 
     def _affordable_rows(self, done: int, elapsed_s: float) -> int:
         """Return how many rows may be computed again: as many as fit into the rest of the time
-        budget of the frame, or, if `rows` per frame is fixed, these minus `done`.
+        budget of the frame, or, if the attribute `rows`, the number per frame, is fixed, these
+        minus `done`.
 
         Parameters
         ----------
@@ -1132,14 +1214,22 @@ class LiveEstimator:
     def _start_second_pass(
         self, track: WindowPass, notes: list[str]
     ) -> WindowPass | None:
-        """Return a new second pass, without rows yet, if one is needed, otherwise None.
+        """Return a new second pass, without rows yet, if one is needed, otherwise None; the caller
+        sets `second_pass`.
 
         During a search for initial values it is needed for the next trial, once there are enough
-        rows, and for the best values at the end; a search begins here if the first pass `track`
-        failed before rows left the window. If no trial succeeded, the search ends with a note.
-        Without a search a pass is needed if the estimate has moved farther than `REPEAT_DISTANCE`
-        from a linearisation point of `track`, or if the sweep needs another pass, but not after a
-        failure. `notes` are extended in place.
+        rows, and for the best values at the end; a search begins here, and sets `search`, if the
+        first pass failed before rows left the window. If no trial succeeded, the search ends with a
+        note. Without a search a pass is needed if the estimate has moved farther than
+        `REPEAT_DISTANCE` from a linearisation point of `track`, or if the sweep needs another pass,
+        but not after a failure.
+
+        Parameters
+        ----------
+        track : WindowPass
+            The first pass, not changed; a new pass repeats it, but for a trial.
+        notes : list of str
+            Beginning and failure of a search; extended in place.
         """
         search = self.search
         at_start = track.start[0] is None
@@ -1200,11 +1290,11 @@ class LiveEstimator:
         track : WindowPass
             First pass, which gives the standard errors.
         pass_to_move : WindowPass
-            Pass to change.
+            Pass to change, in place; may be `track`.
         began : float
-            Time at which the frame began.
+            Time at which the frame began, by `clock` [s].
         distance : float
-            Distance in standard errors.
+            Smallest distance between them, in standard errors.
         """
         current_point = [pass_to_move.sweep.transformed]
         if (

@@ -477,8 +477,20 @@ class FrameReader:
     def _pose_of_body(
         self, pose: tuple[Array, Array] | None
     ) -> tuple[Array, Array] | None:
-        """Return positions (G, 3) [m] and quaternions (G, 4) of the body in the moving grasps from
-        those in a line; None for None.
+        """Return the pose of the undeformed body in each moving grasp from the pose in a line,
+        which is that of the gripper if the grasp has a transform in `gripper_transforms`: both are
+        multiplied. Grasps without a transform keep their pose.
+
+        Parameters
+        ----------
+        pose : (positions, quaternions) or None
+            Positions (G, 3) [m] and unit quaternions (G, 4), x y z w, of the moving grasps; not
+            modified. None if missing.
+
+        Returns
+        -------
+        (positions, quaternions) or None
+            New arrays of the same shapes, or `pose` itself without any transform; None for None.
         """
         if pose is None or not any(
             each is not None for each in self.gripper_transforms

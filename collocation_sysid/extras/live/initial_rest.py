@@ -75,8 +75,8 @@ class InitialRest:
         return list(self._recent) if self._is_body_still() else []
 
     def _is_at_rest(self, frames: list[Frame]) -> bool:
-        """Return whether no grasp of these frames is displaced from the first frame by more than
-        noise; the first frames must be complete.
+        """Return whether no grasp of these frames, which have poses, is displaced from the first
+        frame by more than noise; the first `LONG_REST_FRAMES` frames must have been added.
         """
         first = self._first[0]
         return all(
@@ -99,8 +99,8 @@ class InitialRest:
         )
 
     def _displacement_m(self, frame: Frame, reference: Frame) -> float:
-        """Return the largest displacement of a grasp from the reference [m]; a rotation counts as
-        that of a point at the distance of the body's size.
+        """Return the largest displacement of a grasp between two frames with poses [m]: its
+        translation, and its rotation as that of a point at the distance of the body's size.
         """
         assert frame.pose is not None
         assert reference.pose is not None
@@ -112,8 +112,8 @@ class InitialRest:
         return float(np.max(shifts_m + angles * self.body_size_m, initial=0.0))
 
     def _is_body_still(self) -> bool:
-        """Return whether the markers of the recent frames scatter by no more than noise; true if
-        none is visible twice.
+        """Return whether each coordinate of the markers of the recent frames scatters by no more
+        than noise (`LARGEST_MARKER_DEVIATIONS`); true if no marker is visible twice.
         """
         tracks_m = np.array([frame.tracks_m for frame in self._recent])
         visible = np.isfinite(tracks_m).sum(axis=0) > 1

@@ -91,12 +91,12 @@ class LiveRecording:
     def write(
         self, frame: Frame, update: LiveUpdate, positions_m: Array | None
     ) -> None:
-        """Write a frame and what was estimated after it, at the time of the update.
+        """Write a frame and what was estimated after it into the file, at the time of the update.
 
         Parameters
         ----------
         frame : Frame
-            Frame with the measured markers.
+            Frame with the measured markers; missing ones are left out.
         update : LiveUpdate
             Its result.
         positions_m : (n, 3) array or None
@@ -130,7 +130,10 @@ class LiveRecording:
         self._stream.disconnect()
 
     def _write_estimates(self, update: LiveUpdate) -> None:
-        """Write parameters and intervals, the verdict if it changed, and notes."""
+        """Write parameters and statistical intervals, the verdict with its reasons if it changed
+        since the last call, and notes, at the present time of the recording; intervals that are
+        None are left out.
+        """
         rr = self._rr
         for name, each in update.estimates.items():
             self._write_number(each.value, "parameters", name, "value")

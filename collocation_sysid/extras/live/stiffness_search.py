@@ -59,8 +59,9 @@ class StiffnessSearch:
         return not self._waiting
 
     def next_trial(self) -> Array | None:
-        """Return the parameters p of the next trial; None if no trial is left. `record_trial`
-        advances to the one after it.
+        """Return the parameters p (P,) of the next trial, material parameters followed by nuisance
+        parameters in the solver's coordinates; None if no trial is left. Repeated calls return the
+        same, until `record_trial` advances to the trial after it.
         """
         return (
             np.concatenate([self._waiting[0], self._phi])
@@ -94,8 +95,9 @@ class StiffnessSearch:
 
     @property
     def best(self) -> Array | None:
-        """Linearisation point p, at its end, of the pass with the smallest loss; None if every
-        trial failed. At least one trial must be recorded (otherwise `ValueError`).
+        """Parameters p (P,) of the pass with the smallest loss, in the solver's coordinates: its
+        linearisation point at its end. None if every trial failed. At least one trial must be
+        recorded (otherwise `ValueError`).
         """
         loss, p = min(self._tried, key=lambda each: each[0])
         return p if np.isfinite(loss) else None

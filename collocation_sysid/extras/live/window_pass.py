@@ -122,17 +122,23 @@ class WindowPass:
 
     @property
     def linearisation_point(self) -> Array:
-        """Parameters of the current linearisation point (P,), not transformed."""
+        """Parameters p (P,) of the current linearisation point in the solver's coordinates, not
+        transformed.
+        """
         return self.sweep.p
 
     @property
     def information(self) -> SquareRootInformation:
-        """Information at p in the transformed parameters, including the prior."""
+        """Information of measurements and prior at the current linearisation point, in the
+        transformed parameters (`StreamingModel.transformed`).
+        """
         return self.sweep.information
 
     @property
     def loss(self) -> float:
-        """Loss of measurements and prior at p."""
+        """Loss of measurements and priors, a sum of squared residuals, at the current linearisation
+        point.
+        """
         return self.information.loss(self.sweep.transformed)
 
     def add_rows(
@@ -178,11 +184,11 @@ class WindowPass:
         return len(computed)
 
     def relinearise_at(self, p: Array) -> None:
-        """Continue at another linearisation point p (P,), not transformed; previous rows keep
-        theirs.
+        """Continue at another linearisation point p (P,), in the solver's coordinates, not
+        transformed; the pass is changed, but previous rows keep their point.
 
         The information so far is kept, and the state after the last row is moved to p along its
-        columns. Rows from here on are linearised at p.
+        derivatives. Rows from here on are linearised at p.
         """
         self.sweep = StreamingSweep(
             self.model,
@@ -203,8 +209,8 @@ class WindowPass:
 
     @property
     def linearisation_points(self) -> list[Array]:
-        """Transformed parameters (P,) at which the rows of the window are linearised, in order of
-        the rows; one for each change.
+        """Transformed parameters (P,), see `StreamingModel.transformed`, at which the rows of the
+        window are linearised, in order of the rows; one for each change of the linearisation point.
         """
         return self.linearisation_points_from(0)
 
@@ -241,10 +247,17 @@ class WindowPass:
         ]
 
     def repeat_rows(self, rows: Sequence[LoggedRow]) -> None:
-        """Compute the first of the logged rows, at most `repeatable_rows`, and add their samples.
+        """Compute the first of the logged rows, at most `repeatable_rows`, and add their samples to
+        the pass.
 
         The rows after them are ignored; the attribute `rows` increases by the number of rows that
         were computed.
+
+        Parameters
+        ----------
+        rows : sequence of LoggedRow
+            Rows that follow those of the pass, with the samples to evaluate after each; at least
+            one.
 
         Raises
         ------
@@ -280,8 +293,8 @@ class WindowPass:
         return max(1, min(rows_of_base, self.remaining_rows_of_block))
 
     def _rows_of_base(self, count: int) -> list[StoredRow]:
-        """Return the next `count` rows of `base`; an empty list without `base`, or if it has
-        fewer.
+        """Return the next `count` rows of the pass `base` that is repeated, those after the rows of
+        this one; an empty list without `base`, or if it has fewer.
         """
         if self.base is None or self.rows + count > self.base.rows:
             return []
@@ -314,19 +327,23 @@ class WindowPass:
         ]
 
     def latest_positions_at(self, transformed: Array) -> Array | None:
-        """Return the positions (3n,) of the latest row at transformed parameters (P,), to first
-        order; None if there is no row in the window.
+        """Return the node positions (3n,) [m] of the latest row at transformed parameters (P,), see
+        `StreamingModel.transformed`, to first order; None if there is no row in the window.
         """
         if not self.blocks or not self.blocks[-1].stored_rows:
             return None
         return self._positions_at(self.blocks[-1].stored_rows[-1], transformed)
 
     def _predicted_positions(self, base: StoredRow) -> Array:
-        """Return the positions of a stored row, moved to p along its columns."""
+        """Return the node positions (3n,) [m] of a stored row at the linearisation point of this
+        pass, to first order with the derivatives of the row.
+        """
         return self._positions_at(base, self.sweep.transformed)
 
     def _positions_at(self, base: StoredRow, transformed: Array) -> Array:
-        """Return the positions (3n,) of a stored row at transformed parameters (P,)."""
+        """Return the node positions (3n,) [m] of a stored row at transformed parameters (P,), to
+        first order with the derivatives of the row.
+        """
         step = (transformed - base.transformed)[self.sweep.moving]
         return base.x + base.columns @ step.astype(np.float32)
 
@@ -419,8 +436,8 @@ class CombinedPasses(NamedTuple):
         )
 
     def scatter(self, transformed: Array) -> ResidualScatter:
-        """Return the scatter of the markers' residuals at transformed parameters, to first
-        order.
+        """Return RMS and autocorrelation of the residuals of all marker samples at transformed
+        parameters (P,), to first order; other instruments do not count.
         """
         return ResidualScatter.from_residuals(
             [
