@@ -58,7 +58,9 @@ class BenchmarkBody:
 
     @property
     def data_folder(self) -> Path | None:
-        """Folder with the problem file and all data; None if files are missing."""
+        """Folder with the problem file and all data of the body on this computer; None if files are
+        missing.
+        """
         folder = CHECKOUT / "problems" / self.folder
         if not self.script:
             try:

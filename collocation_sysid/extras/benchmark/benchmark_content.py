@@ -59,7 +59,10 @@ class BenchmarkContent:
 
     @classmethod
     def read(cls, folder: Path) -> BenchmarkContent:
-        """Read a benchmark folder.
+        """Return the bodies and recordings of a benchmark folder, with all measured and simulated
+        values.
+
+        Predictions in the folder are not read.
 
         Raises
         ------

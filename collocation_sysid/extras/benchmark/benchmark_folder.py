@@ -102,7 +102,7 @@ class BodyTask:
 
     @property
     def experiments(self) -> list[Experiment]:
-        """Recordings to be predicted."""
+        """Recordings to be predicted, in the order of the problem."""
         return _recordings(self.problem, self.body)
 
 
@@ -290,11 +290,14 @@ def _body_content(task: BodyTask) -> dict[str, Any]:
 def _write_recording(
     task: BodyTask, experiment: Experiment, folder: Path
 ) -> dict[str, Any]:
-    """Write the tables of a recording to the existing folder of its body, and return what the
-    description of the body states about it, for JSON.
+    """Write the tables of a recording to the existing folder of its body, and return its entry of
+    "recordings" in body.json.
 
-    Its "files" are names in this folder by role: "times", "measured", "simulated", "undeformed",
-    and "stretches" of a specimen without a mesh or "markers" where markers were measured.
+    The keys of the entry are "name", "file_name", "is_held_out", "kind", "start" (None for a static
+    test), "gravity_m_s2", "air_density_kg_m3", "quantity", "key", "columns", "sigma" and "files";
+    with a mesh also "grasps", and "symmetry" unless markers were measured. "files" are names in
+    this folder by role: "times", "measured", "simulated", "undeformed", and "stretches" of a
+    specimen without a mesh or "markers" where markers were measured.
 
     Parameters
     ----------

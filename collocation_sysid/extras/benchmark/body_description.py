@@ -65,15 +65,15 @@ Then `collocation-sysid benchmark FOLDER` prints the scores; `--body NAME` score
 
 
 def law_description(name: str) -> str:
-    """Return the energy density of a material law as a formula; `KeyError` for laws that no body of
-    the benchmark has.
+    """Return the energy density of the material law called `name`, such as "yeoh", as a formula;
+    `KeyError` for laws that no body of the benchmark has.
     """
     return LAWS[name]
 
 
 def damping_description(name: str) -> str:
-    """Return the stress or force of a damping law as a formula; `KeyError` for laws that no body of
-    the benchmark has.
+    """Return the stress or force of the damping law called `name`, such as "rayleigh", as a
+    formula; `KeyError` for laws that no body of the benchmark has.
     """
     return DAMPING_LAWS[name]
 
@@ -167,7 +167,12 @@ def _mesh(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _recording(recording: Mapping[str, Any]) -> Iterator[str]:
-    """Yield lines of the Markdown section on a recording, an entry of "recordings" in body.json."""
+    """Yield lines of the Markdown section on a recording: its task, its files and the format of the
+    prediction.
+
+    `recording` is an entry of "recordings" in body.json, see `_write_recording` of
+    `benchmark_folder`.
+    """
     name = recording["file_name"]
     files = recording["files"]
     held_out = (

@@ -50,7 +50,7 @@ class Signal:
 
     @property
     def table(self) -> dict[str, Array]:
-        """Columns by name, the keys first."""
+        """Columns (T,) of the table by name, the keys first; views of the arrays, not copies."""
         columns = dict(zip(self.columns, self.values.T, strict=True))
         return {self.key: self.keys, **columns}
 

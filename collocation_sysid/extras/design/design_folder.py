@@ -188,8 +188,8 @@ def design_json(design: Design) -> dict[str, Any]:
 
 
 def _error_bars_json(bars: ErrorBars) -> dict[str, Any]:
-    """Return value, standard error (in the unit of the value), relative error, and its range
-    (lowest, highest) over the draws, by parameter, for JSON.
+    """Return the error bars by parameter or modulus, for JSON: "value", "std_error" (in the unit of
+    the value), "relative_error", and "over_draws", its lowest and highest value over the draws.
     """
     return {
         name: {

@@ -113,8 +113,8 @@ def design_figures(design: Design) -> dict[str, Figure]:
 
 
 def motion_picture(design: Design) -> Figure:
-    """Return a figure of translation and rotation vector over time, and of speeds and
-    accelerations as shares of their limits.
+    """Return a figure of four panels over time: translation [mm] and rotation vector [°] of the
+    hand, and its speeds and accelerations in percent of their limits.
     """
     figure = new_figure(PAGE_MM, 100)
     shift, turn, speed, growth = figure.subplots(2, 2, sharex=True).ravel()
@@ -162,8 +162,8 @@ def motion_picture(design: Design) -> Figure:
 
 
 def error_bars_picture(design: Design) -> Figure:
-    """Return a figure of the relative error bars before, if known, and after; lines show their
-    range over the draws of θ.
+    """Return a figure of the relative error bars [%] before the design, if known, and after, a row
+    for each parameter or modulus; lines show their range over the draws of θ.
     """
     names = list(design.after.relative)
     figure = new_figure(PAGE_MM / 2, 14 + 9 * len(names))

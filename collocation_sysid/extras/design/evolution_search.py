@@ -58,7 +58,8 @@ def minimise(
     watch: Watch | None = None,
     start: Array | None = None,
 ) -> SearchResult:
-    """Minimise a function of coefficients whose expected magnitude is one.
+    """Return the best point of a search for the minimum of a function of coefficients whose
+    expected magnitude is one.
 
     Ctrl-C ends the search; the result is the best point so far.
 

@@ -309,5 +309,5 @@ class HandBounds:
 
 
 def _largest_norm(vectors: Array) -> float:
-    """Return the largest norm of vectors (T, 3)."""
+    """Return the largest norm of vectors (T, 3), at least one, in their unit."""
     return float(np.linalg.norm(vectors, axis=1).max())

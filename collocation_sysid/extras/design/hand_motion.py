@@ -58,7 +58,7 @@ class TimeDerivatives(NamedTuple):
     second: Array
 
     def scaled(self, factor: float) -> TimeDerivatives:
-        """Return value and derivatives multiplied by a factor."""
+        """Return a copy with value and both derivatives multiplied by `factor`."""
         return TimeDerivatives(
             factor * self.value,
             factor * self.first,

@@ -391,7 +391,7 @@ class FutureRecording:
 
     @property
     def samples(self) -> int:
-        """Number of samples of the markers."""
+        """Number of samples of the designed recording, the first and the last included."""
         return round(self.duration_s / self.template.timestep_s) + 1
 
     @cached_property

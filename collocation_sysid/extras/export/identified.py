@@ -439,10 +439,12 @@ class IdentifiedBody:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of identified.json as a dictionary, with arrays and dataclasses that
-        `as_json` converts: estimates, mesh, masses, regions, loads, grasps and obstacles of the
-        recording.
+        `as_json` converts.
 
-        Positions are those at the first sample; element and node indices count from 0.
+        The keys are "title", "verdict", "warnings", "parameters" (estimates by name), "element",
+        "nodes_m", "cells", "node_mass_kg", "tied_mass_kg" (point masses), "regions", "experiment",
+        "kind", "start", "gravity_m_s2", "t_s", "grasps", "obstacles" and "node_loads_n". Positions
+        are those at the first sample; element and node indices count from 0.
         """
         e = self.experiment
         body = self.body

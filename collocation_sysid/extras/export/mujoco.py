@@ -142,7 +142,9 @@ def _obstacle_xml(body: IdentifiedBody, step_s: float) -> str:
 
 
 def _geom_attributes(solid: Solid) -> str:
-    """Return the XML attributes of a solid in MuJoCo: type, size, position and rotation."""
+    """Return the XML attributes of a solid in MuJoCo: type, size, position [m] and rotation in the
+    frame of its obstacle; rounded edges are left out.
+    """
     shape = Primitive.from_solid(solid)
     turn = values_as_text(shape.rotation.as_quat(scalar_first=True))
     size = values_as_text(shape.size_m) if len(shape.size_m) else "0 0 1"

@@ -98,8 +98,8 @@ def write_rerun(
 
 
 def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
-    """Return the von Mises stress (T, F) on the surface [Pa]; None if the run has no frames of it,
-    or the experiment was not fitted.
+    """Return the von Mises stress (T, F) [Pa] on the F triangles of the surface of an experiment of
+    a run folder; None if the run has no frames of it, or the experiment was not fitted.
     """
     if replay.positions_m is None:  # only fitted experiments have frames
         return None

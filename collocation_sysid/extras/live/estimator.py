@@ -167,8 +167,8 @@ class LiveUpdate:
 
 
 def _require_phases(problem: Problem) -> None:
-    """Raise an `InputError` for a two-phase field without phases, which live estimation cannot
-    find.
+    """Raise an `InputError` for a problem with a two-phase field without known phases, which live
+    estimation cannot find.
     """
     for name, modes in problem.two_phase_fields.items():
         if not modes.has_phases:
@@ -571,18 +571,20 @@ class LiveEstimator:
     def _compute_rows(
         self, rows: Sequence[LoggedRow], squares: list[Array]
     ) -> tuple[int, list[str]]:
-        """Compute and log new rows with the first pass, as many as possible at once.
+        """Compute and log new rows with the first pass, as many as possible at once, with their
+        samples.
 
-        The first row starts the pass. If the initial state cannot be computed, the frames are
-        discarded; if a later row cannot be simulated, the pass is marked as failed, and rows are
-        only logged.
+        The first row starts the pass. If the initial state cannot be computed, all frames in the
+        buffer are discarded; if a later row cannot be simulated, the pass is marked as failed, and
+        rows are only logged.
 
         Parameters
         ----------
         rows : sequence of LoggedRow
-            At least one row.
-        squares : list
-            Squared marker residuals [m²] of the frame; extended in place.
+            New rows, at least one; not modified. The caller passes those that are not done again.
+        squares : list of (M,) array
+            Squared distances [m²] of the markers of the frame's samples from the estimate's; an
+            array is appended for each sample, in place.
 
         Returns
         -------
@@ -760,18 +762,22 @@ class LiveEstimator:
         return TimeBudget.from_times(took_s[1], took_s[most], many=most)
 
     def _start_pass(self, row: LoggedRow) -> None:
-        """Start the first pass with the first row, and set unknown marker places from its
-        markers.
+        """Start the first pass with the first row, and set unknown marker places from its markers.
 
         The initial guess of the positions is that of the start of the problem's recording, moved
         rigidly with the pose, if there is a single grasp. If marker places are set, `model`, the
         bounds, the nuisance parameters in `p` and `prior` are replaced, and the row is computed
-        again.
+        again. `first_pass` is set; the samples of the row are not added to it.
+
+        Parameters
+        ----------
+        row : LoggedRow
+            First row, with the samples of its markers, if there are any.
 
         Raises
         ------
         SimulationError
-            If the initial state cannot be computed.
+            If the initial state cannot be computed; there is then no first pass.
         """
         model = self.model
         guesses = []
@@ -820,7 +826,8 @@ class LiveEstimator:
 
     def _restart(self) -> None:
         """Keep the information of all samples so far as a prior, discard passes, log and frames,
-        and wait for a new start; estimate and counts stay.
+        and wait for a new start; the estimate stays. The restart is counted in `counts`, as "begun
+        anew".
         """
         if self.first_pass is not None:
             self.prior = self.first_pass.measured_information
@@ -873,8 +880,11 @@ class LiveEstimator:
         )
 
     def _start_anew(self) -> None:
-        """Discard passes, log, frames and information, and return to the initial guess or to a
-        new search for it; counts and positions of markers stay.
+        """Discard passes, log, frames and information, the prior included, and return to the
+        initial guess or to a new search for it.
+
+        Trust region and scatter are as at the beginning, and a further search is allowed; other
+        counts, the samples so far and places of markers on the body stay.
         """
         model = self.model
         self.first_pass = self.second_pass = None
@@ -934,9 +944,9 @@ class LiveEstimator:
         )
 
     def _update_estimate(self) -> None:
-        """Set the estimate `p` to the minimum of the joint quadratic loss of the first and the
-        second pass, within bounds and trust region; without effect before the first pass, or if it
-        failed.
+        """Set the estimate `p` (P,) to the minimum of the joint quadratic loss of the first and the
+        second pass, within bounds and trust region; without effect before the first pass, or if
+        that failed.
         """
         if self.first_pass is not None and not self.first_pass.has_failed:
             self._combined = CombinedPasses.from_passes(
@@ -1125,12 +1135,13 @@ class LiveEstimator:
         return done
 
     def _catch_up(self, began: float, notes: list[str]) -> int:
-        """Complete a second pass that lags by few rows, if there is time, before new rows come.
+        """Complete a second pass that lags by few rows, if there is time, before new rows come; it
+        is then accepted or rejected.
 
         Parameters
         ----------
         began : float
-            Time at which the frame began, by `clock`.
+            Time at which the frame began, by `clock` [s].
         notes : list of str
             Extended in place.
 

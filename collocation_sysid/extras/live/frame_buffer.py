@@ -105,7 +105,7 @@ class FrameBuffer:
 
     @property
     def last_pose_s(self) -> float | None:
-        """Time of the last pose; None if there is none."""
+        """Time of the last pose [s]; None if there is none since the start or a reset."""
         return self._poses[-1][0] if self._poses else None
 
     def marker_samples(

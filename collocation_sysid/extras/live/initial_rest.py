@@ -56,8 +56,12 @@ class InitialRest:
     )
 
     def frames_before_motion(self, frame: Frame) -> list[Frame]:
-        """Add a frame and return the last frames at rest if the motion begins with this one after
-        a long rest of grasps and body; otherwise an empty list. Frames without a pose are ignored.
+        """Add a frame and return the last frames at rest, at most `REPLAYED_FRAMES`, if the motion
+        begins with this one after a long rest of grasps and body; otherwise an empty list.
+
+        A rest is long from `LONG_REST_FRAMES` frames with a pose on. Frames without a pose are
+        ignored, and so are all frames after the first motion, so that the list is not empty at most
+        once.
         """
         if self.is_over or frame.pose is None:
             return []
@@ -85,8 +89,11 @@ class InitialRest:
         )
 
     def _largest_displacement_at_rest_m(self) -> float:
-        """Return the largest displacement that is noise [m], from the differences between
-        consecutive poses of the first frames.
+        """Return the displacement [m] up to which a grasp is at rest: a share of the body's size,
+        or a multiple of the noise of the poses if that is larger.
+
+        The noise follows from the differences between consecutive poses of the first frames, at
+        least two.
         """
         steps_m = [
             self._displacement_m(after, reference=before)

@@ -144,18 +144,20 @@ class WindowPass:
     def add_rows(
         self, poses: Sequence[Poses], guesses: Sequence[Array] = ()
     ) -> int:
-        """Compute further rows of one block and return how many; `add_residuals` adds their
-        samples.
+        """Compute further rows of one block and return how many, at least one; `add_residuals` adds
+        their samples.
 
-        A new block begins if the last one is full. Without guesses, neither given nor from `base`,
-        `StreamingSweep.advance` decides where to start.
+        Fewer rows than given are computed if an initial guess turns out to be far off; the caller
+        passes the remaining poses again. A new block begins if the last one is full. Without
+        guesses, neither given nor from `base`, they are extrapolated.
 
         Parameters
         ----------
         poses : sequence of Poses
-            Poses of the moving grasps at the rows, at most `remaining_rows_of_block`.
+            Poses of the moving grasps at the rows, at least one, at most `remaining_rows_of_block`.
         guesses : sequence of (3n,), optional
-            Initial guesses of the positions; by default from the rows of `base`, if it has them.
+            Initial guesses of the positions [m]; by default from the rows of `base`, if it has
+            them.
 
         Raises
         ------
@@ -233,8 +235,8 @@ class WindowPass:
         ]
 
     def add_residuals(self, residuals: Sequence[LinearisedResidual]) -> None:
-        """Add the linearised residuals of samples to the last block and to the information; at
-        least one row must have been computed.
+        """Add the linearised residuals of samples to the last block and to the information, in
+        place; at least one row must have been computed.
         """
         self.blocks[-1].residuals += residuals
         self.sweep.add_residuals(residuals)
@@ -348,10 +350,11 @@ class WindowPass:
         return base.x + base.columns @ step.astype(np.float32)
 
     def drop_oldest_block(self) -> int:
-        """Add the samples of the oldest block to the prior and remove the block from the window;
+        """Add the samples of the oldest block to the prior, remove the block from the window, and
         return its number of rows.
 
-        `start` becomes the state before the next block; there must be at least two blocks.
+        `start` becomes the state before the next block, and `rows` decreases; there must be at
+        least two blocks. The information does not change.
         """
         block = self.blocks.pop(0)
         self.rows -= len(block.stored_rows)

@@ -57,8 +57,8 @@ class Disagreement:
 
     @property
     def sentence(self) -> str:
-        """Explanation for the user: the range of the parameter, and how the choice of the law
-        widens its interval if that is known.
+        """One or two sentences for the user: the range of the parameter, and how the choice of the
+        law widens its interval if that is known.
         """
         low = min(self.values.values())
         high = max(self.values.values())

@@ -85,10 +85,12 @@ def model_rows(
     list of Row
         By key: "model", "status" ("missing" if the fit to all recordings is not done), "converged",
         "free" (number of parameters), "unit" of the errors, "rms" of the fit to all, "held_out_rms"
-        over all predictions, "predictions" and "blocks" by recording, "failures" (messages by
-        recording), "evidence", "parameters", "budget", "total_s", "independent", "delta_aic" (AIC
-        less the smallest), "log_ratio" and "log_ratio_error" (prediction error relative to the
-        best), "chosen". Values are None if they are not known.
+        over all predictions, "predictions" (RMS) and "blocks" (sums of squares) by held-out
+        recording, "failures" (messages by recording), "evidence" (fields of `Evidence`),
+        "parameters" and "budget" by name, "total_s", "independent", "delta_aic" (AIC less the
+        smallest), "log_ratio" and "log_ratio_error" (logarithm of the prediction error relative to
+        the best), "chosen" (true for at most one row). Values are None if they are not known;
+        mappings are empty.
     """
     of_model: dict[str, dict[str, Any]] = {}
     for run in planned:

@@ -58,7 +58,8 @@ class ModelVariant:
 
 
 def parse_materials(text: str) -> tuple[str, ...]:
-    """Return names of materials from text separated by commas, each once.
+    """Return names of materials from text separated by commas, such as "neo-hookean,yeoh", each
+    once, in the order of the text.
 
     Raises
     ------
@@ -69,7 +70,8 @@ def parse_materials(text: str) -> tuple[str, ...]:
 
 
 def parse_dampings(text: str) -> tuple[str, ...]:
-    """Return names of damping laws from text separated by commas, each once.
+    """Return names of damping laws from text separated by commas, such as "kelvin-voigt,rayleigh",
+    each once, in the order of the text.
 
     Raises
     ------
@@ -82,12 +84,21 @@ def parse_dampings(text: str) -> tuple[str, ...]:
 def _parse_names(
     text: str, known_names: Iterable[str], option: str
 ) -> tuple[str, ...]:
-    """Return names from text separated by commas, each once.
+    """Return names from text separated by commas, each once, in the order of the text.
+
+    Parameters
+    ----------
+    text : str
+        Names, with or without spaces.
+    known_names : iterable of str
+        Names that are allowed.
+    option : str
+        Command-line option, for the message.
 
     Raises
     ------
     InputError
-        For an unknown name or none; it refers to the command-line option.
+        For an unknown name or none.
     """
     names = unique_items(text)
     for name in names or ("",):
@@ -127,12 +138,13 @@ def models(
     dampings: Sequence[str] = (),
 ) -> list[ModelVariant]:
     """Return a model for every problem file with every material, damping law and number of
-    branches; of several files the labels begin with that of the file.
+    branches, file after file; of several files the labels begin with that of the file.
 
     Parameters
     ----------
     problems : sequence of Problem
-        At least one, of the same recordings, each with its file.
+        At least one, of the same recordings, each with its file; time constants of new branches
+        start between the timestep and the duration of the first one's fitted recordings.
     overrides, materials, branches, region, dampings
         See `variants`. Without materials, branches and dampings the files themselves are the
         models.
@@ -387,11 +399,11 @@ def _require_region(
 def _law_changes(
     body: Mapping[str, Any], laws: Mapping[str, str], region: str | None
 ) -> dict[str, Any]:
-    """Return changed keys of the problem that give a material or damping law to a region, or for
-    None to all parts.
+    """Return changed values of the problem by dotted key, such as "object.material", that give a
+    material or damping law to a region, or for None to all parts.
 
     For all parts the laws of the body are set, and those of regions are removed, so that they
-    follow the body.
+    follow the body. With regions, "object.region" is the complete list of their tables.
 
     Parameters
     ----------

@@ -161,7 +161,9 @@ class StudyReport:
 
     @property
     def notes(self) -> list[str]:
-        """Notes that explain the tables, and the number of runs without a record, if there are any."""
+        """Notes that explain the tables, the criterion of success of a comparison of methods, and
+        the number of runs without a record, if there are any.
+        """
         missing = len(self.planned) - len(self.records)
         notes = (
             [f"{missing} of {len(self.planned)} runs remain to be done."]
@@ -440,8 +442,13 @@ def comparison_views(summaries: Sequence[Row]) -> list[Table]:
 
 
 def run_view(rows: Sequence[Row]) -> Table:
-    """Return a table of every run of a comparison, ordered by start, with headings in words; the
-    rows are those of `run_row`, at least one.
+    """Return the table "Runs" of all runs of a comparison of methods, ordered by start, with
+    headings in words.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row`, at least one; None is shown as a dash.
     """
     names = {"start": _text_cell("start"), "method": _text_cell("method")}
     cells: dict[str, Cell] = {

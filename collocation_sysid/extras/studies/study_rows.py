@@ -283,8 +283,15 @@ def _parameter_columns(
 
 
 def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
-    """Return the names of the parameters for which the first of `rows`, at least one, has a column
-    with the prefix `kind`.
+    """Return the names of the parameters for which there is a column with the prefix `kind`,
+    without the prefix.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        At least one row of `run_row` or `method_rows`, the first of which decides.
+    kind : str
+        Prefix of columns, such as "guess_", "value_" or "error_".
     """
     return [
         name.removeprefix(kind) for name in rows[0] if name.startswith(kind)
