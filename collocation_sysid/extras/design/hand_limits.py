@@ -207,8 +207,8 @@ class HandBounds:
 
     @property
     def reach(self) -> TimeDerivatives:
-        """Largest translation [m] and rotation [rad], (2,), along the farthest axis of the
-        workspace, and the limits of their first and second derivatives.
+        """Largest translation [m] along the farthest axis of the workspace and largest rotation
+        [rad], as an array (2,), with the limits of their first and second derivatives, (2,) each.
         """
         limits = self.limits
         farthest = np.maximum(-self.low_m, self.high_m).max()

@@ -99,8 +99,8 @@ class ErrorBars:
 
     @classmethod
     def from_draws(cls, errors: list[PredictedErrors]) -> ErrorBars:
-        """Return the error bars at the first of at least one draw, the middle, with the lowest and
-        the highest over all draws.
+        """Return the error bars at the first of at least one draw of θ, the middle, with the lowest
+        and the highest over all draws. `errors` are those at each draw, all with the same names.
         """
         each = [error.relative for error in errors]
         lowest, highest = (
@@ -293,9 +293,9 @@ class MotionObjective:
         )
 
     def value(self, coefficients: Array, bound: float) -> float:
-        """Return the logarithm of the error bar of a motion, combined over the draws; between one
-        and two times `FORBIDDEN` if a marker leaves the views, between two and three times if a
-        simulation fails.
+        """Return the logarithm of the relative error bar of a motion, combined over the draws;
+        between one and two times `FORBIDDEN` if a marker leaves the views, between two and three
+        times if a simulation fails.
 
         If the value at the middle of the prior exceeds `bound`, it is returned, and the other draws
         are not simulated.
@@ -303,9 +303,9 @@ class MotionObjective:
         Parameters
         ----------
         coefficients : (d,) array
-            Coefficients of the motion.
+            Unbounded coefficients of the motion, which is scaled to the limits of the robot.
         bound : float
-            Bound beyond which the value need not be exact.
+            Bound beyond which the value need not be exact; infinite for none.
         """
         experiment = self.recording.experiment(
             self.recording.poses(self.motion(coefficients))
@@ -408,19 +408,19 @@ def design_motion(
             seed=options.seed,
         )
         known = np.zeros((len(draws[0]),) * 2)
-    judge = MotionObjective(
+    objective = MotionObjective(
         recording,
         limits,
         criterion=criterion,
         draws=draws,
         known_information=known,
     )
-    criterion.require_known(judge.errors(0.0, draws[0]))
-    first = judge.first_guess(options, say)
+    criterion.require_known(objective.errors(0.0, draws[0]))
+    first = objective.first_guess(options, say)
     say("searching for a motion")
     evaluations = 1 if first.is_interrupted else options.evaluations
     best = minimise(
-        judge.value,
+        objective.value,
         HandMotion.coefficient_count(options.waves),
         evaluations=evaluations,
         seed=options.seed,
@@ -431,17 +431,17 @@ def design_motion(
     if best.coefficients is None or best.value >= FORBIDDEN:
         raise InputError(_no_motion_message(best), problem.path)
     say("simulating the best motion")
-    return _evaluate_design(judge, best, add=add)
+    return _evaluate_design(objective, best, add=add)
 
 
 def _evaluate_design(
-    judge: MotionObjective, best: SearchResult, add: bool
+    objective: MotionObjective, best: SearchResult, add: bool
 ) -> Design:
     """Return the design with the best motion, its error bars and its simulation.
 
     Parameters
     ----------
-    judge : MotionObjective
+    objective : MotionObjective
         Objective that was minimised.
     best : SearchResult
         Result of the search, which must have coefficients.
@@ -454,13 +454,15 @@ def _evaluate_design(
         If the motion cannot be simulated at some draw.
     """
     assert best.coefficients is not None
-    recording = judge.recording
-    motion = judge.motion(best.coefficients)
+    recording = objective.recording
+    motion = objective.motion(best.coefficients)
     experiment = recording.experiment(recording.poses(motion))
-    results = [recording.simulate_motion(experiment, q) for q in judge.draws]
-    after = _error_bars(judge, results)
+    results = [
+        recording.simulate_motion(experiment, q) for q in objective.draws
+    ]
+    after = _error_bars(objective, results)
     problem = recording.problem
-    values = problem.parameters.values(judge.draws[0])
+    values = problem.parameters.values(objective.draws[0])
     predicted = simulate(
         experiment,
         values,
@@ -472,55 +474,57 @@ def _evaluate_design(
         motion,
         experiment=with_markers(experiment, predicted.markers_m),
         predicted=predicted,
-        criterion=judge.criterion,
-        before=_before(judge, add),
+        criterion=objective.criterion,
+        before=_before(objective, add),
         after=after,
         added=add,
-        limits=judge.limits,
-        shares=judge.bounds.shares(motion),
+        limits=objective.limits,
+        shares=objective.bounds.shares(motion),
         best=best,
-        draws=len(judge.draws),
+        draws=len(objective.draws),
     )
 
 
-def _before(judge: MotionObjective, add: bool) -> ErrorBars | None:
-    """Return the error bars to compare with, over all draws of `judge`.
+def _before(objective: MotionObjective, add: bool) -> ErrorBars | None:
+    """Return the error bars to compare with, over all draws of `objective`.
 
     If the new recording is added (`add`) they are those of the existing recordings, else those of
     the motion of the template in the problem; None if that has a single pose or cannot be simulated
     at some draw.
     """
     if add:
-        return ErrorBars.from_draws([judge.errors(0.0, q) for q in judge.draws])
-    recording = judge.recording
+        return ErrorBars.from_draws(
+            [objective.errors(0.0, q) for q in objective.draws]
+        )
+    recording = objective.recording
     template = recording.template
     if len(template.grasps[0].poses.t_s) < 2:
         return None
     shipped = replace(recording, duration_s=template.duration_s)
     try:
         simulations = [
-            shipped.simulate_motion(template, q) for q in judge.draws
+            shipped.simulate_motion(template, q) for q in objective.draws
         ]
     except SimulationError:
         return None
-    return _error_bars(judge, simulations)
+    return _error_bars(objective, simulations)
 
 
 def _error_bars(
-    judge: MotionObjective, results: list[SimulatedMotion]
+    objective: MotionObjective, results: list[SimulatedMotion]
 ) -> ErrorBars:
     """Return the error bars of a motion, together with existing recordings and priors.
 
     Parameters
     ----------
-    judge : MotionObjective
+    objective : MotionObjective
         Objective with the existing recordings and the draws of q.
     results : list of SimulatedMotion
-        The motion simulated at each draw, in the order of `judge.draws`, the middle first.
+        The motion simulated at each draw, in the order of `objective.draws`, the middle first.
     """
-    pairs = zip(results, judge.draws, strict=True)
+    pairs = zip(results, objective.draws, strict=True)
     return ErrorBars.from_draws(
-        [judge.errors(each.information, q) for each, q in pairs]
+        [objective.errors(each.information, q) for each, q in pairs]
     )
 
 

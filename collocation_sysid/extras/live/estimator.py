@@ -479,16 +479,25 @@ class LiveEstimator:
             relinearised=rows,
         )
 
-    def _solve_batch(self, track: WindowPass, notes: list[str]) -> Run | None:
+    def _solve_batch(
+        self, first_pass: WindowPass, notes: list[str]
+    ) -> Run | None:
         """Return the run of the batch solve of the complete recording.
 
         None if the window does not hold the whole recording, if that cannot be solved as a batch
         (see `recording_from_log`), or if the solve is refused, which adds a sentence to `notes`, in
-        place. `track` is the first pass; the estimator is not changed.
+        place. The estimator is not changed.
+
+        Parameters
+        ----------
+        first_pass : WindowPass
+            Its prior is empty if the window holds the whole recording.
+        notes : list of str
+            Extended in place.
         """
         recording = (
             None
-            if track.prior.row_count
+            if first_pass.prior.row_count
             else recording_from_log(self.model, self.intake, log=self.log)
         )
         try:
@@ -560,12 +569,12 @@ class LiveEstimator:
             )
         return frame, notes
 
-    def _note_outliers(self, wild: NDArray[np.bool_]) -> str:
-        """Add the number of outliers to the counts, and return a note with their names; `wild` is a
-        mask (M,) of the markers with at least one true value.
+    def _note_outliers(self, is_outlier: NDArray[np.bool_]) -> str:
+        """Add the number of outliers to the counts, and return a note with their names;
+        `is_outlier` (M,) says which markers are, at least one.
         """
-        self.counts["wild"] += int(wild.sum())
-        names = ", ".join(self.names[m] for m in np.flatnonzero(wild))
+        self.counts["wild"] += int(is_outlier.sum())
+        names = ", ".join(self.names[m] for m in np.flatnonzero(is_outlier))
         return f"markers ignored as outliers: {names}"
 
     def _compute_rows(
@@ -593,21 +602,24 @@ class LiveEstimator:
         """
         done = 1
         notes = []
-        track = self.first_pass
+        first_pass = self.first_pass
         try:
-            if track is None:
+            if first_pass is None:
                 self._start_pass(rows[0])
-            elif not track.has_failed:
-                done = track.add_rows(
-                    [row.poses for row in rows[: track.remaining_rows_of_block]]
+            elif not first_pass.has_failed:
+                done = first_pass.add_rows(
+                    [
+                        row.poses
+                        for row in rows[: first_pass.remaining_rows_of_block]
+                    ]
                 )
         except SimulationError as error:
-            if track is None:
+            if first_pass is None:
                 self.intake.reset()
                 return 1, [
                     f"the initial state of the motion cannot be computed: {error}"
                 ]
-            track.has_failed = True
+            first_pass.has_failed = True
             notes = [
                 f"the body cannot be simulated with these parameters: {error}"
             ]
@@ -634,15 +646,15 @@ class LiveEstimator:
         rows : int
             Number of rows computed since the row after which the samples are evaluated.
         """
-        track = self.first_pass
-        if track is None:
+        first_pass = self.first_pass
+        if first_pass is None:
             return []
         notes = []
         sigma_m = self.model.segment.experiment.markers.sigma_m[:, None]
-        if track.has_failed:
+        if first_pass.has_failed:
             self.log[-1].samples.extend(readings)
             return notes
-        all_linearised = track.sweep.linearise_samples(
+        all_linearised = first_pass.sweep.linearise_samples(
             [(reading, rows) for reading in readings]
         )
         for reading, linearised in zip(readings, all_linearised, strict=True):
@@ -661,7 +673,7 @@ class LiveEstimator:
                 squared = np.sum((residual * sigma_m) ** 2, axis=1)
                 squares.append(squared)
             self.log[-1].samples.append(reading)
-        track.add_residuals(all_linearised)
+        first_pass.add_residuals(all_linearised)
         return notes
 
     def _outliers(self, residual: Array) -> NDArray[np.bool_]:
@@ -748,16 +760,16 @@ class LiveEstimator:
             trial.rows - 1, self.model.rows_per_chunk, self._block_rows - 1
         )
         for count in (1, most) * TIMING_REPETITIONS:
-            again = WindowPass(
+            second_pass = WindowPass(
                 self.model,
                 self.p,
                 prior=self.prior,
                 block_rows=self._block_rows,
                 base=trial,
             )
-            again.repeat_rows([row])
+            second_pass.repeat_rows([row])
             began = self.clock()
-            again.repeat_rows([row] * count)
+            second_pass.repeat_rows([row] * count)
             took_s[count] = min(took_s.get(count, np.inf), self.clock() - began)
         return TimeBudget.from_times(took_s[1], took_s[most], many=most)
 
@@ -794,10 +806,10 @@ class LiveEstimator:
                     + position
                 ).ravel()
             ]
-        track = WindowPass(
+        first_pass = WindowPass(
             model, self.p, prior=self.prior, block_rows=self._block_rows
         )
-        track.add_rows([row.poses], guesses)
+        first_pass.add_rows([row.poses], guesses)
         marker_samples = [
             reading.values for reading in row.samples if not reading.instrument
         ]
@@ -807,22 +819,22 @@ class LiveEstimator:
             else np.full((len(self.names), 3), np.nan)
         )
         self.model = model.with_marker_places(
-            first, track.blocks[0].stored_rows[0].x
+            first, first_pass.blocks[0].stored_rows[0].x
         )
         if self.model is not model:
             self._set_bounds()
             places = self.model.collocation.guess_p[model.collocation.nq :]
             self.p = np.concatenate([self.p[: model.collocation.nq], places])
             self.prior = SquareRootInformation.empty(self.model.parameter_count)
-            track = WindowPass(
+            first_pass = WindowPass(
                 self.model,
                 self.p,
                 prior=self.prior,
                 block_rows=self._block_rows,
             )
-            track.add_rows([row.poses], guesses)
-        self.first_pass = track
-        self._combined = CombinedPasses.from_passes(track, None)
+            first_pass.add_rows([row.poses], guesses)
+        self.first_pass = first_pass
+        self._combined = CombinedPasses.from_passes(first_pass, None)
 
     def _restart(self) -> None:
         """Keep the information of all samples so far as a prior, discard passes, log and frames,
@@ -918,7 +930,7 @@ class LiveEstimator:
         )
 
     def _largest_distance(
-        self, track: WindowPass, p: Array, points: Sequence[Array]
+        self, first_pass: WindowPass, p: Array, points: Sequence[Array]
     ) -> float:
         """Return the largest distance of p from some points, in the standard errors of a pass; 0
         without points.
@@ -928,7 +940,7 @@ class LiveEstimator:
 
         Parameters
         ----------
-        track : WindowPass
+        first_pass : WindowPass
             Pass whose standard errors are used.
         p : (P,)
             Parameters in the solver's coordinates, not transformed.
@@ -939,7 +951,8 @@ class LiveEstimator:
         distances = np.abs(np.array(points) - self.model.transformed(p))[:, :nq]
         return float(
             np.max(
-                distances / track.information.standard_errors[:nq], initial=0.0
+                distances / first_pass.information.standard_errors[:nq],
+                initial=0.0,
             )
         )
 
@@ -957,50 +970,55 @@ class LiveEstimator:
             )
 
     def _constrained_minimum(
-        self, track: WindowPass, known: SquareRootInformation
+        self, first_pass: WindowPass, known: SquareRootInformation
     ) -> Array:
         """Return the parameters p (P,), in the solver's coordinates, that minimise a quadratic loss
         within the bounds and the trust region about the linearisation point of a pass.
 
         Parameters
         ----------
-        track : WindowPass
+        first_pass : WindowPass
             Pass whose linearisation point is the centre of the trust region.
         known : SquareRootInformation
             Quadratic loss, in transformed parameters.
         """
         reach = self._trust * self.model.collocation.reach_p
-        low = np.maximum(self.lower, track.linearisation_point - reach)
-        high = np.minimum(self.upper, track.linearisation_point + reach)
+        low = np.maximum(self.lower, first_pass.linearisation_point - reach)
+        high = np.minimum(self.upper, first_pass.linearisation_point + reach)
         best = known.minimiser(
             self.model.transformed(low), self.model.transformed(high)
         )
         return np.clip(self.model.physical(best), low, high)
 
-    def _next_linearisation_point(self, track: WindowPass) -> Array:
+    def _next_linearisation_point(self, first_pass: WindowPass) -> Array:
         """Return the next linearisation point p (P,) of a pass, in the solver's coordinates
         (logarithms, or values of linear parameters; not transformed).
 
         It minimises the joint quadratic loss of the first and the second pass, plus a prior about
-        the linearisation point of `track`, within the bounds and the trust region about that point.
-        The prior keeps poorly determined parameters there, and is weaker the more rows are in the
-        window. Nothing is changed.
+        the linearisation point of the first one, within the bounds and the trust region about that
+        point. The prior keeps poorly determined parameters there, and is weaker the more rows are
+        in the window. Nothing is changed.
 
         Parameters
         ----------
-        track : WindowPass
-            First pass.
+        first_pass : WindowPass
+            The first pass.
         """
         size = self.model.parameter_count
         samples = len(self.log) / self.model.substeps
         deviation = POINT_PRIOR_DEVIATION * max(1.0, samples / TRIAL_SAMPLES)
         slopes = np.diag(
-            1 / (deviation * self.model.collocation.reach_p * track.sweep.rates)
+            1
+            / (
+                deviation
+                * self.model.collocation.reach_p
+                * first_pass.sweep.rates
+            )
         )
         information = self._combined.information.with_rows(
-            np.zeros(size), slopes, parameters=track.sweep.transformed
+            np.zeros(size), slopes, parameters=first_pass.sweep.transformed
         )
-        return self._constrained_minimum(track, information)
+        return self._constrained_minimum(first_pass, information)
 
     def _estimates_and_trust(
         self, t_s: float
@@ -1115,23 +1133,25 @@ class LiveEstimator:
                     self.first_pass, notes
                 )
                 self.budget.record_relinearisation(self.clock() - pass_began)
-            again = self.second_pass
-            if again is None:
+            second_pass = self.second_pass
+            if second_pass is None:
                 break
-            if not done and again.base is not None:
+            if not done and second_pass.base is not None:
                 self._relinearise_if_moved(
                     self.first_pass,
-                    again,
+                    second_pass,
                     began=began,
                     distance=RELINEARISE_DISTANCE,
                 )
             affordable = min(
                 self._affordable_rows(done, self.clock() - began),
-                again.repeatable_rows,
+                second_pass.repeatable_rows,
             )
             if not affordable:
                 break
-            done += self._advance_second_pass(again, affordable, notes=notes)
+            done += self._advance_second_pass(
+                second_pass, affordable, notes=notes
+            )
         return done
 
     def _catch_up(self, began: float, notes: list[str]) -> int:
@@ -1151,20 +1171,20 @@ class LiveEstimator:
             Number of rows that were computed again; 0 without a second pass, if it is a trial of a
             search, or if the remaining rows do not fit into the budget beside a usual frame.
         """
-        again = self.second_pass
-        if again is None or again.base is None:
+        second_pass = self.second_pass
+        if second_pass is None or second_pass.base is None:
             return 0
-        lag = len(self.log) - again.rows
+        lag = len(self.log) - second_pass.rows
         elapsed_s = self.clock() - began
         if lag > min(
-            again.repeatable_rows,
+            second_pass.repeatable_rows,
             self._affordable_rows(0, elapsed_s + self.budget.frame_s),
         ):
             return 0
-        return self._advance_second_pass(again, lag, notes=notes)
+        return self._advance_second_pass(second_pass, lag, notes=notes)
 
     def _advance_second_pass(
-        self, again: WindowPass, count: int, notes: list[str]
+        self, second_pass: WindowPass, count: int, notes: list[str]
     ) -> int:
         """Compute further rows of the second pass; if it has caught up or failed, accept or reject
         it, or record it as a trial of the search.
@@ -1175,7 +1195,7 @@ class LiveEstimator:
 
         Parameters
         ----------
-        again : WindowPass
+        second_pass : WindowPass
             The second pass, changed in place.
         count : int
             Largest number of rows, at least 1; those of the log that follow the rows of the pass.
@@ -1188,23 +1208,23 @@ class LiveEstimator:
             Number of rows that were computed.
         """
         before = self.clock()
-        first_row = again.rows
+        first_row = second_pass.rows
         try:
-            again.repeat_rows(self.log[first_row : first_row + count])
+            second_pass.repeat_rows(self.log[first_row : first_row + count])
         except SimulationError:
-            again.has_failed = True
+            second_pass.has_failed = True
         self.budget.record_steps(count, self.clock() - before)
         if self.search is not None and not self.search.is_done:
-            if again.has_failed or again.rows >= min(
+            if second_pass.has_failed or second_pass.rows >= min(
                 self.search.rows, len(self.log)
             ):
-                self.search.record_trial(again)
+                self.search.record_trial(second_pass)
                 self.second_pass = None
         elif (
-            again.has_failed or again.rows == len(self.log)
+            second_pass.has_failed or second_pass.rows == len(self.log)
         ) and self.first_pass is not None:
-            self._accept_or_reject(self.first_pass, again, notes=notes)
-        return again.rows - first_row
+            self._accept_or_reject(self.first_pass, second_pass, notes=notes)
+        return second_pass.rows - first_row
 
     def _affordable_rows(self, done: int, elapsed_s: float) -> int:
         """Return how many rows may be computed again: as many as fit into the rest of the time
@@ -1223,7 +1243,7 @@ class LiveEstimator:
         return self.budget.affordable_steps(self.budget_s - elapsed_s)
 
     def _start_second_pass(
-        self, track: WindowPass, notes: list[str]
+        self, first_pass: WindowPass, notes: list[str]
     ) -> WindowPass | None:
         """Return a new second pass, without rows yet, if one is needed, otherwise None; the caller
         sets `second_pass`.
@@ -1232,25 +1252,25 @@ class LiveEstimator:
         rows, and for the best values at the end; a search begins here, and sets `search`, if the
         first pass failed before rows left the window. If no trial succeeded, the search ends with a
         note. Without a search a pass is needed if the estimate has moved farther than
-        `REPEAT_DISTANCE` from a linearisation point of `track`, or if the sweep needs another pass,
-        but not after a failure.
+        `REPEAT_DISTANCE` from a linearisation point of the first pass, or if its sweep needs
+        another pass, but not after a failure.
 
         Parameters
         ----------
-        track : WindowPass
+        first_pass : WindowPass
             The first pass, not changed; a new pass repeats it, but for a trial.
         notes : list of str
             Beginning and failure of a search; extended in place.
         """
         search = self.search
-        at_start = track.start[0] is None
-        if search is None and track.has_failed and at_start:
+        at_start = first_pass.start[0] is None
+        if search is None and first_pass.has_failed and at_start:
             search = self.search = self._new_search()
             notes.append(
                 "searching for initial values over a range of stiffnesses"
             )
         p = self.p
-        base = track
+        base = first_pass
         if search is not None:
             if not search.is_done and (
                 len(self.log) < search.rows or not at_start
@@ -1264,29 +1284,29 @@ class LiveEstimator:
                     "found no initial values over a range of stiffnesses"
                 )
                 return None
-        elif track.has_failed:
+        elif first_pass.has_failed:
             return None
         else:
-            p = self._next_linearisation_point(track)
+            p = self._next_linearisation_point(first_pass)
             if (
                 self._largest_distance(
-                    track, p, points=track.linearisation_points
+                    first_pass, p, points=first_pass.linearisation_points
                 )
                 <= REPEAT_DISTANCE
-                and not track.sweep.needs_another_pass
+                and not first_pass.sweep.needs_another_pass
             ):
                 return None
         return WindowPass(
             self.model,
             p,
-            prior=track.prior,
+            prior=first_pass.prior,
             block_rows=self._block_rows,
             base=base,
         )
 
     def _relinearise_if_moved(
         self,
-        track: WindowPass,
+        first_pass: WindowPass,
         pass_to_move: WindowPass,
         began: float,
         distance: float,
@@ -1298,20 +1318,20 @@ class LiveEstimator:
 
         Parameters
         ----------
-        track : WindowPass
+        first_pass : WindowPass
             First pass, which gives the standard errors.
         pass_to_move : WindowPass
-            Pass to change, in place; may be `track`.
+            Pass to change, in place; may be the first one.
         began : float
             Time at which the frame began, by `clock` [s].
         distance : float
-            Smallest distance between them, in standard errors.
+            Smallest distance between point and estimate, in standard errors.
         """
         current_point = [pass_to_move.sweep.transformed]
         if (
             pass_to_move.rows
             < pass_to_move.last_relinearised_row + self.model.rows_per_chunk
-            or self._largest_distance(track, self.p, points=current_point)
+            or self._largest_distance(first_pass, self.p, points=current_point)
             <= distance
         ):
             return
@@ -1320,45 +1340,59 @@ class LiveEstimator:
             0, before - began + self.budget.turn_s
         ):
             return
-        p = self._next_linearisation_point(track)
-        if self._largest_distance(track, p, points=current_point) > distance:
+        p = self._next_linearisation_point(first_pass)
+        if (
+            self._largest_distance(first_pass, p, points=current_point)
+            > distance
+        ):
             pass_to_move.relinearise_at(p)
             self.budget.record_relinearisation(self.clock() - before)
 
     def _accept_or_reject(
-        self, track: WindowPass, again: WindowPass, notes: list[str]
+        self, first_pass: WindowPass, second_pass: WindowPass, notes: list[str]
     ) -> None:
-        """Replace the first pass `track` by the second one, `again`, if that fits about as well as
-        expected, and enlarge the trust region; otherwise discard it and shrink the region.
+        """Replace the first pass by the second one if that fits about as well as expected, and
+        enlarge the trust region; otherwise discard the second one and shrink the region.
 
         A pass that has not failed always replaces one that has. A search for initial values ends
         either way. After `LARGEST_REJECTIONS` rejections in a row with grossly large residuals, a
-        search begins, once in the life of the estimator. The estimate is updated, and `notes` are
-        extended in place.
+        search begins, once in the life of the estimator. The estimate is updated.
+
+        Parameters
+        ----------
+        first_pass : WindowPass
+            The present first pass.
+        second_pass : WindowPass
+            Pass over all rows of the log, or one that has failed.
+        notes : list of str
+            Extended in place.
         """
         self.second_pass = None
         was_search = self.search is not None
         self.search = None
-        points = [*track.linearisation_points, again.linearisation_points[0]]
-        expected = max(track.information.loss(point) for point in points)
+        points = [
+            *first_pass.linearisation_points,
+            second_pass.linearisation_points[0],
+        ]
+        expected = max(first_pass.information.loss(point) for point in points)
         # The loss of a pass whose linearisation point was changed is not that of a simulation.
         is_within_trust_region = (
-            track.last_relinearised_row
+            first_pass.last_relinearised_row
             and self._largest_distance(
-                track,
-                track.linearisation_point,
-                points=again.linearisation_points,
+                first_pass,
+                first_pass.linearisation_point,
+                points=second_pass.linearisation_points,
             )
             <= REPEAT_DISTANCE
         )
         fits = (
-            track.has_failed
+            first_pass.has_failed
             or is_within_trust_region
-            or again.loss <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
+            or second_pass.loss <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
         )
-        if not again.has_failed and fits:
-            again.base = None
-            self.first_pass = again
+        if not second_pass.has_failed and fits:
+            second_pass.base = None
+            self.first_pass = second_pass
             self._trust = (
                 INITIAL_RADIUS
                 if was_search
@@ -1367,14 +1401,17 @@ class LiveEstimator:
             self._rejected = 0
             if was_search:
                 notes.append("restarted with another stiffness")
-            self.scatter = CombinedPasses.from_passes(again, None).scatter(
-                again.sweep.transformed
-            )
+            self.scatter = CombinedPasses.from_passes(
+                second_pass, None
+            ).scatter(second_pass.sweep.transformed)
         else:
             reach = self.model.collocation.reach_p
             length = float(
                 np.abs(
-                    (again.linearisation_point - track.linearisation_point)
+                    (
+                        second_pass.linearisation_point
+                        - first_pass.linearisation_point
+                    )
                     / reach
                 ).max()
             )
@@ -1388,7 +1425,7 @@ class LiveEstimator:
                 is_stuck
                 and not was_search
                 and not self.counts["searched"]
-                and track.start[0] is None
+                and first_pass.start[0] is None
             ):
                 self.counts["searched"] += 1
                 self.search = self._new_search()

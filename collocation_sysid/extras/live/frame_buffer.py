@@ -311,7 +311,8 @@ class FrameBuffer:
 
     def _completed_rows(self) -> list[LoggedRow]:
         """Return the rows for which poses are available now, each with the samples that can be
-        evaluated after it, and increase `rows`; none before the first pose.
+        evaluated after it, and increase `rows`; none before the first pose. The samples are removed
+        from the buffer.
         """
         rows: list[tuple[Array, Array, list[Sample]]] = []
         if self.start_s is None:

@@ -576,8 +576,9 @@ class FrameReader:
 
     @property
     def _instrument_columns(self) -> list[Sequence[str]]:
-        """Column names of each instrument: custom sensors, then sensors of grasps; the latter with
-        the number of the grasp and a dot in front if there are several.
+        """Column names of each instrument: custom sensors, then the six of each sensor of a grasp,
+        "fx_n" to "tz_nm"; the latter with the number of the grasp and a dot in front if there are
+        several.
         """
         before = [
             "" if len(self.wrenches) == 1 else f"{number}."

@@ -73,8 +73,9 @@ def _only_experiment(problem: Problem) -> Experiment:
 def _unsupported_features(
     experiment: Experiment,
 ) -> Iterator[tuple[str, object, str]]:
-    """Yield each feature that live estimation lacks: its description, a value that is true if the
-    experiment has the feature, and the supported alternative.
+    """Yield for each feature that live estimation lacks, whether the experiment has it or not: its
+    description, a value that is true if the experiment has the feature, and the supported
+    alternative.
     """
     body = experiment.body
     grasps = experiment.grasps

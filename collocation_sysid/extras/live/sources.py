@@ -184,7 +184,8 @@ def paced_frames(
 
 @contextmanager
 def without_garbage_of_startup() -> Iterator[None]:
-    """Exclude all existing objects from garbage collection within this context.
+    """Context within which all objects that exist at its beginning are excluded from garbage
+    collection, after one collection.
 
     A collection of all objects takes longer than some frames.
     """

@@ -69,9 +69,9 @@ class StiffnessSearch:
             else None
         )
 
-    def record_trial(self, track: WindowPass) -> None:
-        """Record the loss of a pass as the result of the next trial; a failed pass has an infinite
-        loss.
+    def record_trial(self, trial: WindowPass) -> None:
+        """Record the loss of the pass `trial` as the result of the next trial; a failed pass has an
+        infinite loss.
 
         After at least one success and at least three trials, the search ends if each of the last
         two losses exceeds `FAILURE_RATIO` times the smallest one.
@@ -84,8 +84,8 @@ class StiffnessSearch:
         self._waiting.pop(0)
         self._tried.append(
             (
-                np.inf if track.has_failed else track.loss,
-                track.linearisation_point,
+                np.inf if trial.has_failed else trial.loss,
+                trial.linearisation_point,
             )
         )
         least = min(loss for loss, _ in self._tried)

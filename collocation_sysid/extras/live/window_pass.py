@@ -402,38 +402,46 @@ class CombinedPasses(NamedTuple):
 
     @classmethod
     def from_passes(
-        cls, track: WindowPass, again: WindowPass | None
+        cls, first_pass: WindowPass, second_pass: WindowPass | None
     ) -> CombinedPasses:
-        """Return the joint information of a pass `track` and of a repetition `again` that has
-        nearly caught up with it: the samples that both have count from the repetition, the rest
-        from the pass.
+        """Return the joint information of a first pass and of a second one that repeats it and has
+        nearly caught up: the samples that both have count from the second, the rest from the first.
 
-        If the repetition is None, has failed, has no base (a trial of other initial values), or
-        lags behind by more than `LARGEST_LAG` samples or than its own samples, the information is
-        that of the pass alone.
+        If the second is None, has failed, has no base (a trial of other initial values), or lags
+        behind by more than `LARGEST_LAG` samples or than its own samples, the information is that
+        of the first alone.
+
+        Parameters
+        ----------
+        first_pass : WindowPass
+            Pass with all rows of the window; not changed.
+        second_pass : WindowPass or None
+            Repetition of its first rows; not changed.
         """
-        residuals = track.residuals
+        residuals = first_pass.residuals
         repeated = (
-            again.residuals
-            if again is not None and again.base is not None
+            second_pass.residuals
+            if second_pass is not None and second_pass.base is not None
             else []
         )
         remaining = residuals[len(repeated) :]
         if (
-            again is None
-            or again.has_failed
+            second_pass is None
+            or second_pass.has_failed
             or not repeated
             or len(remaining) > min(LARGEST_LAG, len(repeated))
         ):
             return cls(
-                track.information, residuals, points=track.linearisation_points
+                first_pass.information,
+                residuals,
+                points=first_pass.linearisation_points,
             )
         points = [
-            *again.linearisation_points,
-            *track.linearisation_points_from(again.rows),
+            *second_pass.linearisation_points,
+            *first_pass.linearisation_points_from(second_pass.rows),
         ]
         return cls(
-            track.sweep.with_residuals(again.information, remaining),
+            first_pass.sweep.with_residuals(second_pass.information, remaining),
             [*repeated, *remaining],
             points=points,
         )

@@ -103,7 +103,7 @@ def comparison_plots(
 
 def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
     """Return colour and rows of each method by its name, in the order of their first rows; colours
-    repeat if there are more methods than colours.
+    repeat if there are more methods than colours. `rows` are those of `run_row`.
     """
     methods = dict.fromkeys(row["method"] for row in rows)
     return {
@@ -242,15 +242,16 @@ def success_by_distance(
 def basins(
     rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: bool
 ) -> Figure:
-    """Return a figure of the start points over each pair of parameters, a row of panels for each
-    method; a single parameter is paired with itself.
+    """Return a figure of the guesses of all runs, relative to a reference, over each pair of
+    parameters, a row of panels for each method; a single parameter is paired with itself. Successes
+    and failures have different marks.
 
     Parameters
     ----------
     rows : sequence of Row
-        Runs with a guess of each parameter.
+        Rows of `run_row`, at least one, with a guess of each parameter.
     centre : mapping of str to float
-        Reference by name, relative to which guesses are drawn.
+        Positive reference by name, relative to which guesses are drawn; at least one.
     is_truth_known : bool
         Whether the reference is the truth, otherwise the best estimate; for the labels.
     """
@@ -403,15 +404,16 @@ def sweep_plots(
 def estimates_against(
     rows: Sequence[Row], varied_keys: Sequence[str]
 ) -> Figure:
-    """Return a figure of estimates with their 95 % intervals: a row for each parameter, a column
-    for each swept key.
+    """Return a figure of estimates with their combined 95 % intervals: a row for each parameter, a
+    column for each swept key.
 
-    Estimates that did not converge are crosses. Values of the first other key have colours.
+    Estimates that did not converge are crosses, unknown ones are left out. Values of the first
+    other key have colours.
 
     Parameters
     ----------
     rows : sequence of Row
-        One for each run, at least one with a result.
+        Rows of `run_row`, one for each run, at least one with a result.
     varied_keys : sequence of str
         Swept keys.
     """

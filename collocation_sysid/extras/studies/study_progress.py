@@ -82,8 +82,8 @@ class StudyProgress(Watched):
         self.update(Text(line, style="dim"), line)
 
     def _remaining_text(self, worker_count: int) -> str:
-        """Return "; about … left", from the times of finished runs and the number of runs at once;
-        empty if the remaining time is unknown.
+        """Return "; about … left" with a duration, from the times of finished runs and the number
+        of runs at once; empty if no run waits or none has finished.
         """
         remaining_s = remaining_time_s(
             [run.method for run in self._waiting.values()],
