@@ -134,7 +134,8 @@ def write_benchmark(
     Raises
     ------
     InputError
-        If there are no bodies, the data of a body are missing, or the folder has other files.
+        If there are no bodies, the data of a body or the value of a parameter are missing, or the
+        folder has other files; nothing is written then.
     SimulationError
         If a simulation fails; nothing is written then.
     """

@@ -163,7 +163,8 @@ def _number(
 
 
 def _read_archive(file: Path, measured: Signal) -> tuple[Array, Array]:
-    """Return the keys (N,) and the values (N, C) of an NPZ archive, markers (N, M, 3) as (N, 3 M).
+    """Return the keys (N,) and the values (N, C) of an NPZ archive: its arrays called
+    `measured.key` and "values". Positions of markers (N, M, 3) become (N, 3 M).
 
     Raises
     ------

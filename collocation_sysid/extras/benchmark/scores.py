@@ -71,7 +71,7 @@ UNITS = {"markers": "m", "forces": "N", "stresses": "Pa"}
 
 
 def score_benchmark(folder: str | Path, body: str | None = None) -> list[Score]:
-    """Score the predictions in a benchmark folder.
+    """Return the scores of the predictions in a benchmark folder; nothing is written.
 
     Parameters
     ----------
@@ -79,18 +79,19 @@ def score_benchmark(folder: str | Path, body: str | None = None) -> list[Score]:
         Folder that `write_benchmark` wrote, with a prediction file of each recording added to the
         folder of its body.
     body : str, optional
-        Only this body; all by default.
+        Name of the only body to score; all by default.
 
     Returns
     -------
     list of Score
-        For each recording the prediction, the forward simulation of this package, and the
+        For each recording three: the prediction, the forward simulation of this package, and the
         undeformed body.
 
     Raises
     ------
     InputError
-        If the folder is no benchmark or was changed, or if a prediction is missing or invalid.
+        If the folder is no benchmark or was changed, has no such body, or if a prediction is
+        missing or invalid.
     """
     content = BenchmarkContent.read(Path(folder))
     names = content.bodies

@@ -238,8 +238,11 @@ def _mean_edge_m(body: IdentifiedBody) -> float:
 
 
 def _keyframe_xml(body: IdentifiedBody) -> str:
-    """Return the XML of the state at the first sample: simulated displacements, or zero if the run
-    has no forward simulation, and the declared initial velocities, or zero.
+    """Return the XML of the key frame "start", the state at the first sample: poses of the grasps,
+    then displacements of the free nodes, and their velocities.
+
+    Displacements from `IdentifiedBody.nodes_m` are the simulated ones, or zero if the run has no
+    forward simulation; velocities are the declared initial ones, or zero.
     """
     free = ~body.is_node_prescribed
     shape = body.nodes_m if body.simulated_m is None else body.simulated_m[0]
@@ -390,6 +393,15 @@ def _compare_motion(
 
     Deformation is the distance of free nodes from the rigidly moved body. The equality constraints
     of `model` are switched off, in place, and grasped bodies are moved directly.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+        Body with a forward simulation.
+    mujoco : module
+        Module of MuJoCo.
+    model : MjModel
+        Exported model.
 
     Raises
     ------

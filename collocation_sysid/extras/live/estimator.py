@@ -419,8 +419,8 @@ class LiveEstimator:
 
     @property
     def node_positions_m(self) -> Array | None:
-        """Node positions (n, 3) of the latest row at the estimate [m], to first order around the
-        linearisation point; None before the first row.
+        """Node positions (n, 3) [m] of the body at the latest row, at the estimate, to first order
+        around the linearisation point; None before the first row.
         """
         if self.first_pass is None:
             return None
@@ -1436,10 +1436,11 @@ class LiveEstimator:
         self._update_estimate()
 
     def _drop_old_rows(self) -> None:
-        """Remove the oldest blocks of rows from the first pass and the log if the window is full.
+        """Remove the oldest blocks of rows from the first pass and the log if the window is full;
+        their information becomes part of the prior of the pass.
 
         While a second pass needs them, they stay, up to twice the window; beyond that the second
-        pass is discarded. A failed first pass with that many rows is restarted.
+        pass is discarded. A failed first pass with that many rows is restarted, see `_restart`.
         """
         if self.first_pass is None:
             return

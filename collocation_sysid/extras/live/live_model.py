@@ -22,10 +22,11 @@ MIDDLE_PA = 1e4
 
 
 def model_from_problem(problem: Problem) -> StreamingModel:
-    """Return the model of a problem with one fitted experiment; held-out experiments are ignored.
+    """Return the model for live estimation of a problem with one fitted experiment; held-out
+    experiments are ignored, and the problem is not modified.
 
-    Parameters without a guess take typical values for the stiffness `MIDDLE_PA`; those with a
-    guess keep it.
+    Parameters without a guess take typical values for the stiffness `MIDDLE_PA`; those with a guess
+    keep it.
 
     Raises
     ------

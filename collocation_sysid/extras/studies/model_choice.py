@@ -427,8 +427,8 @@ def _prediction_text(row: Row) -> str:
 
 
 def display_unit(unit: str) -> tuple[float, str]:
-    """Return factor and unit for display: metres as millimetres, pascals as kilopascals, other
-    units unchanged.
+    """Return factor and unit for the display of numbers in `unit`: (1000, "mm") for "m", (0.001,
+    "kPa") for pascals, and (1, `unit`) for others.
     """
     return {"m": (1e3, "mm"), STRESS_UNIT: (1e-3, "kPa")}.get(unit, (1.0, unit))
 
@@ -591,8 +591,15 @@ def evidence_from_fit(fit: LinearisedFit) -> Evidence:
 def _independent_measurements(
     block: ResidualBlock, process: ErrorProcess
 ) -> float:
-    """Return the equivalent number of independent measurements in one block of residuals, at most
-    the number of measurements, from the correlation of its errors in time and between channels.
+    """Return the equivalent number of independent measurements in one block of residuals, above
+    zero and at most the number of measurements.
+
+    Parameters
+    ----------
+    block : ResidualBlock
+        Residuals with at least one measurement.
+    process : ErrorProcess
+        Correlation of the errors of this block in time and between its channels.
     """
     lags = np.arange(1, len(process.autocorrelation))
     in_time = 1 + 2 * float(

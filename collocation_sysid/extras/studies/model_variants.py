@@ -466,7 +466,13 @@ def _with_material(
 def _with_part_material(
     parameters: Mapping[str, Any], prefix: str, material: str, of_any: set[str]
 ) -> dict[str, Any]:
-    """Return the parameters with another material in the part whose constants have this prefix.
+    """Return a copy of the parameters with another material in the part whose constants have this
+    prefix.
+
+    Constants of the part that the material does not have are left out. Those that it needs are
+    added, each with a table of `_starting_guess`; the shear modulus, Poisson's ratio and other
+    elastic constants only if the part neither has nor shares one that takes their place. Other
+    parameters stay.
 
     Parameters
     ----------

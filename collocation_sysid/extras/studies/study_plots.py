@@ -303,8 +303,11 @@ def basins(
 
 
 def _ratio_axes(axes: Axes, factor: float) -> None:
-    """Set both axes, in place, to a logarithmic scale from 0.8/`factor` to 1.25 `factor` (at least
-    1), with ticks at 1 and at a round ratio and its inverse.
+    """Set both axes, in place, to a logarithmic scale around one, with ticks at 1 and at a round
+    ratio and its inverse.
+
+    The scale ends at 0.8 / `factor` and 1.25 · `factor`; `factor`, the largest ratio that is drawn,
+    is at least 1.
     """
     digit = 10 ** np.floor(np.log10(factor))
     tick = (

@@ -61,7 +61,8 @@ class StudyProgress(Watched):
         Parameters
         ----------
         record : Record
-            Record of one of the remaining runs, which has not been counted yet.
+            Record of one of the remaining runs, which has not been counted yet, with "key" and
+            "outcome".
         worker_count : int
             Number of runs that are executed at once.
 
