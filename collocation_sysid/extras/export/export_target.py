@@ -200,7 +200,8 @@ class TargetCapabilities:
         return sentences if self.is_tested else [*sentences, UNTESTED]
 
     def _obstacle_limitations(self, body: IdentifiedBody) -> Iterator[str]:
-        """Yield sentences on what the simulator cannot express of the obstacles.
+        """Yield sentences on what the simulator cannot express of the obstacles of a body; none
+        without obstacles.
 
         Of an obstacle whose shape is not exported nothing else is said.
         """
@@ -303,13 +304,17 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
 
 
 def longest_displacement_m(displacements_m: Array) -> float:
-    """Return the largest length of displacements (n, 3) [m]; NaN if one is NaN."""
+    """Return the largest length of displacements (n, 3) [m], at least one; NaN if one is NaN."""
     return float(np.linalg.norm(displacements_m, axis=1).max())
 
 
 def linear_tetrahedra(body: IdentifiedBody) -> list[Index]:
     """Return the node indices of the linear tetrahedra (k, 4) of each region, in the order of
-    `IdentifiedBody.regions`; each quadratic one is split into eight on the same nodes.
+    `IdentifiedBody.regions`.
+
+    Linear elements are returned as they are, in the order of the region's cells; each quadratic one
+    is split into eight, which follow each other. Indices count from 0 and refer to
+    `IdentifiedBody.nodes_m`, to which no nodes are added.
     """
     if not body.is_quadratic:
         return [body.body.cells[region.cells] for region in body.regions]
@@ -358,5 +363,7 @@ def comment_lines(
 
 
 def xml_attribute(text: str) -> str:
-    """Return a name as a quoted attribute of XML, with marks in place of control characters."""
+    """Return a name as the value of an XML attribute, escaped and in quotation marks, with marks in
+    place of control characters.
+    """
     return quoteattr(printable(text))
