@@ -201,16 +201,16 @@ def simulate_with_parameters(
     segment : Transcription
         The recording as it was fitted, see `transcription_and_nuisance`.
     phi : (k,) array
-        Nuisance parameters of the recording.
+        Nuisance parameters of the recording, in units of their prior standard deviations.
     parameters : mapping of name to value
-        All parameters of the problem.
+        All parameters of the problem, in SI units.
     report : callable, optional
         Called with the completed share, from 0 to 1.
 
     Returns
     -------
     ForwardSimulation
-        Without what concerns validation.
+        `nuisance`, `places_m`, `blind_error` and `copy_error` are empty or None.
 
     Raises
     ------

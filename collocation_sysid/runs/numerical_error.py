@@ -75,7 +75,7 @@ def refine(
     Parameters
     ----------
     run : SolvedProblem
-        Run that has converged; not modified.
+        Run that has converged, which is not checked; not modified, apart from cached properties.
     levels : int
         Number of discretisations of each kind, see `solve_refined`.
     report_progress : callable, optional
@@ -244,6 +244,9 @@ def _level_summary(
     kind: str, level: int, solution: Solution
 ) -> RefinementLevel:
     """Return size, cost and estimates of a solved level.
+
+    Nodes and time steps are sums over the bodies and the fitted experiments; the values, also of
+    fixed parameters and derived moduli, are physical.
 
     Parameters
     ----------

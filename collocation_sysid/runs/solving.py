@@ -183,7 +183,9 @@ def _solve_once(
     one and no earlier solution is given, else as `_solve_directly`, which describes the arguments
     and errors.
 
-    If the coarse start is not possible or fails, the problem is solved directly, with a note.
+    If the coarse start is not possible or fails, the problem is solved directly, with a note. After
+    an interrupt of the coarse solve its point is returned as an interrupted solution, see
+    `interrupted_solution`.
     """
 
     def solve_directly(from_problem: Problem) -> Solution:
@@ -348,6 +350,11 @@ def _solve_directly(
     workers : ExperimentExecutor or None
         Workers for reduced space; None for this process.
 
+    Returns
+    -------
+    Solution
+        Also if the search failed: see its `status`.
+
     Raises
     ------
     InputError
@@ -486,8 +493,9 @@ def best_of_second_start(
     """Return the better of a solution and of the solution from its `second_start_parameters`, with
     a note if that is the second one.
 
-    Without a second start the first solution is returned; after an interrupt it is returned as
-    interrupted. The history of the first search is not part of the second solution.
+    The second is better if it converges with a loss that is lower by more than `LEAST_GAIN`.
+    Without a second start the first solution is returned; after an interrupt a copy of it with the
+    status of the interrupt. The history of the first search is not part of the second solution.
 
     Parameters
     ----------
@@ -568,8 +576,8 @@ def second_start_parameters(solution: Solution) -> Parameters | None:
     usual one at the same Young's modulus.
 
     A ratio is high above `NEARLY_INCOMPRESSIBLE`. Only ratios of regions count in which both
-    moduli, or the ratio alone, are estimated. None if no ratio is high, or if a replaced value is
-    not within its bounds.
+    moduli, or the ratio alone, are estimated. Other estimated parameters have their estimates as
+    guesses. None if no ratio is high, or if a replaced value is not within its bounds.
     """
     collocation = solution.collocation
     values = parameter_values(solution.collocation, solution.q)

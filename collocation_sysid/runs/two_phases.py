@@ -569,8 +569,11 @@ def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
 def _associations(
     collocation: Collocation, experiments: Sequence[Experiment]
 ) -> dict[str, Association]:
-    """Return the associations of a program, by experiment, for the bodies of
-    `experiments`, which differ from those of the program in their fields only.
+    """Return new associations of the measurements of a program, by name of the fitted experiment,
+    that refer to the bodies of `experiments`.
+
+    The associations themselves are unchanged: the bodies differ from those of the program in their
+    fields only. `experiments` must contain every fitted experiment.
     """
     bodies = {experiment.name: experiment.body for experiment in experiments}
     return {

@@ -308,7 +308,7 @@ def expected_rms_m(
     solution: Solution, uncertainty: Uncertainty | None
 ) -> float:
     """Return the RMS distance [m] of the fitted markers that is expected from noise with the stated
-    σ, less what the fitted parameters absorb.
+    σ, less what the fitted parameters absorb; 0 without markers.
 
     Parameters
     ----------

@@ -101,7 +101,9 @@ def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
 
 
 def slenderness(mesh: TetMesh) -> Slenderness:
-    """Return length and thickness of a body, and the number of elements across its thickness."""
+    """Return length and thickness [m] of an undeformed body, and the number of elements across its
+    thickness.
+    """
     # Edges of the box with the same second moments, however it is turned.
     edges = np.sqrt(12 * np.linalg.eigvalsh(_covariance(mesh)))
     # A bent or hollow body is thinner than its extents: six times volume over surface is a cube's
@@ -172,7 +174,9 @@ def element_concerns(
 
 
 def _covariance(mesh: TetMesh) -> Array:
-    """Return the mean of (x − x̄)(x − x̄)ᵀ over the volume of a mesh, (3, 3) [m²]."""
+    """Return the mean of (x − x̄)(x − x̄)ᵀ over the undeformed volume of a mesh, (3, 3) [m²], with
+    its centroid x̄.
+    """
     shares = mesh.volumes_m3 / mesh.volume_m3
     corners = mesh.points_m[mesh.tetrahedra]
     corners = corners - shares @ corners.mean(axis=1)
@@ -284,6 +288,8 @@ def check_body(
         Names of its experiments.
     is_homogeneous : bool
         Whether it is the cell of specimens, which has no discretisation error.
+    point_masses_kg : mapping of str to float, optional
+        Sum of the point masses by experiment [kg]; none by default.
     """
     mesh = body.mesh
     fields = {
@@ -450,9 +456,9 @@ def _check_grasp(
     points_m : (n, 3) array
         Nodes of the undeformed body.
     grasp : Grasp
-        Grasp with its nodes selected.
+        Grasp with its nodes selected, at least one.
     mean_edge_m : float
-        Mean edge length of the mesh.
+        Mean edge length of the mesh [m].
     """
     nodes = grasp.nodes
     grasped_m = points_m[nodes]

@@ -104,8 +104,9 @@ def check_recording(
     Parameters
     ----------
     experiment : Experiment
-    positions_m : (T, n, 3) or None
-        Its simulation at the guess, at the samples or the first of them.
+    positions_m : (T, n, 3) array or None
+        Its node positions in the simulation at the guess [m], at all samples or the first T; None
+        without a simulation, and then no `start_miss_m` is known.
     """
     markers = experiment.markers
     miss = np.zeros((0, len(markers.names)))
