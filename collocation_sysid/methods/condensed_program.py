@@ -290,7 +290,9 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def _remaining(self) -> tuple[Index, Index]:
-        """Indices of the variables and of the constraints that remain."""
+        """Indices in the complete program, ascending, of the variables and of the constraints that
+        remain: two int arrays.
+        """
         variables = np.arange(self.complete.variable_count)
         rows = np.arange(self.complete.constraint_count)
         for each in self.eliminated:
@@ -560,8 +562,8 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
-        """Indices, in the values of the Hessian, of the diagonal entries of q, and of those of the
-        positions that remain.
+        """Indices, in the values of the Hessian's upper triangle, of the diagonal entries of q
+        (nq,), and of those of the positions that remain.
         """
         places = np.full(len(self.complete.hessian_structure[1]), -1)
         places[self._hessian.remaining] = self._hessian.targets[0]

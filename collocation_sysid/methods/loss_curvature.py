@@ -24,10 +24,11 @@ LARGEST_SHARE = 0.9
 
 
 def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
-    """Return B (np, np) after an accepted step, by the update of Dennis, Gay and Welsch; B itself
-    if the score does not increase along the step.
+    """Return B (np, np) after an accepted step, by the update of Dennis, Gay and Welsch; the given
+    array itself if the score does not increase along the step.
 
-    B is what Gauss–Newton neglects of the Hessian.
+    B is what Gauss–Newton neglects: the Hessian of the loss is 2 (SᵀS + B). The given array is not
+    modified.
 
     Parameters
     ----------
@@ -124,15 +125,17 @@ def exact_curvature(
     iterate: Iterate,
     stopwatch: Stopwatch | None = None,
 ) -> Array:
-    """Return B (np, np) at an iterate of the complete recordings, by one backward sweep.
+    """Return B (np, np), symmetric, at an iterate of the complete recordings, by one backward
+    sweep.
 
-    B follows from the reduced Hessian Wᵀ ∇²(L + yᵀ g) W of the Lagrangian with W = (I, Z), the
-    sensitivities Z and the multipliers y of the equations of motion.
+    B is what Gauss–Newton neglects, see `secant_update`. B follows from the reduced Hessian Wᵀ ∇²(L
+    + yᵀ g) W of the Lagrangian with W = (I, Z), the sensitivities Z and the multipliers y of the
+    equations of motion.
 
     Parameters
     ----------
     collocation : Collocation
-        Problem.
+        Problem with second derivatives, which is not checked, see `require_second_derivatives`.
     iterate : Iterate
         Iterate of all rows; its trajectories must be in this process.
     stopwatch : Stopwatch, optional

@@ -463,13 +463,15 @@ class ReducedSearch:
         return secant_update(curvature, previous, after=after)
 
     def _step_length(self, step: Array) -> float:
-        """Return the largest change of a parameter by a step (np,), relative to `reach`."""
+        """Return the largest change of a parameter by a step (np,), relative to `reach`; 0 without
+        parameters.
+        """
         return float(np.abs(step / self.reach).max(initial=0.0))
 
     def _next_step(self, point: Iterate, curvature: Array) -> Array:
         """Return the step (np,) from `point` that minimises the quadratic model of the loss, with
         the neglected curvature (np, np) added as far as `with_curvature` allows, within bounds and
-        trust region.
+        trust region; nothing is changed.
         """
         low = np.maximum(self.lower - point.p, -self.trust * self.reach)
         high = np.minimum(self.upper - point.p, self.trust * self.reach)
@@ -731,7 +733,7 @@ class ReducedSearch:
         x : list
             Trajectories, as the workers store them.
         loss : float
-            Loss with priors.
+            Loss with priors, without the scaling of the NLP.
         summaries : sequence of FitSummary
             Fit of each experiment.
         """

@@ -140,7 +140,8 @@ class Timing:
 
     @classmethod
     def since(cls, watch: Stopwatch, start_s: float) -> Timing:
-        """Return the times that a stopwatch has measured.
+        """Return the times that a stopwatch has measured, and the total time from a start until
+        now.
 
         Parameters
         ----------

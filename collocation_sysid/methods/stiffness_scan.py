@@ -127,7 +127,8 @@ def start_problem(
     """Return the problem with a guess of every parameter, and the scan; None if there was no scan.
 
     Given guesses are kept, unless the body cannot be simulated with them or fits worse than an
-    undeformed one, and the scan finds better ones.
+    undeformed one, and the scan finds better ones. The given problem is not modified; it is
+    returned itself if nothing changes.
 
     Parameters
     ----------
@@ -328,8 +329,8 @@ def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
 
 
 def typical_constants(parameters: Parameters) -> dict[str, float]:
-    """Return values of all parameters by name: guesses, or typical ones of a
-    soft body (`SOFT_PA`).
+    """Return values of all parameters by name, in SI units: guesses, or typical ones of a soft body
+    (`SOFT_PA`).
     """
     return typical_parameters(parameters, SOFT_PA).guesses
 
@@ -417,11 +418,12 @@ def _misfit(
 
 
 def _residuals(iterate: ExperimentIterate) -> Array:
-    """Return the residuals of all measurements of one experiment, in standard deviations.
+    """Return the residuals (m,) of all measurements of one experiment, in standard deviations;
+    missing values are left out.
 
     Offsets, clocks and tool parameters of sensors have the values that fit best, because nothing
-    else determines them beforehand and the residuals are nearly linear in them; their priors are
-    included.
+    else determines them beforehand and the residuals are nearly linear in them; their m − M priors
+    follow the M measurements.
     """
     residuals = []
     slopes = []
@@ -638,8 +640,8 @@ class ScanState:
         self.is_ended_early = False
 
     def try_sequence(self, young_pa: Sequence[float]) -> None:
-        """Try Young's moduli in the given order [Pa] until `CONSECUTIVE_FAILURES` in a row fail or
-        fit badly; then `is_ended_early` is set. Their misfits are stored.
+        """Try Young's moduli in the given order [Pa], at least one, until `CONSECUTIVE_FAILURES` in
+        a row fail or fit badly; then `is_ended_early` is set. Their misfits are stored.
 
         Failures before the first simulation that succeeds do not count. Of neighbours that give the
         same parameters only one is tried.
@@ -691,7 +693,8 @@ class ScanState:
     def is_best_at_end(self, softest: bool) -> bool:
         """Return whether the best modulus is the softest (or else the stiffest) that was tried.
 
-        False for the softest end if the scan ended before it.
+        False if no modulus could be simulated, and for the softest end if the scan ended before it.
+        `softest` selects the end.
         """
         finite_misfits = {
             young: m for young, m in self.misfits.items() if np.isfinite(m)

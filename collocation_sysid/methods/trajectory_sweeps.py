@@ -98,7 +98,7 @@ class SweepReport(FitSummary):
     indefinite_steps : int
         Number of time steps whose matrix is not positive definite.
     times_s : tuple of three floats
-        Times for `Stopwatch.add` [s].
+        Times of building, evaluations and linear algebra, as for `Stopwatch.add` [s].
     """
 
     fit: SquareRootInformation
@@ -154,7 +154,7 @@ class SimulationResult:
     failure : SimulationError or None
         Reason why the simulation ended early; None if it is complete.
     times_s : tuple of three floats
-        Times for `Stopwatch.add` [s].
+        Times of building, evaluations and linear algebra, as for `Stopwatch.add` [s].
     """
 
     x: Array
@@ -179,7 +179,10 @@ def sweep(
     known_sweep: LinearisedTrajectory | None = None,
     previous: LinearisedTrajectory | None = None,
 ) -> LinearisedTrajectory:
-    """Return the result of one sweep at parameters p and given positions.
+    """Return the result of one sweep at parameters p and given positions: the feasibility step, the
+    sensitivities, and the measurement residuals linearised after that step.
+
+    A sweep solves the linearised equations of motion once, forward in time.
 
     Parameters
     ----------
@@ -190,11 +193,11 @@ def sweep(
     p : (k,) array
         Parameters (q, φ) of the experiment.
     trajectory : LinearisedTrajectory, SimulationResult or (rows, 3n) array
-        Positions [m].
+        Positions [m], with as many rows as the solver.
     known_sweep : LinearisedTrajectory, optional
         Sweep of the first rows at the same p and positions, which is continued.
     previous : LinearisedTrajectory, optional
-        Previous trajectory, from which changes are measured.
+        Previous trajectory, from which changes are measured; without one they are zero.
 
     Raises
     ------
@@ -407,7 +410,7 @@ def _linearised_trajectory(
         Previous trajectory; for None the change of positions and `previous_slopes_residual` are
         zero.
     times_s : tuple of three floats
-        Times for `Stopwatch.add` [s].
+        Times of building, evaluations and linear algebra, as for `Stopwatch.add` [s].
     """
     response = ObservableResponse.from_array(
         iterate, swept.by_p, swept.grasp_forces, step=swept.step
