@@ -32,8 +32,10 @@ from ..recording.nuisance import TIME
 
 
 def condense(complete: Collocation) -> Collocation:
-    """Return the program without the grasped positions that follow from φ; the same program if no
-    grasp and no clock is estimated.
+    """Return the program without the grasped positions that follow from φ, and with a sparser
+    Hessian; the argument itself if no grasp and no clock is estimated.
+
+    The given program is not modified.
     """
     if not any(
         s.nuisance.affects_grasps or len(s.nuisance.clock_indices)
@@ -104,7 +106,7 @@ class EliminatedDofs:
         cls, transcription: Transcription, complete: Collocation
     ) -> EliminatedDofs:
         """Return the grasped dofs of an experiment whose positions follow from φ: those that
-        constraints of the `complete` program prescribe.
+        constraints of the `complete` program prescribe, which contains the `transcription`.
         """
         rows = np.flatnonzero(transcription.is_grasp_constraint)
         time, place = np.divmod(rows, transcription.constraints_per_time)

@@ -404,8 +404,8 @@ def _row_count(result: LinearisedTrajectory | SimulationResult | Array) -> int:
 def _failure_and_times(
     result: SimulationResult,
 ) -> tuple[SimulationError | None, tuple[float, float, float]]:
-    """Return the failure (None if complete) and the times [s] of a simulation; workers run
-    this function.
+    """Return the failure (None if complete) and the times of building, evaluations and linear
+    algebra [s] of a simulation; workers run this function.
     """
     return result.failure, result.times_s
 
@@ -413,5 +413,7 @@ def _failure_and_times(
 def _first_rows(
     result: LinearisedTrajectory | SimulationResult | Array, count: int
 ) -> Array:
-    """Return the first `count` rows of a trajectory; workers run this function."""
+    """Return the positions (count, 3n) [m] of the first `count` rows of a trajectory, or all if
+    there are fewer; workers run this function.
+    """
     return trajectory_positions(result)[:count]

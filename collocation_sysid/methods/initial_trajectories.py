@@ -227,7 +227,7 @@ def complete_variables(
 
 
 def _empty_trajectories(collocation: Collocation) -> list[Array]:
-    """Return an empty trajectory (0, 3n) of each experiment."""
+    """Return an empty trajectory (0, 3n) of each fitted experiment."""
     return [
         np.zeros((0, segment.dof_count))
         for segment in collocation.transcriptions

@@ -105,8 +105,9 @@ def with_curvature(
 
 
 def require_second_derivatives(collocation: Collocation) -> None:
-    """Raise an `InputError` if the problem has no exact second derivatives: for materials with
-    memory, forces with internal variables, measured wrenches and custom sensors of grasp forces.
+    """Do nothing, or raise an `InputError` if the problem has no exact second derivatives: for
+    materials with memory, forces with internal variables, measured wrenches and custom sensors of
+    grasp forces.
     """
     if collocation.has_eliminated_histories:
         raise InputError(
@@ -128,9 +129,9 @@ def exact_curvature(
     """Return B (np, np), symmetric, at an iterate of the complete recordings, by one backward
     sweep.
 
-    B is what Gauss–Newton neglects, see `secant_update`. B follows from the reduced Hessian Wᵀ ∇²(L
-    + yᵀ g) W of the Lagrangian with W = (I, Z), the sensitivities Z and the multipliers y of the
-    equations of motion.
+    B is what Gauss–Newton neglects of the Hessian, see `secant_update`. It follows from the reduced
+    Hessian Wᵀ ∇²(L + yᵀ g) W of the Lagrangian with W = (I, Z), the sensitivities Z and the
+    multipliers y of the equations of motion.
 
     Parameters
     ----------
@@ -166,7 +167,8 @@ def _tangent_direction(
     collocation: Collocation, iterate: Iterate, k: int
 ) -> Array:
     """Return the change (variables,) of all variables per unit of the parameter with index k, along
-    the equations of motion linearised at `iterate`; other parameters do not change.
+    the equations of motion linearised at `iterate`; other parameters do not change. Both are those
+    of `collocation`, in its coordinates p and its scaling of z.
     """
     unit = np.eye(len(iterate.p))[k]
     position_changes = [

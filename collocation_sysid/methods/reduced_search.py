@@ -484,7 +484,8 @@ class ReducedSearch:
         self, horizon: Horizon, point: Iterate, step: Array
     ) -> Iterate | None:
         """Return the point after a step (np,) of the parameters from `point`, clipped to the
-        bounds, by one sweep, which is counted; None if that fails or is not finite.
+        bounds, by one sweep on the horizon, which is counted; None if that fails or is not finite.
+        Nothing else of the search changes.
         """
         self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
@@ -564,7 +565,7 @@ class ReducedSearch:
 
     def _are_feasible(self, summaries: list[FitSummary]) -> bool:
         """Return whether the largest residual of the equations of motion of every experiment is at
-        most `FEASIBLE_FORCE` times its unit of force.
+        most `FEASIBLE_FORCE` times its unit of force; one summary for each, in their order.
         """
         return all(
             each.violation_n <= FEASIBLE_FORCE * segment.force_n

@@ -357,8 +357,8 @@ def _ranked_moduli(young_pa: Array, misfit: Array) -> list[float]:
 
 
 def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
-    """Return the parameters with a unit for those linear ones that have none, a tenth of Young's
-    modulus [Pa].
+    """Return the parameters with a unit for those linear ones that have none (NaN): a tenth of the
+    Young's modulus `young_pa` [Pa].
     """
     unit = young_pa / 10
     return parameters.map_components(
@@ -367,7 +367,7 @@ def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
 
 
 def _has_free_modulus(collocation: Collocation) -> bool:
-    """Return whether a free modulus on a logarithmic scale exists."""
+    """Return whether the problem has an estimated modulus on a logarithmic scale."""
     free = collocation.parameters.free
     return any(is_modulus(item.name) and item.scale == "log" for item in free)
 
@@ -563,8 +563,8 @@ class TrialSimulation:
         return failure is None
 
     def parameter_key(self, young_pa: float) -> tuple[float, ...]:
-        """Return the parameters at a Young's modulus; moduli beyond all bounds have the
-        same key.
+        """Return the parameters p, in the solver's coordinates, at a Young's modulus [Pa] as a
+        tuple, by which trials are compared; moduli beyond all bounds have the same key.
         """
         return tuple(self._p(young_pa).tolist())
 

@@ -319,7 +319,8 @@ def extrapolate(
     step: Array,
 ) -> Array:
     """Return positions (rows, 3n) [m] after the feasibility step of `sweep_result` and a step (k,)
-    of the experiment's parameters, to first order.
+    of the experiment's parameters, to first order. The sweep is that of the `transcription`; it is
+    not modified.
     """
     return (
         sweep_result.x
@@ -350,7 +351,7 @@ def simulate_rows(
     known_rows : LinearisedTrajectory, SimulationResult, (m, 3n) array or None
         First rows, which are continued; None for none.
     guess : LinearisedTrajectory or None
-        Trajectory at other parameters, near which equilibria are searched first.
+        Trajectory at other parameters, near which equilibria are searched first; None for none.
     """
     part = _iterate(
         transcription,
@@ -373,8 +374,8 @@ def simulate_rows(
 
 
 def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
-    """Return the fit of positions x (rows, 3n) [m] at the experiment's parameters p (k,), with
-    residuals of the equations of motion evaluated at x.
+    """Return the fit of an array of positions x (rows, 3n) [m] to the markers at the experiment's
+    parameters p (k,), with residuals of the equations of motion evaluated at x.
     """
     part = _iterate(transcription, p, x=x)
     return FitSummary.from_iterate(

@@ -252,6 +252,15 @@ def interrupted_solution(
 
     Its history has one entry, the evaluation at that point; no iteration was done on the given
     mesh.
+
+    Parameters
+    ----------
+    start : CoarseStart
+        Relation of the coarse and the given problem.
+    problem : Problem
+        Given problem; not modified.
+    coarse : Solution
+        Solution of `start.problem`, interrupted.
     """
     collocation = start.given_collocation(
         problem, coarse, undetermined=undetermined_names(coarse)
@@ -310,6 +319,7 @@ def undetermined_names(solution: Solution) -> tuple[str, ...]:
 def require_determined_moduli(undetermined: Sequence[str]) -> None:
     """Raise `NoCoarseStartError` if a modulus is among the parameters that a coarse solution does
     not determine, see `undetermined_names`: the coarse mesh then does not describe the motion.
+    `undetermined` contains names of parameters, with their regions; nothing is returned.
     """
     for name in undetermined:
         if is_modulus(name):
@@ -319,7 +329,9 @@ def require_determined_moduli(undetermined: Sequence[str]) -> None:
 
 
 def start_note(start: CoarseStart, coarse: Solution, given: Solution) -> str:
-    """Return a note on a coarse start: size, sweeps and time of both solves."""
+    """Return a note on the coarse start `start` with its size, and the number of sweeps and the
+    time [s] of the solutions on the coarse and on the given mesh.
+    """
     return (
         f"coarse start: solved on {start.size} first, with {coarse.iterations} sweeps in "
         f"{coarse.timing.total:.2g} s, then on the given mesh with {given.iterations} sweeps in "
@@ -337,6 +349,13 @@ def mesh_error_note(
     of both solutions (Richardson's extrapolation, as in `discretisation_error`), in the coordinate
     in which the interval of the parameter is symmetric. The difference includes that of the
     surfaces.
+
+    Parameters
+    ----------
+    start : CoarseStart
+        Relation of the coarse and the given problem, which has the ratio of the edges.
+    coarse, given : Solution
+        Converged solutions on the coarse and on the given mesh.
     """
     before = parameter_values(coarse.collocation, coarse.q)
     after = parameter_values(given.collocation, given.q)

@@ -264,7 +264,7 @@ def _recordings_agreement(
 
 def _fit_result(answer: SolvedProblem) -> FitResult:
     """Return the residuals of the fit of each experiment and of all together, with expected noise
-    and sentences on nuisance parameters.
+    and sentences on nuisance parameters; cached properties of the answer are computed.
     """
     solution = answer.solution
     experiments = {}

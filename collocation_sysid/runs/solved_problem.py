@@ -409,7 +409,9 @@ class SolvedProblem:
         return pandas.DataFrame.from_dict(rows, orient="index")
 
     def _row(self, name: str) -> dict[str, float | str]:
-        """Return the row of an estimate in `to_frame`, by column; NaN for unknown numbers."""
+        """Return the row of the estimate `name`, which must exist, in `to_frame`, by column; NaN
+        for unknown numbers.
+        """
         each = self.estimates[name]
         combined = each.combined95 or (np.nan, np.nan)
         statistical = each.statistical95 or (np.nan, np.nan)

@@ -165,7 +165,8 @@ class WarmStart:
 
     def apply_to_places(self, collocation: Collocation) -> Collocation:
         """Return the discretised problem in which markers whose place is estimated start at the
-        earlier places; markers without an earlier place keep theirs.
+        earlier places; markers without an earlier place keep theirs. Their prior is then centred
+        there; the given problem is not modified.
         """
         places_m = []
         for segment in collocation.transcriptions:

@@ -384,7 +384,7 @@ class _AverageValue:
 
     @property
     def error(self) -> float:
-        """Estimated rounding error of the value."""
+        """Estimated rounding error of the value: `rounding` times the average size."""
         return self.options.rounding * self.size
 
 

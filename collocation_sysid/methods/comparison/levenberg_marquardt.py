@@ -451,8 +451,8 @@ class _QuadraticModel:
 
 
 def _narrow_order(square: sp.coo_array) -> Index:
-    """Return an order (n,) of the positions that makes the band of a symmetric matrix narrower; the
-    identity if none is found.
+    """Return an order (n,) of the rows and columns that makes the band of a symmetric sparse matrix
+    (n, n) narrower, as indices of the columns in the new order; the identity if none is found.
     """
     order = reverse_cuthill_mckee(
         sp.csr_array(square), symmetric_mode=True

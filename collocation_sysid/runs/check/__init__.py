@@ -382,7 +382,7 @@ def _fit_to_markers_s(
     collocation: Collocation, total_s: float, samples: int
 ) -> float:
     """Return the estimated time [s] to fit the first `samples` time steps to the markers alone;
-    `total_s` is the time to simulate the complete recordings [s].
+    `total_s` is the time to simulate the complete recordings [s] of `collocation`.
     """
     share = min(1.0, samples / _grid_rows(collocation))
     return FIT_SIMULATIONS * total_s * share
@@ -423,7 +423,7 @@ def _simulated_fields(
 
 
 def _grid_rows(collocation: Collocation) -> int:
-    """Return the number of time steps of all segments."""
+    """Return the number of times of the grids of all fitted experiments together."""
     return sum(segment.grid_times for segment in collocation.transcriptions)
 
 
@@ -486,7 +486,8 @@ def _natural_modes(
     problem: Problem, collocation: Collocation
 ) -> tuple[ModesCheck, ...]:
     """Return the natural modes at the guess of each fitted experiment that moves, in their order,
-    with the scheme and step of the collocation; static and held out experiments are left out.
+    with the scheme and step of the collocation; static and held out experiments are left out. Every
+    parameter must have a guess.
 
     Raises
     ------

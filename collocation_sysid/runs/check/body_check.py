@@ -81,8 +81,9 @@ class Slenderness:
 
 
 def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
-    """Return the shapes of the `count` elements of lowest quality, worst first; all of them if
-    there are fewer.
+    """Return the shapes of the `count` elements of lowest quality, worst first, with indices from
+    0; all of them if there are fewer. The mesh is undeformed, and of quadratic elements the corners
+    count alone.
     """
     corners = mesh.points_m[mesh.tetrahedra]
     areas = [_areas(corners[:, face]) for face in _FACES]
@@ -333,7 +334,9 @@ def check_body(
 
 
 def _rest_shape(body: Body) -> str | None:
-    """Return the kind of the stated rest shape; None if none is stated."""
+    """Return the kind of the stated rest shape, "stress_free" or "under_gravity"; None if none is
+    stated.
+    """
     if body.rest_shape is None:
         return None
     return "stress_free" if body.scan_conditions is None else "under_gravity"
@@ -511,8 +514,8 @@ def grasp_sentence(grasp_check: GraspCheck) -> str:
 
 
 def grasp_concerns(grasp_check: GraspCheck) -> list[Concern]:
-    """Return one concern if some nodes are so near to a face of the box that rounding decides
-    whether they are held; otherwise none.
+    """Return a list with one concern if some nodes are so near to a face of the box that rounding
+    decides whether they are held; otherwise an empty list.
     """
     by_chance = bool(grasp_check.nearly_grasped or grasp_check.nearly_free)
     counts = {

@@ -212,8 +212,8 @@ def method_costs(
 
 
 def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
-    """Return, for each experiment, the number of unknowns per time step in interior point: free
-    dofs and overstresses.
+    """Return, for each fitted experiment in their order, the number of unknowns per time step in
+    interior point: free dofs and overstresses.
     """
     return [
         len(segment.free_dofs)

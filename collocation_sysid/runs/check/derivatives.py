@@ -124,7 +124,9 @@ def derivative_errors(
 
 
 def _difference_step(collocation: Collocation) -> float:
-    """Return the step of the differences: `STEP`, or less where a feature needs smaller ones."""
+    """Return the step of the differences in the scaled variables z: `STEP`, or less where a feature
+    of a fitted experiment needs smaller ones.
+    """
     return min(
         (
             STEP,
