@@ -506,7 +506,9 @@ class TrialSimulation:
 
     @cached_property
     def rigid_misfit(self) -> float:
-        """Misfit of an undeformed body that moves with the grasp, in standard deviations."""
+        """Misfit of an undeformed body that moves with the grasp in the first part of the
+        recordings, in standard deviations; every parameter must have a guess.
+        """
         positions = []
         for segment, rows in zip(
             self.collocation.transcriptions, self.rows, strict=True
@@ -555,8 +557,8 @@ class TrialSimulation:
         return self._evaluate(p, positions), positions
 
     def is_simulable(self, young_pa: float) -> bool:
-        """Return whether the complete recordings can be simulated at a Young's modulus [Pa]; if
-        not, the error is stored in `failure`.
+        """Simulate the complete recordings at a Young's modulus [Pa], and return whether that
+        succeeds; if not, the error is stored in `failure`.
         """
         _, failure = self._simulate(self._p(young_pa), None, rows=self.all_rows)
         self.failure = failure or self.failure

@@ -381,8 +381,9 @@ def check_problem(
 def _fit_to_markers_s(
     collocation: Collocation, total_s: float, samples: int
 ) -> float:
-    """Return the estimated time [s] to fit the first `samples` time steps to the markers alone;
-    `total_s` is the time to simulate the complete recordings [s] of `collocation`.
+    """Return the estimated time [s] to fit the first `samples` samples, each counted as one time
+    step, to the markers alone; `total_s` is the time to simulate the complete recordings [s] of
+    `collocation`.
     """
     share = min(1.0, samples / _grid_rows(collocation))
     return FIT_SIMULATIONS * total_s * share
