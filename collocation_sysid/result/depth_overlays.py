@@ -110,8 +110,8 @@ class DepthProjection:
         """Return u and v (5 F, 2) of the edges of the F faces that are turned to the camera, as
         closed lines: for each face its three corners, the first corner again, and a row of NaN.
 
-        Faces that are partly behind a camera with an image are left out. Units are those of
-        `image_points`.
+        They are pixels of the image without distortion, and for a point cloud millimetres in the
+        parallel view. Faces that are partly behind a camera with an image are left out.
 
         Parameters
         ----------

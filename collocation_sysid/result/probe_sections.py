@@ -73,9 +73,10 @@ def probe_section(result: Result) -> TitledParts:
 
 
 def probe_lines(result: Result) -> list[str | Table]:
-    """Return the conclusions of the probes for a terminal.
+    """Return the table of the probes, how to read it, and their conclusions, for a terminal.
 
-    After routine probes without a significant result the table is left out; empty without probes.
+    After the probes of every solve alone, without a significant result, only the conclusions are
+    returned. Empty without probes.
     """
     if is_routine(result) and not any(
         probe.sentences for probe in result.probes

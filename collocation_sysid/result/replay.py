@@ -142,10 +142,10 @@ class MotionRecord:
         For each spatially varying constant: the estimate, the ends of its 95 % interval, and its
         posterior over its prior standard deviation; NaN in elements of other regions.
     visible_points : mapping of name to (k, 8)
-        For each depth camera, rows of points: time [s], image coordinates u and v, depth [m],
-        distance behind the surface [m] (NaN for points that do not count), and position in the
-        world [m]. For some samples, rows of outlines follow: time, u, v, and NaN else; a row
-        without u and v ends each face.
+        For each depth camera, rows of points: time [s], image coordinates u and v (pixels, or mm
+        for a point cloud), depth [m], distance behind the surface [m] (NaN for points that do not
+        count), and position in the world [m]. For some samples, rows of outlines follow: time, u,
+        v, and NaN else; a row without u and v ends each face.
     reading_units : mapping of name to str
         Units of the custom sensors that state one.
     strain : (T,), or None
@@ -351,7 +351,9 @@ class MotionRecord:
         """Return the experiment called `name` from the arrays of a run, see
         `MotionRecord.to_arrays`.
 
-        Names begin with `name` and a slash, or have no prefix if there are no such names.
+        The names of the arrays begin with `name` and a slash, or have no prefix if there is no
+        `name`/t_s. Those of the body (`BODY_ARRAYS`), which experiments of a run share, have no
+        prefix either, unless the experiment has its own, as a specimen. Other arrays are ignored.
 
         Raises
         ------

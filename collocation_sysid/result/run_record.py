@@ -199,6 +199,8 @@ def write_all_frames(finished: SolvedProblem, place: Path) -> None:
     exist.
 
     With several fitted experiments each has a subfolder of its name, which is made if missing.
+    Besides the data of `write_frames` and `_constant_cell_data`, the frames have the residuals of
+    the equations of motion, "residual_force_n" [N], which are zero at prescribed dofs.
     """
     for part in finished.solution.parts:
         segment = part.segment

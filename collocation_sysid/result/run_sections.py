@@ -412,11 +412,13 @@ def budget_table(result: Result) -> Table:
 
 
 def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
-    """Return the cells of an estimate after its name: value, combined uncertainty and interval,
-    statistical and systematic uncertainty, guess, and a remark.
+    """Return the seven cells of an estimate after its name: value, combined standard uncertainty
+    and interval, statistical and systematic standard uncertainty, guess, and a remark.
 
-    Unknown numbers are empty. Instead of an interval the cell says whether the parameter is at its
-    bound or not determined, and instead of a guess whether it is fixed or tied.
+    Numbers are in the unit of the name and without it; unknown ones are empty. Instead of an
+    interval the cell is "at its bound"; if the estimate has a `reason`, which is the remark, it is
+    "not identifiable", or "not determined" without a statistical interval. Instead of the guess of
+    a fixed or tied parameter the cell is "fixed" or "tied".
     """
     each = result.values[name]
     interval = _interval_text(each.combined95)
@@ -533,7 +535,9 @@ def _fit_section(result: Result) -> TitledParts:
 
 
 def _elapsed_text(elapsed: Elapsed) -> str:
-    """Return how long each part of a run took; pictures that were not drawn are left out."""
+    """Return the times of search, checks and pictures as text, such as "search 1.2 s, checks
+    3.4 s"; pictures that were not drawn are left out.
+    """
     parts = {
         "search": elapsed.search,
         "checks": elapsed.checks,
@@ -720,7 +724,9 @@ def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
 
 
 def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
-    """Yield for each experiment a table of its other nuisance parameters, in mm, ms or degrees."""
+    """Yield for each experiment a table of its other nuisance parameters in readable units such as
+    mm, ms or degrees, see `_size_text`.
+    """
     explanation = (
         "Estimated for this recording alone, together with the parameters; the prior has a mean "
         "of zero."
@@ -854,7 +860,9 @@ def _captioned_pictures(run: Path) -> list[Picture]:
 
 
 def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:
-    """Yield a table of the problem and software versions, and the problem file as it was run."""
+    """Yield a table of the problem and software versions, and the problem file as it was run, if
+    this program wrote one into the folder `run`.
+    """
     rows = content(result.problem) | content(result.provenance)
     listed_rows = (
         (key, each if isinstance(each, list) else [each])
@@ -877,7 +885,7 @@ def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:
 
 def _size_text(value: float | None, unit: str) -> str:
     """Return a value in `unit` as text in a readable unit, see `in_readable_unit`, such as "1.2 mm"
-    for 0.0012 in "m"; a unit that it does not know is kept, and None becomes "–".
+    for 0.0012 in "m"; a unit that `in_readable_unit` does not know is kept, and None becomes "–".
     """
     factor, shown = in_readable_unit(1.0, unit)
     # No powers of ten for the sizes of bodies.

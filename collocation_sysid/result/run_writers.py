@@ -52,7 +52,7 @@ def write_vtu(
     path : str or Path
         File to write; an existing one is replaced.
     points_m : (n, 3)
-        Positions of the points.
+        Positions of the points [m].
     cells : (E, nodes per cell)
         Point indices of each cell, in the order of meshio for this type.
     meshio_type : {"tetra", "tetra10"}
@@ -374,8 +374,12 @@ def require_replaceable(
     ----------
     target : Path
         Place of the folder.
-    overwrite, marker_file, content_word
-        See `replaced_folder`.
+    overwrite : bool
+        Whether an earlier run passes, if this program wrote every file in it and none was changed.
+    marker_file : str
+        Name of a file by which an earlier run is recognised.
+    content_word : str
+        Word for the content in messages, such as "run".
 
     Raises
     ------

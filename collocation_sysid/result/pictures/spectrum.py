@@ -43,9 +43,10 @@ def spectrum_picture(
     t_s : (T,)
         Evenly spaced times [s], at least two.
     measured_m : (T, M, 3)
-        Measured markers, NaN where missing.
+        Measured markers [m], NaN where missing: gaps are interpolated linearly, and markers that
+        are missing too often are left out, see `spectral_density`.
     fitted_m : (T, M, 3) or None
-        Fitted markers.
+        Fitted markers [m]; None draws no spectrum of the residual.
     natural_hz : (k,) or None
         Natural frequencies [Hz], ascending; those above half the sampling rate are left out, and
         None draws none.
