@@ -147,7 +147,8 @@ def _material(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _mesh(content: Mapping[str, Any]) -> Iterator[str]:
-    """Yield lines of the Markdown section on the mesh.
+    """Yield lines of the Markdown section on the mesh: its files, which homogeneous tests have too,
+    and what it was used for.
 
     `content` is that of body.json, of which "element" is used: the name of the element, or None for
     a homogeneous test.

@@ -223,10 +223,15 @@ def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
     """Return the content of a problem file in `folder` for the designed recording, as nested
     dictionaries and lists for TOML; nothing is written.
 
-    Estimated parameters get guesses at the middle draw, coefficients of fields none. Existing
-    recordings are kept only if they are used (`Design.added`); the new one is named "designed", or
-    "designed_2" and so on if that name is used. File names become relative to `folder`, an absolute
-    path. The problem must have been read from a file.
+    It is the content of the problem's own file with its overrides (`Origin.text`), and with the
+    defaults of experiments in the table of each experiment. Estimated parameters get guesses at the
+    middle draw, coefficients of fields none. Existing recordings are kept only if they are used
+    (`Design.added`).
+
+    The table of the new recording, the last one, is a copy of the template's that reads poses,
+    markers and wrench from the files of the design in `folder`, see `_designed_table`. Its name is
+    "designed", or "designed_2" and so on if that name is used. Other file names become relative to
+    `folder`, an absolute path. The problem must have been read from a file.
     """
     origin = design.recording.problem.origin
     recording = design.recording

@@ -88,7 +88,9 @@ class Limits(Section):
 
     @model_validator(mode="after")
     def _require_consistent(self) -> Limits:
-        """Raise `ValueError` for corners in the wrong order, or too few cameras."""
+        """Return the limits, unchanged; raise `ValueError` for corners in the wrong order, or fewer
+        cameras than `cameras_per_marker`.
+        """
         for key in ("workspace_m", "markers_box_m"):
             corners = getattr(self, key)
             if (

@@ -229,7 +229,8 @@ class MotionObjective:
 
     def errors(self, information: Array | float, q: Array) -> PredictedErrors:
         """Return the error bars at the parameters q from existing recordings, priors, and a new
-        recording.
+        recording. A parameter about which nothing is known has the error bar `UNDETERMINED` times
+        its value, see `PredictedErrors.from_information`.
 
         Parameters
         ----------

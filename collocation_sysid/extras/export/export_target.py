@@ -228,8 +228,10 @@ class TargetCapabilities:
 
 
 def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
-    """Yield sentences on what none of the targets can express of a body: actuators, air, custom
-    forces, and loads or grasps that change in time.
+    """Yield a sentence for each property of a body that no target can express; none for others.
+
+    These are actuators, air, custom forces, forces or point masses on nodes that change between
+    samples, and grasps that begin or end within the recording. Moving grasps are not among them.
     """
     e = body.experiment
     times = body.experiment.t_s
@@ -264,9 +266,9 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
     Returns
     -------
     moved_m : (T, n, 3)
-        Displacements of the nodes from `IdentifiedBody.nodes_m`.
+        Displacements [m] of the n nodes of the body from `IdentifiedBody.nodes_m` at the T samples.
     forces_n : (T, o, 3)
-        Forces of each obstacle on the body.
+        Force [N] of each of the o obstacles on the body.
 
     Raises
     ------

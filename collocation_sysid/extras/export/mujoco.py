@@ -165,13 +165,13 @@ def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
 
 def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
     """Return position (3,) [m] and unit quaternion (w, x, y, z) of a grasp or obstacle at a time
-    `t_s` [s].
+    `t_s` [s], interpolated between its poses, or up to half a sample beyond them continued or held,
+    see `PoseSequence.at`. A single pose holds at all times.
 
     Raises
     ------
     InputError
-        If the time is more than half a sample before or after its poses, except a single pose,
-        which holds at all times.
+        If the time is more than half a sample before or after several poses.
     """
     rotations, positions = grasp.poses.at([t_s])
     return positions[0], np.roll(

@@ -229,7 +229,8 @@ class Facets:
 
     def _oriented_outwards(self) -> Facets:
         """Return a copy of the facets with the corners of each triangle ordered counter-clockwise
-        as seen from outside, the side without the point behind all facets.
+        as seen from outside: from the side of its plane on which the last point, behind all facets,
+        is not.
         """
         corners = self.points_m[self.triangles]
         inwards = (
@@ -375,8 +376,9 @@ def faceted_obstacles(body: IdentifiedBody) -> tuple[FacetedObstacle, ...]:
     without obstacles.
 
     Facets that face the body at no sample are left out. Nodes and cells are numbered after those of
-    the body. The stiffness and the width of the pressure law are means over the area of the surface
-    that may touch.
+    the body. Stiffness and width are means of the pressure law over the area of the surface that
+    may touch, the stiffness twice that (see `FacetedObstacle`). The points at the start are
+    retracted so far that no node touches.
     """
     if body.experiment_with_obstacles is None:
         return ()
@@ -470,8 +472,9 @@ class SharedContact:
         cls, obstacles: Sequence[FacetedObstacle]
     ) -> SharedContact:
         """Return the contact constants that represent all obstacles: the friction of the first one,
-        and the largest stiffness and width; zeros without obstacles. If they differ, `limitations`
-        has a sentence on that.
+        the largest stiffness of a node, and half of the largest width as the particle radius; zeros
+        without obstacles. If obstacles differ in a constant, `limitations` has one sentence on
+        that, otherwise none.
         """
         constants = {
             "friction": [float(wall.obstacle.friction) for wall in obstacles],

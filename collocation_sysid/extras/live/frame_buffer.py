@@ -310,9 +310,12 @@ class FrameBuffer:
         return self.start_s + row * self.interval_s / self.substeps
 
     def _completed_rows(self) -> list[LoggedRow]:
-        """Return the rows for which poses are available now, each with the samples that can be
-        evaluated after it, and increase `rows`; none before the first pose. The samples are removed
-        from the buffer.
+        """Return the new rows, up to the last pose, and increase `rows` by their number; none
+        before the first pose.
+
+        Each row has the rotations and positions of the moving grasps, interpolated by `_pose_at`,
+        and the samples of markers and instruments that can be evaluated after it, which are removed
+        from the buffer (`_available_samples`).
         """
         rows: list[tuple[Array, Array, list[Sample]]] = []
         if self.start_s is None:

@@ -84,7 +84,8 @@ def parse_pose(
     Raises
     ------
     InputError
-        If a value is not a pose, or for an unknown grasp or a wrong number of poses.
+        If a value is not a pose (see `_parse_single_pose`; quaternions must have the norm 1), or
+        for an unknown grasp or a wrong number of poses.
     """
     if pose is None:
         return None
@@ -122,8 +123,9 @@ def _parse_single_pose(pose: Pose) -> tuple[Array, Array]:
     Raises
     ------
     InputError
-        If the mapping lacks a key, or if position, quaternion or matrix are not those of a pose
-        (NaN or None included).
+        If the mapping lacks a key, a number is None, NaN or beyond `LARGEST_NUMBER`, the norm of
+        the quaternion differs from 1 by more than `QUATERNION_NORM_TOLERANCE`, or the matrix is not
+        a rigid motion (`first_matrix_fault`).
     """
     if isinstance(pose, Mapping):
         if missing := [key for key in _POSE_KEYS if key not in pose]:
@@ -165,7 +167,8 @@ def parse_markers(
     Raises
     ------
     InputError
-        For unknown markers, or values that are not three numbers.
+        For unknown markers, another shape, text, or coordinates beyond `LARGEST_NUMBER` in
+        magnitude, such as infinity.
     """
     tracks = np.full((len(names), 3), np.nan)
     if markers is None:

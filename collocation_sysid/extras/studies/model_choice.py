@@ -362,8 +362,9 @@ def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
 
 
 def _failed_prediction(row: Row, chosen: Row) -> str:
-    """Return a sentence on the model `row`, with which some held-out samples cannot be predicted,
-    and on its AIC if that is lower than that of the `chosen` model by more than `NO_SUPPORT`.
+    """Return a sentence with the names of the held-out recordings that the model `row` does not
+    predict, and by how much its AIC is lower than that of the `chosen` model, if that is more than
+    `NO_SUPPORT`.
 
     Both are rows of `model_rows` of converged models, whose "delta_aic" must not be None.
     """
@@ -401,8 +402,9 @@ def _comparison(chosen: Row, rival: Row) -> str:
 
 
 def _ratio_text(ratio: float, error: float) -> str:
-    """Return the ratio of two prediction errors as text, with its standard error if it differs from
-    one by more than that, otherwise with the interval of `SURE` standard errors, which contains one.
+    """Return the ratio of two prediction errors as text, with its standard error if its logarithm
+    is positive and exceeds `LIKELY` standard errors, otherwise with the interval of `SURE` standard
+    errors, as a ratio that may be one.
 
     Parameters
     ----------
@@ -419,8 +421,8 @@ def _ratio_text(ratio: float, error: float) -> str:
 
 
 def _prediction_text(row: Row) -> str:
-    """Return the prediction error of a model (a row of `model_rows`), which must be known, as text
-    with its unit for display.
+    """Return the prediction error "held_out_rms" of a model (a row of `model_rows`), which must not
+    be None, as text with three digits and its unit for display, such as "0.52 mm".
     """
     factor, unit = display_unit(row["unit"])
     return f"{factor * row['held_out_rms']:.3g} {unit}"
@@ -743,8 +745,8 @@ def _budget_record(
 
 
 def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
-    """Return the problem without a recording, or without its end, and the time of the first
-    held-out sample [s].
+    """Return the problem without a recording, or without its end, and the time [s] after which its
+    samples are held out.
 
     If it is the only fitted recording, the measurements after two thirds of its duration are
     removed, see `without_later_measurements`. Otherwise the recording becomes one for validation,

@@ -292,15 +292,17 @@ def variants(
 def file_variants(
     problems: Sequence[Problem], overrides: Sequence[str]
 ) -> list[ModelVariant]:
-    """Return problem files of the same recordings as models, named after the files (with their
-    paths if two files have the same name).
+    """Return a model for each problem file of the same recordings, in the order of `problems`.
+
+    Labels are the names of the files without suffix, or the paths of all of them if two have the
+    same name. Files are not read, and overrides are stored in the models, not applied.
 
     Parameters
     ----------
     problems : sequence of Problem
         At least one problem, each with its file.
     overrides : sequence of str
-        Overrides "key=value" of all files.
+        Overrides "key=value", the same for all files.
 
     Raises
     ------
@@ -434,7 +436,8 @@ def _with_material(
 
     A part with its own constants keeps constants of its own; the others share theirs. Constants
     that the new material does not have are left out. Those that it needs are added with a guess of
-    the same shear modulus, or for a scan if that is unknown.
+    the same shear modulus, or for a scan if that is unknown; see `_with_part_material` for when
+    shared constants are enough.
 
     Parameters
     ----------
@@ -469,10 +472,15 @@ def _with_part_material(
     """Return a copy of the parameters with another material in the part whose constants have this
     prefix.
 
-    Constants of the part that the material does not have are left out. Those that it needs are
-    added, each with a table of `_starting_guess`; the shear modulus, Poisson's ratio and other
-    elastic constants only if the part neither has nor shares one that takes their place. Other
-    parameters stay.
+    Constants of the part that the material neither has nor accepts in place of its own
+    (`elastic_names`) are left out; other parameters stay. Added under the prefix, each with the
+    table of `_starting_guess`, are
+
+    - the shear modulus, if the material has it, and the part has neither it nor Young's modulus;
+      those that parts share count only if the part has no constants of its own at all,
+    - Poisson's ratio, if the material has a compressibility, for which the part neither has nor
+      shares a constant (`VOLUMETRIC`),
+    - each other constant of the material that the part does not have itself, even if it is shared.
 
     Parameters
     ----------

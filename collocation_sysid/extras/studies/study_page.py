@@ -683,7 +683,7 @@ def _varied_cell(key: str) -> Cell:
     """
 
     def cell(row: Row) -> str:
-        """Return the text of the cell in a row."""
+        """Return the swept value of a row: a number with five digits, other text as it is."""
         try:
             return f"{float(row[key]):.5g}"
         except ValueError:
@@ -748,7 +748,9 @@ def _estimate_cell(name: str) -> Cell:
     """
 
     def cell(row: Row) -> str:
-        """Return the text of the cell in a row."""
+        """Return the estimate of a row as text, with "± " and its standard error if known; "–" for
+        no estimate.
+        """
         value = row.get(f"value_{name}")
         spread = row.get(f"std_error_{name}")
         if value is None:

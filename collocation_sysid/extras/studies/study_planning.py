@@ -320,8 +320,8 @@ def plan_models(
     Raises
     ------
     InputError
-        For a model that its problem file does not accept, and for a recording without markers and
-        wrenches.
+        For a model that its problem file does not accept, and for a fitted recording that has
+        neither markers nor a wrench, and is no test of a specimen.
     """
     for each in problem.experiments:
         is_compared = (
@@ -425,13 +425,14 @@ def _planned_run(
 
 
 def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
-    """Return hashes by name of the files that the content of a problem names, so that changed data
-    give another run; names of missing files are left out.
+    """Return SHA-256 hashes, by the name as it is written, of the files that the content of a
+    problem names, so that changed data give another run. A topic of a log with several files has
+    their hashes, separated by spaces. Names of missing files and of folders are left out.
 
     Parameters
     ----------
     content : Any
-        Nested mappings, lists and texts; every text is tried as the name of a file.
+        Nested mappings, lists and texts; every text except keys is tried as the name of a file.
     folder : Path
         Folder of the problem file, to which names are relative.
     """
