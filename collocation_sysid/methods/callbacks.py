@@ -147,7 +147,8 @@ class LagrangianGradient(TimedFunction):
 class NlpFunctions:
     """Functions of the NLP as CasADi callbacks.
 
-    Inputs are z and an empty p, and for functions of the Lagrangian w f + yᵀ g also w and y.
+    Inputs are the variables z and CasADi's parameters p, which are empty, and for functions of the
+    Lagrangian w f + yᵀ g also the weight w of the objective and the multipliers y (constraints,).
     Outputs by name:
 
     =================  =================================================
@@ -326,7 +327,9 @@ class NlpFunctions:
 
     @cached_property
     def _inputs(self) -> list[ca.Sparsity]:
-        """Sparsity of z, p, w and y."""
+        """Sparsity of the inputs in CasADi's order: variables z (variables, 1), CasADi's parameters p,
+        which are empty (0, 1), weight w of the objective (1, 1), and multipliers y (constraints, 1).
+        """
         dense = ca.Sparsity.dense
         variables = self.collocation.variable_count
         rows = self.collocation.constraint_count

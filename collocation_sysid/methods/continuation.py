@@ -225,7 +225,8 @@ class _ContinuationState:
         least one part was solved.
 
         If the last part is not the complete problem, missing positions are simulated or move
-        rigidly, and the solution has no multipliers of the method.
+        rigidly, and the solution has no multipliers of the method. History, counts and times are
+        those of all parts.
         """
         assert self.last is not None
         assert self.known is not None

@@ -87,13 +87,12 @@ class Recorder:
     def initial_variables(self, start: Array | None) -> Array:
         """Return the initial variables (variables,).
 
-        In that case every parameter must have a guess.
-
         Parameters
         ----------
         start : (variables,) array or None
-            Variables to start from, which are returned themselves; None means a simulation at the
-            guess, whose notes on failures are added to `notes`.
+            Variables to start from, which are returned themselves. None means a simulation at the
+            guess, whose notes on failures are added to `notes`; every parameter must then have a
+            guess.
         """
         if start is not None:
             return start

@@ -490,7 +490,7 @@ class TrialSimulation:
     all_rows : list of int
         Number of all grid rows, by experiment.
     failure : SimulationError or None
-        Last failure; None before the first.
+        Last failure of `evaluate_at` or `is_simulable`; None before the first.
     """
 
     def __init__(self, collocation: Collocation) -> None:
@@ -524,9 +524,11 @@ class TrialSimulation:
     def evaluate_guess(
         self, is_complete: bool
     ) -> tuple[float, SimulationError | None]:
-        """Return the misfit of the guess and None, or NaN and the failure of its simulation. With
-        `is_complete` the complete recordings are simulated; the misfit is always that of their
-        first part, in standard deviations, and NaN without a failure if it is not finite.
+        """Return the misfit of the guess and None, or NaN and the failure of its simulation.
+
+        With `is_complete` the complete recordings are simulated; the misfit is always that of their
+        first part, in standard deviations, and NaN with None if it is not finite. Nothing is
+        stored, neither the trajectories nor `failure`. Every parameter must have a guess.
         """
         p = self.collocation.guess_p
         positions, failure = self._simulate(

@@ -79,20 +79,23 @@ def instrument_misfits(
 def nuisance_of_fitted_recordings(
     segment: Transcription, solution: Solution
 ) -> Array:
-    """Return the nuisance parameters φ (k,) of a recording by those of the fitted recordings, in
-    units of their prior standard deviations.
+    """Return nuisance parameters φ (k,) for a recording that is not fitted, from the fitted ones, in
+    units of the prior standard deviations of that recording.
 
-    Each is the mean of the physical values in the fitted recordings that have one of the same
-    label, such as the place of a marker by its name, over the recording's own prior standard
-    deviation; it is zero, the mean of its prior, where no fitted recording has one. Nothing of the
-    recording's own measurements is used, and bounds are not regarded.
+    Each is the mean of the estimates, in physical units, of the parameters with the same label in
+    the fitted recordings, divided by its own prior standard deviation. The place of a marker that
+    is estimated is the mean of its places on the body [m] in the fitted recordings that have a
+    marker of this name, estimated or exact; its entries in φ are the displacement from the
+    recording's own place at φ = 0 to that mean, along the directions of its own prior. Where no
+    fitted recording has the label or the marker, φ is zero, the mean of the prior. The recording's
+    own measurements are not compared, and φ is not limited to its bounds.
 
     Parameters
     ----------
     segment : Transcription
-        Of the recording to be predicted.
+        Transcription of the recording to be predicted.
     solution : Solution
-        Of the fitted recordings.
+        Solution of the fitted recordings.
     """
     nuisance = segment.nuisance
     places = segment.markers.coordinate_parameters

@@ -471,17 +471,24 @@ def _nuisance_sentence(
     answer: SolvedProblem,
 ) -> str:
     """Return a sentence with the size of a nuisance parameter, or of a vector of them, its standard
-    error if known, and its prior.
+    error if known, its prior, and, for kinds whose sentence has a place for it, whether it is at its
+    bound.
+
+    The tare is multiplied by the symmetry of the experiment: the sensor measures the load of the
+    whole specimen.
 
     Parameters
     ----------
     part : ExperimentIterate
         Experiment at the solution.
     components : sequence of int
-        Indices of its components in φ, at least one; the first gives label, unit and prior.
+        Indices of its components in φ, at least one; the first gives label, unit, prior, standard
+        error and bound.
     values : (k,) array
-        Their values in the unit of the row.
+        Values of the k components in the unit of the entry; the size is their norm, and the sign
+        that of the first.
     answer : SolvedProblem
+        Solved problem with the standard errors, if it has any.
     """
     nuisance = part.segment.nuisance
     k = components[0]

@@ -471,7 +471,8 @@ class Result:
     dynamics : DynamicsResult
         Residuals of the equations of motion.
     iterations, evaluations : int
-        Numbers of iterations and of evaluations of the search.
+        Numbers of iterations and of evaluations of the search that gave the solution, with those
+        of one with fewer substeps before it; searches from other starts do not count.
     timing_s : Timing
         Time of the method's iterations alone.
     elapsed_s : Elapsed

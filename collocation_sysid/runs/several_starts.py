@@ -96,7 +96,7 @@ def follow_starts(
         If this is not the reduced-space method, the starts are followed in reduced space, which is
         much faster, and the result has no solution: the solver goes on from the best start.
     collocation : Collocation
-        With the guesses of the scan's best stiffness.
+        Program with the guesses of the scan's best stiffness.
     scan : Scan
         Scan with its starts; not modified.
     solve : callable

@@ -67,7 +67,8 @@ def solve(
     near ν = ½; with correspondences of measurements that the estimates change; with other
     correlation lengths or phases of fields; and, of a large body, one on a coarser mesh first, see
     `coarse_start`. `watch` receives the iterations of all of them, and one of them gives the
-    solution. Nothing is written.
+    solution: its history and counts are of that search alone, and its times too, with those of the
+    search on a coarser mesh if it started from there. Nothing is written.
 
     Parameters
     ----------
@@ -142,7 +143,7 @@ def _solve_with_likeliest_lengths(
     Returns
     -------
     Solution
-        The last solution; its history and times are those of the last solve alone.
+        The last solution; its history, counts and times are those of the last solve alone.
 
     Raises
     ------
@@ -360,7 +361,8 @@ def _solve_directly(
     Returns
     -------
     Solution
-        Also if the search failed: see its `status`.
+        Also if the search failed: see its `status`. Its history, counts and times are those of the
+        search that gave it alone; a scan that gave the start is stored in `scan`, with a note.
 
     Raises
     ------
@@ -454,8 +456,8 @@ def _feature_notes(solution: Solution) -> list[str]:
 
 def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:
     """Return the method `solver` with workers that solve its experiments, as a `functools.partial`
-    of it, if it is the reduced-space method; any other method, and any method if `workers` is None,
-    is returned unchanged.
+    of it, if it is an instance of `ReducedSpace`; any other method, also a partial of that one, and
+    any method if `workers` is None, is returned unchanged.
     """
     if workers is None or not isinstance(solver, ReducedSpace):
         return solver
@@ -481,7 +483,8 @@ def _solve_from_scan(
     scan : Scan or None
         None if the scan finds no start, or the search from there fails too.
     solution : Solution
-        The new solution, also if it was interrupted, or the failed one.
+        The new solution, also if it was interrupted, or the failed one itself. History, counts and
+        times are those of one of the two searches, not of both.
     """
     reason = f"the search from the guess failed ({failed.status.value})"
     needs_complete_start = getattr(solver, "needs_complete_start", False)
@@ -502,14 +505,16 @@ def best_of_second_start(
     """Return the better of a solution and of the solution from its `second_start_parameters`, with
     a note if that is the second one.
 
-    The second is better if it converges with a loss that is lower by more than `LEAST_GAIN`.
-    Without a second start the first solution is returned; after an interrupt a copy of it with the
-    status of the interrupt. The history of the first search is not part of the second solution.
+    The second is better if it converges with a χ² that is lower by more than `LEAST_GAIN`, an
+    absolute difference. If it is not, or there is no second start, `first` itself is returned; after
+    an interrupt of the second search a copy of it with the status and message of the interrupt. The
+    history, counts and times of the result are those of its own search alone. Exceptions of the
+    method are not caught.
 
     Parameters
     ----------
     solver : Method
-        Method to use.
+        Method to use, also with workers, see `with_workers`.
     first : Solution
         Converged solution.
     watch : callable or None

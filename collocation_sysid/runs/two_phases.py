@@ -134,12 +134,13 @@ def solve_two_phases(
 
     If the smooth field or the first solve with phases does not converge, that solution is returned,
     without samples. A later round that does not converge or does not decrease χ² ends the rounds,
-    and the best solution counts.
+    and the best solution counts. History, counts and times of the result are those of its own solve
+    alone, without the smooth field and the other rounds.
 
     Parameters
     ----------
     problem : Problem
-        With exactly one two-phase field.
+        Problem with exactly one two-phase field.
     start : str, Path or WarmStart, optional
         Start of the solve with the smooth field.
     solve_once : callable

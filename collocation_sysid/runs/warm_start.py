@@ -189,11 +189,12 @@ class WarmStart:
 
     def apply_to_nuisance(self, collocation: Collocation) -> tuple[Array, int]:
         """Return p (np,), the guesses of parameters and nuisance parameters in the solver's
-        coordinates with the earlier nuisance parameters, and the number of these.
+        coordinates with the earlier nuisance parameters, and the number of replaced guesses.
 
         Nuisance parameters are in units of their prior standard deviations. Only those with the
-        same experiment and label are replaced, and not limited to their bounds. Places of markers
-        are those of the discretised problem. Every parameter must have a guess.
+        same experiment and label are replaced, and not limited to their bounds. The entries of the
+        places of markers are never replaced, nor counted: `apply_to_places` sets the places of
+        the discretised problem beforehand. Every parameter must have a guess.
         """
         p = collocation.guess_p
         matches = 0
@@ -213,9 +214,9 @@ class WarmStart:
         """Return the variables z (variables,) of a simulation at the guess with the earlier
         nuisance parameters, limited to their bounds.
 
-        None if no nuisance parameter or place matches, or if the simulation fails. Places of
-        markers are those of the discretised problem, see `apply_to_places`. Every parameter must
-        have a guess.
+        None if no nuisance parameter or place matches, or if the simulation fails. The places of
+        markers are not changed: `apply_to_places` sets them in `collocation` beforehand. Every
+        parameter must have a guess.
         """
         p, matches = self.apply_to_nuisance(collocation)
         matches += sum(

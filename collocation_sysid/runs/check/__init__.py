@@ -440,9 +440,9 @@ def _program_fields(
     ----------
     problem : Problem
     collocation : Collocation
-        Of the whole recordings.
+        Program of the complete recordings.
     first : Collocation
-        Of their first samples.
+        Program of their first samples.
     first_z : (variables,) array
         Variables of `first` at the guess.
     """

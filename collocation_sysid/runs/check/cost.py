@@ -187,7 +187,7 @@ def method_costs(
     z : (variables,) array
         Start of `short`.
     nonzeros : int
-        Of the Jacobian and the Hessian of interior point, together.
+        Number of nonzeros of the Jacobian and the Hessian of interior point, together.
     factorisation : {"auto", "band", "sparse", "supernodal"}
         Option of reduced space.
     """
