@@ -467,8 +467,8 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
     """Raise a `ValueError` if sizes, types or values of arrays from a file are inconsistent.
 
     `arrays` are by name as in `ARRAY_LAYOUT`, where None means that an optional array is missing;
-    those that every `MotionRecord` has must be present. Under each group of `GROUP_PREFIXES` is a
-    mapping of name to array, which may be empty.
+    those that every `MotionRecord` has are not checked for presence and must not be None. Under
+    each group of `GROUP_PREFIXES` is a mapping of name to array, which may be empty.
     """
     sizes: dict[str, int] = {}
     for key, (kinds, letters) in ARRAY_LAYOUT.items():

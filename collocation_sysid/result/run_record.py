@@ -110,7 +110,8 @@ def draw_run(
     Raises
     ------
     InputError
-        If the folder holds another result, or cannot be written to.
+        If the folder holds another result, also that of an earlier call, or no result; its
+        pictures are replaced already then. If the folder cannot be written to.
     """
     began_s = time.perf_counter()
     result = build_result(solved)

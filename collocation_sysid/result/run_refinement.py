@@ -187,6 +187,9 @@ def _estimates_at_optimum(
 ) -> dict[str, Estimate]:
     """Return the estimates of parameters and derived moduli, without coefficients of fields, before
     the correction of the discretisation error, by name.
+
+    `parameters` are those of the problem; they state which are estimated
+    as values instead of logarithms.
     """
     return {
         name: each.at_optimum(name, linear=name in parameters.linear_names)

@@ -460,7 +460,8 @@ def _table_names(
     each custom sensor; the names are EXPERIMENT_CONTENT.csv. Poses are listed for grasps that read
     them or their markers from a file, without `section` for all grasps. The tables of a test bench
     (displacement and force) have the names in the problem file, also as keys. A specimen has one
-    file, with the name in the problem file, or EXPERIMENT.csv without `section`.
+    file, by the content "specimen", with the name in the problem file, or EXPERIMENT.csv without
+    `section`.
 
     Parameters
     ----------

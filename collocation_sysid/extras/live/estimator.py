@@ -593,7 +593,8 @@ class LiveEstimator:
             New rows, at least one; not modified. The caller passes those that are not done again.
         squares : list of (M,) array
             Squared distances [m²] of the markers of the frame's samples from the estimate's; an
-            array is appended for each sample, in place.
+            array is appended for each marker sample, in place; none without a pass, or if it
+            has failed.
 
         Returns
         -------
@@ -1311,7 +1312,11 @@ class LiveEstimator:
         began: float,
         distance: float,
     ) -> None:
-        """Move the linearisation point of a pass to the estimate if it is far and there is time.
+        """Move the linearisation point of a pass towards the estimate if it is far and there is
+        time.
+
+        The new point is that of `_next_linearisation_point`; the old one stays unless it is far
+        from both, the estimate and the new point.
 
         Without effect if fewer than `StreamingModel.rows_per_chunk` rows were computed since the
         last change. With a fixed number of rows per frame there is always time.

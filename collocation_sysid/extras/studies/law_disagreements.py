@@ -134,9 +134,9 @@ def _disagreement(
     values : mapping of str to float
         Positive estimates by model, the chosen one first.
     budget_line : mapping or None
-        Fields of the chosen model's `BudgetLine`, to which the choice of the law is added as a
-        further source; None if it is unknown, which leaves budget and interval None and the share
-        0.
+        Fields of the chosen model's `BudgetLine`, which becomes `chosen_budget` as it is; interval
+        and share are those with the choice of the law as a further source. None if it is unknown,
+        which leaves budget and interval None and the share 0.
     """
     if budget_line is None:
         return Disagreement(

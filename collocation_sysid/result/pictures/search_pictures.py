@@ -113,12 +113,16 @@ def _mark_continuation_stages(
 ) -> None:
     """Mark the iterations at which the fit takes in more timesteps; loss and error increase there.
 
+    Lines are drawn between the stages, and the title of the first panel is set to the shares of
+    the timesteps.
+
     Parameters
     ----------
     panels : sequence of Axes
+        At least one.
     history : sequence of Iteration
     stages : sequence of slice
-        Ranges of `_continuation_stages`; a single range is not marked.
+        Ranges of `_continuation_stages`; with fewer than two nothing is changed.
     """
     if len(stages) < 2:
         return

@@ -123,7 +123,7 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
 
 def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
     """Draw lines at the natural frequencies (k,) [Hz] below `limit_hz` into `axes`, numbered from 1
-    at the top; neighbours that are too near share a label.
+    at the top, with one entry of the legend; neighbours that are too near share a number label.
     """
     shown = natural_hz[natural_hz < limit_hz]
     for group in _neighbour_groups(shown, 0.05 * limit_hz):
