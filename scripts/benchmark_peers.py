@@ -29,7 +29,7 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from shutil import which
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,16 +182,15 @@ def solve_with(
         substeps=steps_per_sample,
         method=method,
     )
-    solution = cs.solve(problem)
-    # The history has elapsed times since the solve began.
-    share = min(1.0, progress.passed_s / solution.history[-1].time_s)
-    for entry in solution.history:
+
+    def watch(entry: cs.Iteration) -> None:
         progress.simulations += 1
         values = {name: entry.parameters[name] for name in GUESS}
-        progress.append(values, share * entry.time_s)
-    progress.append(
-        {name: solution.parameters[name] for name in GUESS}, progress.passed_s
-    )
+        progress.append(values, progress.passed_s)
+
+    solution = cs.solve(problem, watch=watch)
+    values = {name: solution.parameters[name] for name in GUESS}
+    progress.append(values, progress.passed_s)
 
 
 def search(
@@ -313,16 +312,15 @@ def solve_with_mujoco(
     *,
     step_s: float,
     integrator: str,
+    backend: Literal["scipy", "mujoco"],
 ) -> None:
-    """Search by `mujoco.sysid` with MuJoCo's own simulation."""
+    """Search by a backend of `mujoco.sysid` with MuJoCo's own simulation."""
     from mujoco import sysid
 
     mesh = cylinder()
 
     def simulate(values: dict[str, float]) -> Array:
-        return simulate_flex(
-            mesh, values, step_s=step_s, integrator=integrator
-        )
+        return simulate_flex(mesh, values, step_s=step_s, integrator=integrator)
 
     single = counted_residuals(simulate, experiment, progress)
     parameters = sysid.ParameterDict()
@@ -336,7 +334,7 @@ def solve_with_mujoco(
         columns = [single(column) for column in np.asarray(x).T]
         return [np.stack(columns, axis=1)], None, None
 
-    sysid.optimize(parameters, residuals, optimizer="mujoco", verbose=False)
+    sysid.optimize(parameters, residuals, optimizer=backend, verbose=False)
 
 
 @dataclass(frozen=True)
@@ -407,14 +405,32 @@ CANDIDATES = {
         is_compiled=True,
     ),
     "mujoco-sysid": Candidate(
-        "`mujoco.sysid`, explicit steps of 0.05 ms",
-        partial(solve_with_mujoco, step_s=MUJOCO_STEP_S, integrator="Euler"),
+        "`mujoco.sysid`, SciPy's trust region, explicit steps of 0.05 ms",
+        partial(
+            solve_with_mujoco,
+            step_s=MUJOCO_STEP_S,
+            integrator="Euler",
+            backend="scipy",
+        ),
         package="mujoco",
     ),
-    "mujoco-sysid-discrete": Candidate(
-        "`mujoco.sysid`, implicit steps of 0.5 ms",
+    "mujoco-sysid-implicit": Candidate(
+        "`mujoco.sysid`, SciPy's trust region, implicit steps of 0.5 ms",
         partial(
-            solve_with_mujoco, step_s=DISCRETE_STEP_S, integrator="discrete"
+            solve_with_mujoco,
+            step_s=DISCRETE_STEP_S,
+            integrator="discrete",
+            backend="scipy",
+        ),
+        package="mujoco",
+    ),
+    "mujoco-sysid-default": Candidate(
+        "`mujoco.sysid`, its default optimiser, explicit steps of 0.05 ms",
+        partial(
+            solve_with_mujoco,
+            step_s=MUJOCO_STEP_S,
+            integrator="Euler",
+            backend="mujoco",
         ),
         package="mujoco",
     ),

@@ -47,8 +47,8 @@ SWING_M = 0.03
 SWING_RAD = 0.25
 SWING_RATES_RAD_S = (16.0, 11.0)
 RAMP_S = 0.2
-# Time steps per sample of implicit rules. Two thirds of a hundredth of
-# the noise separate the motion from that of half the step, see `main`.
+# Time steps per sample of implicit rules; the motion is then within 0.02 mm
+# (root mean square) of that of MuJoCo's explicit steps of 0.01 ms.
 STEPS_PER_SAMPLE = 4
 
 
@@ -105,12 +105,12 @@ def hand_pose(time_s: float) -> Array:
     return pose
 
 
-def hand_poses(times_s: Array) -> Array:
+def hand_poses(times_s: NDArray[np.floating]) -> Array:
     """Return the poses (k, 4, 4) of the hand at times (k,) [s]."""
     return np.array([hand_pose(time_s) for time_s in times_s.tolist()])
 
 
-def held_positions(mesh: cs.TetMesh, times_s: Array) -> Array:
+def held_positions(mesh: cs.TetMesh, times_s: NDArray[np.floating]) -> Array:
     """Return the positions (k, held, 3) [m] of the held nodes at times (k,) [s]."""
     poses = hand_poses(times_s)
     places_m = mesh.points_m[held_nodes(mesh)]

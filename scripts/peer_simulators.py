@@ -283,7 +283,9 @@ U
 """
 
 
-def _amplitudes(held: Array, times_s: Array, moved_m: Array) -> str:
+def _amplitudes(
+    held: NDArray[np.intp], times_s: NDArray[np.floating], moved_m: Array
+) -> str:
     """Return CalculiX's tables of the displacements (k, held, 3) [m] of the held nodes."""
     tables = []
     for k, node in enumerate(held):
@@ -294,7 +296,7 @@ def _amplitudes(held: Array, times_s: Array, moved_m: Array) -> str:
     return "\n".join(tables)
 
 
-def _moved_boundaries(held: Array) -> str:
+def _moved_boundaries(held: NDArray[np.intp]) -> str:
     """Return CalculiX's conditions that the held nodes follow their tables."""
     return "\n".join(
         f"*BOUNDARY,AMPLITUDE=A{n}_{axis}\n{n + 1},{axis + 1},{axis + 1},1."
