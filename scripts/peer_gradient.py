@@ -7,10 +7,10 @@ and differentiates them in reverse. Needs the package `warp-lang`; runs on the C
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 from peer_case import (
     NODE_MASS_KG,
@@ -24,6 +24,22 @@ from peer_case import (
 )
 
 Array = NDArray[np.float64]
+# Untyped: annotations of Warp's kernels are calls, which type checkers refuse.
+wp: Any = import_module("warp")
+if TYPE_CHECKING:
+    Number = Any
+    Numbers = Any
+    Integers = Any
+    IntegerRows = Any
+    Matrices = Any
+    Vectors = Any
+else:
+    Number = wp.float64
+    Numbers = wp.array(dtype=wp.float64)
+    Integers = wp.array(dtype=int)
+    IntegerRows = wp.array2d(dtype=int)
+    Matrices = wp.array(dtype=wp.mat33d)
+    Vectors = wp.array2d(dtype=wp.vec3d)
 
 # As MuJoCo's explicit steps: stable at the truth and the guess.
 STEP_S = 5e-5
@@ -37,8 +53,8 @@ FIRST_CHANGE = 0.2
 
 @wp.kernel
 def set_constants(
-    logarithms: wp.array[wp.float64],
-    constants: wp.array[wp.float64],
+    logarithms: Numbers,
+    constants: Numbers,
 ):
     """Set λ, μ and γ_r from the logarithms of E, ν and γ_r."""
     young = wp.exp(logarithms[0])
@@ -52,14 +68,14 @@ def set_constants(
 
 @wp.kernel
 def add_forces(
-    x: wp.array2d[wp.vec3d],
-    v: wp.array2d[wp.vec3d],
-    tetrahedra: wp.array2d[int],
-    inverses: wp.array[wp.mat33d],
-    volumes: wp.array[wp.float64],
-    constants: wp.array[wp.float64],
+    x: Vectors,
+    v: Vectors,
+    tetrahedra: IntegerRows,
+    inverses: Matrices,
+    volumes: Numbers,
+    constants: Numbers,
     step: int,
-    forces: wp.array2d[wp.vec3d],
+    forces: Vectors,
 ):
     """Add the forces of elasticity and damping of each tetrahedron at a step."""
     k = wp.tid()
@@ -103,15 +119,15 @@ def add_forces(
 
 @wp.kernel
 def advance(
-    x: wp.array2d[wp.vec3d],
-    v: wp.array2d[wp.vec3d],
-    forces: wp.array2d[wp.vec3d],
-    held_row: wp.array[int],
-    held_m: wp.array2d[wp.vec3d],
+    x: Vectors,
+    v: Vectors,
+    forces: Vectors,
+    held_row: Integers,
+    held_m: Vectors,
     step: int,
-    step_s: wp.float64,
-    mass_kg: wp.float64,
-    drag_1_s: wp.float64,
+    step_s: Number,
+    mass_kg: Number,
+    drag_1_s: Number,
 ):
     """Set positions and velocities of the next step; held nodes (rows ≥ 0) are prescribed."""
     n = wp.tid()
@@ -131,13 +147,13 @@ def advance(
 
 @wp.kernel
 def add_misfit(
-    x: wp.array2d[wp.vec3d],
-    nodes: wp.array[int],
-    measured_m: wp.array2d[wp.vec3d],
+    x: Vectors,
+    nodes: Integers,
+    measured_m: Vectors,
     first: int,
     stride: int,
-    scale: wp.float64,
-    loss: wp.array[wp.float64],
+    scale: Number,
+    loss: Numbers,
 ):
     """Add the squared distances of the markers of all samples, over the noise."""
     k = wp.tid()
@@ -257,8 +273,7 @@ class WarpCylinder:
                 ],
             )
         tape.backward(self.loss)
-        derivative: Any = x.grad
-        gradient = np.array(derivative.numpy(), dtype=float)
+        gradient = np.array(x.grad.numpy(), dtype=float)
         loss = float(self.loss.numpy()[0])
         tape.zero()
         return LossGradient(loss, gradient)
