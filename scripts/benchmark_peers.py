@@ -465,9 +465,9 @@ def reached_entry(track: Track, best: Mapping[str, float]) -> int | None:
 
     None: the last entry is not.
     """
-    values = np.array([[each[name] for name in best] for each in track.values])
-    if not len(values):
+    if not track.values:
         return None
+    values = np.array([[each[name] for name in best] for each in track.values])
     away = np.abs(values / np.array(list(best.values())) - 1).max(axis=1)
     far = np.flatnonzero(away > REACHED)
     first = int(far[-1]) + 1 if len(far) else 0
@@ -562,7 +562,7 @@ def row(
 
 def table(
     tracks: Mapping[str, Track],
-    missing: Mapping[str, str],
+    unmeasured: Mapping[str, str],
     best: Mapping[str, float],
 ) -> str:
     """Return the results as a Markdown table.
@@ -571,8 +571,8 @@ def table(
     ----------
     tracks : dict of str to Track
         Results by candidate.
-    missing : dict of str to str
-        How to install what a candidate needs, for those that were not run.
+    unmeasured : dict of str to str
+        Reason by candidate, for those without a result.
     best : dict of str to float
         The best answer.
     """
@@ -591,15 +591,15 @@ def table(
     rows = [row(name, track, best, ours_s) for name, track in tracks.items()]
     empty = [""] * (len(heads) - 2)
     rows += [
-        (CANDIDATES[name].title, f"not installed: {how}", *empty)
-        for name, how in missing.items()
+        (CANDIDATES[name].title, reason, *empty)
+        for name, reason in unmeasured.items()
     ]
     return markdown(heads, rows)
 
 
 def report(
     tracks: Mapping[str, Track],
-    missing: Mapping[str, str],
+    unmeasured: Mapping[str, str],
     best: Mapping[str, float],
 ) -> str:
     """Return the table with the best answer and the versions of the tools."""
@@ -610,7 +610,7 @@ def report(
     versions = dict.fromkeys(each for each in found if each is not None)
     base = (f"{each} {version(each)}" for each in ("scipy", "casadi"))
     return (
-        f"{table(tracks, missing, best)}\n\n"
+        f"{table(tracks, unmeasured, best)}\n\n"
         f"Best answer beside the truth: {errors}.\n"
         f"Versions: {', '.join((*base, *versions))}.\n"
     )
@@ -628,17 +628,21 @@ def compare(names: list[str], out: Path | None) -> None:
     """
     best = measure_alone(BEST).values[-1]
     tracks = {}
-    missing = {}
+    unmeasured = {}
     for name in names:
         how = CANDIDATES[name].missing_requirement()
         if how is not None:
-            missing[name] = how
+            unmeasured[name] = f"not installed: {how}"
             continue
-        if CANDIDATES[name].is_compiled:
-            measure_alone(name)
-        tracks[name] = measure_alone(name)
-        print(table(tracks, missing, best), flush=True)
-    text = report(tracks, missing, best)
+        try:
+            if CANDIDATES[name].is_compiled:
+                measure_alone(name)
+            tracks[name] = measure_alone(name)
+        except subprocess.CalledProcessError as error:
+            unmeasured[name] = f"failed with exit code {error.returncode}"
+            continue
+        print(table(tracks, unmeasured, best), flush=True)
+    text = report(tracks, unmeasured, best)
     print(text)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -657,7 +661,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, help="file for the table; without it, only print"
     )
-    parser.add_argument("--candidate", help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--candidate", choices=[*CANDIDATES, BEST], help=argparse.SUPPRESS
+    )
     options: Any = parser.parse_args(arguments)
     if find_spec("mujoco") is None:
         print(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+
 import benchmark_peers
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from benchmark_peers import (
     LimitReachedError,
     Progress,
     Track,
+    compare,
     main,
     reached_entry,
     table,
@@ -63,14 +66,38 @@ def test_the_table_says_what_was_reached_and_what_is_not_installed():
         "warp": track_of(2.0, 1.8, 1.5, 1.0),
         "calculix": track_of(1.5, 1.2, has_ended=False),
     }
-    lines = table(tracks, {"scikit-fem": "`pip install x`"}, TRUTH).splitlines()
+    lines = table(tracks, {"scikit-fem": "not installed"}, TRUTH).splitlines()
     cells = [[cell.strip() for cell in line.split("|")] for line in lines[2:]]
     assert cells[0][2:7] == ["1", "2", "20", "9", "90"]
     assert cells[1][2:4] == ["2", "4"]
     assert cells[2][2:6] == ["–", "not reached", "–", "9 (limit)"]
     assert cells[2][7] == "+20.00 %"
-    assert cells[3][2] == "not installed: `pip install x`"
+    assert cells[3][2] == "not installed"
     assert len({len(line) for line in cells}) == 1
+
+
+def test_candidates_that_are_missing_or_fail_do_not_stop_the_others(
+    monkeypatch, capsys, tmp_path
+):
+    def measure(name: str) -> Track:
+        if name == "calculix":
+            raise subprocess.CalledProcessError(3, "ccx")
+        return track_of(1.5, 1.0)
+
+    def requirement(candidate: Candidate) -> str | None:
+        is_missing = candidate is CANDIDATES["warp"]
+        return "`pip install warp-lang`" if is_missing else None
+
+    monkeypatch.setattr(benchmark_peers, "measure_alone", measure)
+    monkeypatch.setattr(Candidate, "missing_requirement", requirement)
+    monkeypatch.setattr(Candidate, "version", lambda _: None)
+    out = tmp_path / "new" / "peers.md"
+    compare(["calculix", "warp", "reduced-space"], out)
+    text = out.read_text(encoding="utf-8")
+    assert "failed with exit code 3" in text
+    assert "not installed: `pip install warp-lang`" in text
+    assert "| this project, reduced space | 1 | 2 |" in text
+    assert text in capsys.readouterr().out
 
 
 def test_only_better_fits_are_entries_and_the_limit_stops_a_search(monkeypatch):
