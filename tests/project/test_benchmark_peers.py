@@ -1,0 +1,151 @@
+"""Benchmark against other tools: when the answer counts as reached, and what the table shows."""
+
+from __future__ import annotations
+
+import subprocess
+
+import benchmark_peers
+import numpy as np
+import pytest
+from benchmark_peers import (
+    CANDIDATES,
+    Candidate,
+    LimitReachedError,
+    Progress,
+    Track,
+    compare,
+    main,
+    reached_entry,
+    table,
+)
+from peer_case import (
+    GUESS,
+    HEIGHT_M,
+    SAMPLE_S,
+    TRUTH,
+    cylinder,
+    hand_motion,
+    held_nodes,
+    held_positions,
+)
+
+
+def track_of(*factors: float, has_ended: bool = True) -> Track:
+    """A search whose entries, one per second, are multiples of the truth."""
+    values = [{name: f * x for name, x in TRUTH.items()} for f in factors]
+    times_s = [1.0 + k for k in range(len(factors))]
+    counts = [10 * (k + 1) for k in range(len(factors))]
+    return Track(times_s, values, counts, 9.0, 90, has_ended)
+
+
+@pytest.mark.parametrize(
+    ("factors", "entry"),
+    [
+        ((2.0, 1.005, 1.5, 1.002, 1.0), 3),
+        ((1.0, 1.009), 0),
+        ((1.0, 1.011), None),
+        ((), None),
+    ],
+)
+def test_an_answer_is_reached_when_the_search_stays_within_one_percent(
+    factors, entry
+):
+    """The second entry of the first search is within 1 %, but the third one is not."""
+    assert reached_entry(track_of(*factors), TRUTH) == entry
+
+
+def test_one_parameter_away_is_enough_to_miss_the_answer():
+    track = track_of(1.0)
+    track.values[0]["poisson"] *= 1.02
+    assert reached_entry(track, TRUTH) is None
+
+
+def test_the_table_says_what_was_reached_and_what_is_not_installed():
+    tracks = {
+        "reduced-space": track_of(1.5, 1.001),
+        "warp": track_of(2.0, 1.8, 1.5, 1.0),
+        "calculix": track_of(1.5, 1.2, has_ended=False),
+    }
+    lines = table(tracks, {"scikit-fem": "not installed"}, TRUTH).splitlines()
+    cells = [[cell.strip() for cell in line.split("|")] for line in lines[2:]]
+    assert cells[0][2:7] == ["1", "2", "20", "9", "90"]
+    assert cells[1][2:4] == ["2", "4"]
+    assert cells[2][2:6] == ["–", "not reached", "–", "9 (limit)"]
+    assert cells[2][7] == "+20.00 %"
+    assert cells[3][2] == "not installed"
+    assert len({len(line) for line in cells}) == 1
+
+
+def test_candidates_that_are_missing_or_fail_do_not_stop_the_others(
+    monkeypatch, capsys, tmp_path
+):
+    def measure(name: str) -> Track:
+        if name == "calculix":
+            raise subprocess.CalledProcessError(3, "ccx")
+        return track_of(1.5, 1.0)
+
+    def requirement(candidate: Candidate) -> str | None:
+        is_missing = candidate is CANDIDATES["warp"]
+        return "`pip install warp-lang`" if is_missing else None
+
+    monkeypatch.setattr(benchmark_peers, "measure_alone", measure)
+    monkeypatch.setattr(Candidate, "missing_requirement", requirement)
+    monkeypatch.setattr(Candidate, "version", lambda _: None)
+    out = tmp_path / "new" / "peers.md"
+    compare(["calculix", "warp", "reduced-space"], out)
+    text = out.read_text(encoding="utf-8")
+    assert "failed with exit code 3" in text
+    assert "not installed: `pip install warp-lang`" in text
+    assert "| this project, reduced space | 1 | 2 |" in text
+    assert text in capsys.readouterr().out
+
+
+def test_only_better_fits_are_entries_and_the_limit_stops_a_search(monkeypatch):
+    progress = Progress()
+    progress.record(TRUTH, loss=2.0)
+    progress.record(GUESS, loss=3.0)
+    assert progress.values == [TRUTH]
+    assert progress.simulations == 2
+    monkeypatch.setattr(benchmark_peers, "LIMIT_S", -1.0)
+    with pytest.raises(LimitReachedError):
+        progress.record(GUESS, loss=1.0)
+    assert progress.values[-1] == GUESS
+    assert progress.counts == [1, 3]
+
+
+def test_missing_packages_and_programs_are_named():
+    run = CANDIDATES["warp"].run
+    package = Candidate("a", run, package="no-such-tool", module="no_such_tool")
+    assert package.missing_requirement() == "`pip install no-such-tool`"
+    program = Candidate("b", run, program="no-such-program")
+    assert program.missing_requirement() == "the program `no-such-program`"
+    assert Candidate("c", run, package="numpy").missing_requirement() is None
+
+
+def test_without_mujoco_a_message_says_how_to_install_it(monkeypatch, capsys):
+    monkeypatch.setattr(benchmark_peers, "find_spec", lambda _: None)
+    assert main([]) == 2
+    assert "pip install mujoco" in capsys.readouterr().err
+
+
+def test_held_nodes_follow_the_hand_and_rates_are_those_of_the_motion():
+    mesh = cylinder()
+    held_m = held_positions(mesh, np.array([0.0, 0.3]))
+    rest_m = mesh.points_m[held_nodes(mesh)]
+    np.testing.assert_allclose(held_m[0], rest_m, atol=1e-15)
+    np.testing.assert_allclose(rest_m[:, 2], HEIGHT_M)
+    along_m, angle = hand_motion(0.3).coordinates
+    centre = np.argmin(np.hypot(*rest_m.T[:2]))
+    np.testing.assert_allclose(
+        held_m[1, centre], [along_m, 0.0, HEIGHT_M], atol=1e-12
+    )
+    outermost = np.argmax(rest_m[:, 0])
+    reach_m = rest_m[outermost, 0]
+    lowered_m = HEIGHT_M - reach_m * np.sin(angle)
+    assert held_m[1, outermost, 2] == pytest.approx(lowered_m)
+    for time_s in (0.1, 0.3):
+        ahead = hand_motion(time_s + 1e-6).coordinates
+        behind = hand_motion(time_s - 1e-6).coordinates
+        rates = (ahead - behind) / 2e-6
+        np.testing.assert_allclose(hand_motion(time_s).rates, rates, rtol=1e-6)
+    assert SAMPLE_S > 0
