@@ -19,7 +19,7 @@ from .newton_solver import (
     NewtonFailure,
     NewtonLinearisation,
     NewtonSolver,
-    follow_path,
+    SolutionPath,
     simulation_error,
 )
 
@@ -130,30 +130,33 @@ def _solve_equilibrium(
                 experiment, without_contact, time_s=at_s, share=share
             ).ravel()
         )
-        return solver.solve(
+        return solver.solve_equilibrium(
             x,
             residual,
             linearise=linearise,
-            keep_definite=True,
             prescribed_m=goal[solver.is_prescribed],
         )
 
     guess = shape.ravel() if start is None and experiment.obstacles else start
-    try:
-        return follow_path(
-            solve,
-            without_contact.ravel(),
-            halvings=solver.options.max_halvings,
-            guess=guess,
-        )
-    except NewtonFailure as failure:
-        raise simulation_error(
-            solver,
-            failure,
-            time_s=at_s,
-            what="finding the rest state",
-            static=True,
-        ) from failure
+    path = SolutionPath(
+        without_contact.ravel(),
+        halvings=solver.options.max_halvings,
+        guess=guess,
+    )
+    while path.share < 1.0:
+        try:
+            path.accept(solve(*path.next_guess()))
+        except NewtonFailure as failure:
+            if path.shorten():
+                continue
+            raise simulation_error(
+                solver,
+                failure,
+                time_s=at_s,
+                what="finding the rest state",
+                static=True,
+            ) from failure
+    return path.x
 
 
 def _describe_state(share: float, force_n: Array) -> str:
