@@ -120,24 +120,23 @@ class SimdEvaluator:
         data_of_points: Array | None = None,
     ) -> None:
         """Sum the kernel over elements and points into `out` (T, width); see `Evaluator`."""
-        pointers = [
+        arguments = [
+            self._blocks,
+            fields[0].shape[1],
+            self._width,
+            int(add),
             *(address(field) for field in fields),
             *self._tables,
             address(theta),
             address(out),
         ]
         if self._point_data_columns is not None and data_of_points is not None:
-            length = data_of_points.shape[1] if len(data_of_points) > 1 else 0
-            pointers += [
-                length,
+            arguments += [
+                data_of_points.shape[1] if len(data_of_points) > 1 else 0,
                 address(self._point_data_columns),
                 address(data_of_points),
             ]
-        stride = fields[0].shape[1]
-        sizes = self._blocks, stride, self._width, int(add)
-        run_in_slices(
-            self._run, len(out), threads=threads, arguments=(*sizes, *pointers)
-        )
+        run_in_slices(self._run, len(out), threads=threads, arguments=arguments)
 
 
 def _emit_kernel(kernel: ElementKernel, points: int, lanes: int) -> ir.Module:

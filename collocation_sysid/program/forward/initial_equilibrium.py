@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...common.array_types import Array
+from ...common.array_types import Array, Index
 from ...common.step_counting import report_state
 from ...common.time_dependence import scale_loads
 from ...model.contact import Contact
@@ -16,9 +16,11 @@ from ...recording.obstacle import Obstacle
 from ..linear_algebra.factorisation import NONE
 from ..linear_algebra.lapack import one_blas_thread
 from .newton_solver import (
+    Linearise,
     NewtonFailure,
     NewtonLinearisation,
     NewtonSolver,
+    Residual,
     SolutionPath,
     simulation_error,
 )
@@ -101,41 +103,9 @@ def _solve_equilibrium(
     SimulationError
         If no stable equilibrium is found.
     """
-    zero_velocity = np.zeros((1, len(goals_m)))
     shape = experiment.rigid_positions([at_s])[0]
     forces = with_start_memory(forces, experiment.loaded_since_s)
     without_contact = _without_contact(forces, shape)
-
-    def solve(x: Array, share: float) -> Array:
-        loaded = scale_loads(forces, share)
-
-        def residual(state: Array) -> Array:
-            return loaded.total(state, zero_velocity)[0]
-
-        def linearise(state: Array) -> NewtonLinearisation:
-            # Nothing moves: there is no skew part.
-            at = loaded.linearise(state, zero_velocity)
-            report_state(
-                lambda: _describe_state(share, at.force[0][solver.free])
-            )
-            return NewtonLinearisation(
-                at.force[0], -at.by_position[0], skew=NONE
-            )
-
-        # Grasps that are off are there at the end: the way there may be any.
-        goal = (
-            goals_m
-            if share == 1
-            else _partial_displacement(
-                experiment, without_contact, time_s=at_s, share=share
-            ).ravel()
-        )
-        return solver.solve_equilibrium(
-            x,
-            residual,
-            linearise=linearise,
-            prescribed_m=goal[solver.is_prescribed],
-        )
 
     guess = shape.ravel() if start is None and experiment.obstacles else start
     path = SolutionPath(
@@ -144,8 +114,25 @@ def _solve_equilibrium(
         guess=guess,
     )
     while path.share < 1.0:
+        x, share = path.next_guess()
+        residual, linearise = _static_equations(
+            scale_loads(forces, share), share, free=solver.free
+        )
+        # Grasps that are off are there at the end: the way there may be any.
+        goal = (
+            goals_m
+            if share == 1
+            else _partial_displacement(
+                experiment, without_contact, time_s=at_s, share=share
+            ).ravel()
+        )
         try:
-            path.accept(solve(*path.next_guess()))
+            solution = solver.solve_equilibrium(
+                x,
+                residual,
+                linearise=linearise,
+                prescribed_m=goal[solver.is_prescribed],
+            )
         except NewtonFailure as failure:
             if path.shorten():
                 continue
@@ -156,7 +143,37 @@ def _solve_equilibrium(
                 what="finding the rest state",
                 static=True,
             ) from failure
+        path.accept(solution)
     return path.x
+
+
+def _static_equations(
+    loaded: Forces, share: float, free: Index
+) -> tuple[Residual, Linearise]:
+    """Return the force balance (3n,) [N] of a body at rest as a function of its positions (3n,)
+    [m], and its linearisation, which also reports the state of the search.
+
+    Parameters
+    ----------
+    loaded : Forces
+        Forces with the share of the loads.
+    share : float
+        Share of loads and displacements, for the report.
+    free : (free,) array
+        Free dofs.
+    """
+    zero_velocity = np.zeros((1, loaded.pattern.size))
+
+    def residual(state: Array) -> Array:
+        return loaded.total(state, zero_velocity)[0]
+
+    def linearise(state: Array) -> NewtonLinearisation:
+        # Nothing moves: there is no skew part.
+        at = loaded.linearise(state, zero_velocity)
+        report_state(lambda: _describe_state(share, at.force[0][free]))
+        return NewtonLinearisation(at.force[0], -at.by_position[0], skew=NONE)
+
+    return residual, linearise
 
 
 def _describe_state(share: float, force_n: Array) -> str:
