@@ -10,6 +10,11 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.time_dependence import at_times
 from ..errors import InputError
+from .gap_interpolation import (
+    SAME_TIME_INTERVALS,
+    interpolate_without_gaps,
+    is_gap,
+)
 from .marker_files import MarkerTable
 from .poses import PoseSequence
 from .sample_times import (
@@ -20,10 +25,6 @@ from .sample_times import (
     unrounded_s,
 )
 
-# Distance of samples, in median steps, above which samples were lost between them.
-_GAP_STEPS = 1.5
-# Distance of equal times, in steps: rounding of the grid.
-_SAME_TIME_STEPS = 1e-6
 # Fewest samples of a motion: an acceleration needs three.
 _FEWEST_SAMPLES = 3
 
@@ -113,7 +114,11 @@ def align(
     else:
         t_s = grid = _even_grid(table.t_s, resample_hz)
         table = MarkerTable(
-            grid, table.names, positions_m=_interpolate_markers(table, grid)
+            grid,
+            table.names,
+            positions_m=interpolate_without_gaps(
+                grid, table.t_s, table.positions_m
+            ),
         )
     moved = []
     for k, sequence in enumerate(poses):
@@ -230,35 +235,15 @@ def _even_grid(t_s: Array, rate_hz: float) -> Array:
     """
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise InputError(f"resample_hz is {rate_hz:g}; expected a rate above 0")
-    count = int(np.floor((t_s[-1] - t_s[0]) * rate_hz + _SAME_TIME_STEPS)) + 1
+    count = (
+        int(np.floor((t_s[-1] - t_s[0]) * rate_hz + SAME_TIME_INTERVALS)) + 1
+    )
     if count < 2:
         raise InputError(
             f"resample_hz = {rate_hz:g} leaves one sample between {t_s[0]:.9g} s and "
             f"{t_s[-1]:.9g} s; raise it or widen window_s"
         )
     return t_s[0] + np.arange(count) / rate_hz
-
-
-def _interpolate_markers(table: MarkerTable, grid: Array) -> Array:
-    """Return marker positions (G, M, 3) [m] at the times `grid` (G,), linear between samples; NaN
-    beside a missing sample or within a gap of the times, over `_GAP_STEPS` median intervals.
-
-    At a time within `_SAME_TIME_STEPS` of a sample it is that sample, whatever its neighbour. The
-    table must have at least two samples.
-    """
-    t_s = table.t_s
-    x = table.positions_m
-    k = np.clip(np.searchsorted(t_s, grid, side="right") - 1, 0, len(t_s) - 2)
-    step_s = t_s[k + 1] - t_s[k]
-    fraction = ((grid - t_s[k]) / step_s)[:, None, None]
-    between = (1.0 - fraction) * x[k] + fraction * x[k + 1]
-    between[step_s > _GAP_STEPS * np.median(np.diff(t_s))] = np.nan
-    # On a sample its neighbour does not matter, even if that one is missing.
-    on_previous_sample = fraction <= _SAME_TIME_STEPS
-    on_later = fraction >= 1.0 - _SAME_TIME_STEPS
-    return np.where(
-        on_previous_sample, x[k], np.where(on_later, x[k + 1], between)
-    )
 
 
 def _poses_on_grid(
@@ -320,7 +305,7 @@ def _tolerance_s(poses: PoseSequence, t_s: Array) -> float:
 
 def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
     """Return the predicate of a note on poses that were interpolated to the times `grid` (G,), and
-    on gaps of the poses within the grid (over `_GAP_STEPS` median intervals); the caller adds the
+    on gaps of the poses within the grid (see `gap_interpolation`); the caller adds the
     subject.
     """
     how = (
@@ -334,15 +319,14 @@ def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
         else _span_text(grid)
     )
     note = f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, {at}"
-    steps = np.diff(poses.t_s)
-    is_gap = (steps > _GAP_STEPS * np.median(steps)) & (poses.t_s[1:] > grid[0])
-    is_gap &= poses.t_s[:-1] < grid[-1]
-    if not is_gap.any():
+    in_grid = (poses.t_s[1:] > grid[0]) & (poses.t_s[:-1] < grid[-1])
+    gaps = np.flatnonzero(is_gap(poses.t_s) & in_grid)
+    if not len(gaps):
         return note
-    k = int(np.argmax(np.where(is_gap, steps, 0.0)))
+    longest = gaps[np.argmax(np.diff(poses.t_s)[gaps])]
     return (
-        f"{note}, also across {is_gap.sum()} gap{'s' * int(is_gap.sum() > 1)} in them, the longest "
-        f"{_span_text(poses.t_s[k : k + 2])}"
+        f"{note}, also across {len(gaps)} gap{'s' * int(len(gaps) > 1)} in them, the longest "
+        f"{_span_text(poses.t_s[longest : longest + 2])}"
     )
 
 

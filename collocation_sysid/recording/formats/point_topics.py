@@ -12,6 +12,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...errors import InputError
+from ..gap_interpolation import interpolate_without_gaps
 from .logs import Log, TopicAddress, open_log, require_topic
 from .topics import (
     AXES,
@@ -23,9 +24,6 @@ from .topics import (
 )
 
 TOPIC_LIST_SEPARATOR = ","
-# Largest gap between two points of a topic over which a point is interpolated, in median intervals:
-# over a longer one the marker is missing.
-LARGEST_GAP_INTERVALS = 1.5
 
 
 def address_as_csv(address: TopicAddress) -> bytes:
@@ -49,7 +47,8 @@ def address_as_csv(address: TopicAddress) -> bytes:
     times = max((t_s for t_s, _, _ in tracks.values()), key=len)
     markers = marker_names(names)
     values = np.concatenate(
-        [_points_at(times, *tracks[name][:2]) for name in names], axis=1
+        [interpolate_without_gaps(times, *tracks[name][:2]) for name in names],
+        axis=1,
     )
     columns = [f"{marker}_{axis}" for marker in markers for axis in AXES]
     return csv_content(columns, times, values=values)
@@ -115,26 +114,3 @@ def _require_one_frame(frames: dict[str, set[str]]) -> None:
         f"points of one marker table have different frame_id ({stated}); expected one frame: "
         "publish or convert all points in the world frame of the robot's poses"
     )
-
-
-def _points_at(times: Array, t_s: Array, points_m: Array) -> Array:
-    """Return points (T, 3) [m] at `times` (T,) [s], interpolated linearly between the points (S, 3)
-    at the times (S,); NaN outside them and in gaps.
-    """
-    found = np.full((len(times), 3), np.nan)
-    after = np.searchsorted(t_s, times)
-    exact = after < len(t_s)
-    exact[exact] = t_s[after[exact]] == times[exact]
-    found[exact] = points_m[after[exact]]
-    if len(t_s) < 2:
-        return found
-    inside = ~exact & (after > 0) & (after < len(t_s))
-    right = after[inside]
-    interval_s = t_s[right] - t_s[right - 1]
-    share = (times[inside] - t_s[right - 1]) / interval_s
-    between = points_m[right - 1] + share[:, None] * (
-        points_m[right] - points_m[right - 1]
-    )
-    is_gap = interval_s > LARGEST_GAP_INTERVALS * float(np.median(np.diff(t_s)))
-    found[inside] = np.where(is_gap[:, None], np.nan, between)
-    return found
