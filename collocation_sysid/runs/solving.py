@@ -66,8 +66,8 @@ def solve(
     missing or a search from guesses fails; a second one in reduced space, if the first converges
     near ν = ½; with correspondences of measurements that the estimates change; with other
     correlation lengths or phases of fields; and, of a large body, one on a coarser mesh first, see
-    `coarse_start`. `watch` receives the iterations of all of them, and one
-    of them gives the solution. Nothing is written.
+    `coarse_start`. `watch` receives the iterations of all of them, and one of them gives the
+    solution. Nothing is written.
 
     Parameters
     ----------
@@ -97,6 +97,9 @@ def solve(
         found, if the machine lacks memory, for a scheduler that does not answer or a method that
         cannot use it, for two-phase fields that cannot be searched, and when the solver refuses the
         problem.
+    SimulationError
+        If the equations of motion are singular at a solution with a field whose correlation
+        length or phases are searched.
     """
     solver = problem.solver(method)
     if scheduler is not None and not isinstance(solver, ReducedSpace):
@@ -133,6 +136,11 @@ def _likeliest_lengths(
 
     The likelihood of each length follows to first order from the solution, see
     `statistics.field_estimates`.
+
+    Raises
+    ------
+    SimulationError
+        If the equations of motion are singular at the solution.
     """
     fields = {
         part.field
@@ -159,7 +167,8 @@ def _solve_by_coarse_start(
     """Solve a problem with fixed correlation lengths on a coarser mesh first, and from there on its
     own; None if the method's options or the sizes of the bodies do not call for a coarse start.
 
-    The arguments are those of `_solve_once`.
+    After an interrupt of the coarse solve its point is returned as an interrupted solution, see
+    `interrupted_solution`. The arguments are those of `_solve_once`.
 
     Raises
     ------
@@ -199,7 +208,8 @@ def _solve_on_coarse_mesh(
     workers: ExperimentExecutor | None,
 ) -> Solution:
     """Return the solution on a coarser mesh, with a tolerance of at least `COARSE_TOLERANCE`; also
-    if it did not converge. The arguments are those of `_solve_once`.
+    if it did not converge. The problem is `coarse_start.problem`, solved from its guesses or a
+    scan; the other arguments are those of `_solve_once`.
 
     Raises
     ------
@@ -315,6 +325,11 @@ def _solve_once(
         Called with every iteration.
     workers : ExperimentExecutor or None
         Workers for reduced space; None for this process.
+
+    Returns
+    -------
+    Solution
+        Also if the search failed: see its `status`.
 
     Raises
     ------
@@ -438,7 +453,9 @@ def _program_and_start(
 
 
 def _feature_notes(solution: Solution) -> list[str]:
-    """Return the notes of all features on the experiments of a solution."""
+    """Return the notes of all features on the fitted experiments of a solution, in their order;
+    empty without any.
+    """
     return [
         note
         for part in solution.parts
@@ -448,9 +465,9 @@ def _feature_notes(solution: Solution) -> list[str]:
 
 
 def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:
-    """Return the reduced-space method with workers that solve its experiments, as a
-    `functools.partial` of it; any other method, and any method if `workers` is None, is returned
-    unchanged.
+    """Return the method `solver` with workers that solve its experiments, as a `functools.partial`
+    of it, if it is the reduced-space method; any other method, and any method if `workers` is None,
+    is returned unchanged.
     """
     if workers is None or not isinstance(solver, ReducedSpace):
         return solver
@@ -497,8 +514,9 @@ def best_of_second_start(
     """Return the better of a solution and of the solution from its `second_start_parameters`, with
     a note if that is the second one.
 
-    Without a second start the first solution is returned; after an interrupt it is returned as
-    interrupted. The history of the first search is not part of the second solution.
+    The second is better if it converges with a loss that is lower by more than `LEAST_GAIN`.
+    Without a second start the first solution is returned; after an interrupt a copy of it with the
+    status of the interrupt. The history of the first search is not part of the second solution.
 
     Parameters
     ----------
@@ -579,8 +597,8 @@ def second_start_parameters(solution: Solution) -> Parameters | None:
     usual one at the same Young's modulus.
 
     A ratio is high above `NEARLY_INCOMPRESSIBLE`. Only ratios of regions count in which both
-    moduli, or the ratio alone, are estimated. None if no ratio is high, or if a replaced value is
-    not within its bounds.
+    moduli, or the ratio alone, are estimated. Other estimated parameters have their estimates as
+    guesses. None if no ratio is high, or if a replaced value is not within its bounds.
     """
     collocation = solution.collocation
     values = parameter_values(solution.collocation, solution.q)
