@@ -12,7 +12,7 @@ import secrets
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
 from typing import Any, Protocol, TypeVar
 from weakref import WeakKeyDictionary
@@ -78,6 +78,12 @@ class ExperimentExecutor(Protocol):
 class LocalExecutor:
     """Executor with threads of this process, see `ExperimentExecutor`.
 
+    Attributes
+    ----------
+    map_experiments : callable
+        `fem.kernels.map_experiments` with these threads: results are the values themselves, and
+        an exception of the function is raised.
+
     Parameters
     ----------
     threads : int
@@ -85,26 +91,11 @@ class LocalExecutor:
     """
 
     def __init__(self, threads: int) -> None:
-        self.threads = threads
+        self.map_experiments = partial(map_experiments, threads=threads)
 
     def store_segments(self, collocation: Collocation) -> list[Any]:
         """Return the transcriptions of the fitted experiments themselves, in a new list."""
         return list(collocation.transcriptions)
-
-    def map_experiments(
-        self, run: Callable[..., Any], *columns: Sequence[Any]
-    ) -> list[Any]:
-        """Apply a function to every experiment, in parallel threads, and return its results
-        themselves, in the order of the experiments; an exception of the function is raised.
-
-        Parameters
-        ----------
-        run : callable
-            Function of one entry of each column.
-        columns : sequence
-            Arguments, one entry per experiment each; all must have the same length.
-        """
-        return map_experiments(run, *columns, threads=self.threads)
 
     def fetch(self, stored: Sequence[Any]) -> list[Any]:
         """Return the stored values themselves, in a new list."""

@@ -15,7 +15,7 @@ from ..common.array_types import Array
 from ..errors import SimulationError
 from ..fem.kernels import map_experiments
 from ..model.forces import Forces
-from ..program.collocation import Collocation, ExperimentIterate
+from ..program.collocation import Collocation
 from ..program.forward.initial_equilibrium import initial_state
 from ..program.forward.loss_of_stability import explain_failure
 from ..program.forward.newton_solver import NewtonOptions, NewtonSolver
@@ -134,64 +134,27 @@ def simulate_trajectories(
         """Simulate experiment number k, from 0; return its trajectory as far as it succeeded, and
         the failure or None.
         """
-        count = parts[k].segment.grid_times if rows is None else rows[k]
-        own_guess = None if guess is None else guess[k]
-        return continue_trajectory(
-            parts[k],
-            count,
+        part = parts[k]
+        count = part.segment.grid_times if rows is None else rows[k]
+        x, failure = continue_simulation(
+            part.segment.experiment,
+            part.equations.dynamics.truncated_to(count),
+            known=part.x if len(part.x) else None,
             options=options,
             stopwatch=stopwatch,
-            guess=own_guess,
+            approximate_solution=None if guess is None else guess[k],
         )
+        if failure is not None:
+            failure = explain_failure(
+                part.segment.experiment, part.equations.theta, error=failure
+            )
+        return x, failure
 
     reached = map_experiments(
         simulate_one, range(len(parts)), threads=collocation.threads
     )
     failures = [failure for _, failure in reached if failure is not None]
     return [x for x, _ in reached], failures[0] if failures else None
-
-
-def continue_trajectory(
-    iterate: ExperimentIterate,
-    rows: int,
-    options: NewtonOptions | None = None,
-    stopwatch: Stopwatch | None = None,
-    guess: Array | None = None,
-) -> tuple[Array, SimulationError | None]:
-    """Continue the trajectory of one experiment, as far as the simulation succeeds.
-
-    Parameters
-    ----------
-    iterate : ExperimentIterate
-        Experiment at its parameters, with its known first rows.
-    rows : int
-        Number of grid rows of the result.
-    options : NewtonOptions, optional
-        Tolerances of Newton's method.
-    stopwatch : Stopwatch, optional
-        Stopwatch that measures the simulation.
-    guess : (N, 3n) array, optional
-        Trajectory at other parameters [m], see `simulate_trajectories`.
-
-    Returns
-    -------
-    tuple of (m, 3n) array and SimulationError or None
-        Trajectory with the known rows [m], and the failure, which names the mode where the body
-        lost its stability; None if the trajectory is complete.
-    """
-    experiment = iterate.segment.experiment
-    positions_m, failure = continue_simulation(
-        experiment,
-        iterate.equations.dynamics.truncated_to(rows),
-        known=iterate.x if len(iterate.x) else None,
-        options=options,
-        stopwatch=stopwatch,
-        approximate_solution=guess,
-    )
-    if failure is not None:
-        theta = np.asarray(iterate.equations.theta)
-        failure = explain_failure(experiment, theta, error=failure)
-    return positions_m, failure
 
 
 def complete_variables(

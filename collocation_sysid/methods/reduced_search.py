@@ -238,7 +238,21 @@ class ReducedSearch:
         SearchEnded
             If the workers are lost.
         """
-        status = self._solve_from_start() or self._solve_horizons()
+        status = self._solve_from_start()
+        if status is not None:
+            return status, status.sentence
+        status = Status.CONVERGED
+        for share in self.options.ladder:
+            last = share == self.options.ladder[-1]
+            rows = [
+                samples_in_share(segment.grid_times, share)
+                for segment in self.collocation.transcriptions
+            ]
+            rung = self._horizon(rows, last)
+            self._extend_to(rung)
+            status = self._minimise(rung, last)
+            if status is Status.ITERATION_LIMIT:
+                break
         return status, status.sentence
 
     def _solve_from_start(self) -> Status | None:
@@ -258,29 +272,6 @@ class ReducedSearch:
         except SimulationError:
             self.trajectories = self.point = None
             return None
-
-    def _solve_horizons(self) -> Status:
-        """Solve one horizon after the other, up to the complete problem or a limit of iterations,
-        and return the last status.
-
-        Raises
-        ------
-        SimulationError
-            If a horizon cannot be reached or started, see `_extend_to` and `_minimise`.
-        """
-        status = Status.CONVERGED
-        for share in self.options.ladder:
-            last = share == self.options.ladder[-1]
-            rows = [
-                samples_in_share(segment.grid_times, share)
-                for segment in self.collocation.transcriptions
-            ]
-            rung = self._horizon(rows, last)
-            self._extend_to(rung)
-            status = self._minimise(rung, last)
-            if status is Status.ITERATION_LIMIT:
-                break
-        return status
 
     def _horizon(self, rows: list[int], last: bool) -> Horizon:
         """Return the problem on the given numbers of first rows of each experiment; unless it is

@@ -42,7 +42,7 @@ from .initial_trajectories import complete_variables, simulate_trajectories
 from .loss_curvature import require_second_derivatives
 from .reduced_search import ReducedSearch, SearchOptions
 from .solution import Solution, Status, Watch
-from .solve_recorder import Recorder, SearchEnded
+from .solve_recorder import SEARCH_ENDS, Recorder, SearchEnded, status_of_end
 from .trajectory_sweeps import trajectory_positions
 
 # Misfits above this many standard deviations of the markers are worth a note.
@@ -110,7 +110,10 @@ class ReducedSpace(SearchOptions):
         workers = workers or LocalExecutor(collocation.threads)
         recorder = Recorder(self.name, collocation, watch=watch)
         search = ReducedSearch(self, recorder, start=start, workers=workers)
-        status, message = recorder.run_search(search.run)
+        try:
+            status, message = search.run()
+        except SEARCH_ENDS as end:
+            status, message = status_of_end(end)
         collocation = recorder.collocation
         try:
             trajectories = search.trajectories and workers.fetch(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 import numpy as np
 
@@ -30,6 +29,35 @@ class SearchEnded(Exception):
         super().__init__(message)
         self.status = status
         self.message = message or status.sentence
+
+
+# Exceptions that end a search with a status, see `status_of_end`.
+SEARCH_ENDS = (SearchEnded, SimulationError, KeyboardInterrupt)
+
+
+def status_of_end(
+    end: SearchEnded | SimulationError | KeyboardInterrupt,
+) -> tuple[Status, str]:
+    """Return the status and message of a search that one of the `SEARCH_ENDS` has ended.
+
+    `SearchEnded` gives its own status, `SimulationError` gives `NOT_SIMULABLE`, and
+    `KeyboardInterrupt` gives `INTERRUPTED`.
+    """
+    if isinstance(end, SearchEnded):
+        return end.status, end.message
+    if isinstance(end, KeyboardInterrupt):
+        return Status.INTERRUPTED, Status.INTERRUPTED.sentence
+    # Another stiffness does not prevent that a surface wrinkles: stretches decide.
+    is_physical = (
+        end.stability_loss is not None
+        and end.stability_loss.is_surface_instability
+    )
+    sentence = (
+        "The recording cannot be simulated to its end:"
+        if is_physical
+        else Status.NOT_SIMULABLE.sentence
+    )
+    return Status.NOT_SIMULABLE, f"{sentence} {end}."
 
 
 class Recorder:
@@ -99,41 +127,6 @@ class Recorder:
         z, notes = initial_variables(self.collocation)
         self.notes += notes
         return z
-
-    def run_search(
-        self, search: Callable[[], tuple[Status, str]]
-    ) -> tuple[Status, str]:
-        """Run a search and return its status and message, also if it ends by an exception.
-
-        Parameters
-        ----------
-        search : callable
-            The search; it returns status and message.
-
-        Returns
-        -------
-        tuple of Status and str
-            `SearchEnded` gives its own status, `SimulationError` gives `NOT_SIMULABLE`, and
-            `KeyboardInterrupt` gives `INTERRUPTED`. Other exceptions are not caught.
-        """
-        try:
-            return search()
-        except SearchEnded as end:
-            return end.status, end.message
-        except SimulationError as error:
-            # Another stiffness does not prevent that a surface wrinkles: stretches decide.
-            is_physical = (
-                error.stability_loss is not None
-                and error.stability_loss.is_surface_instability
-            )
-            sentence = (
-                "The recording cannot be simulated to its end:"
-                if is_physical
-                else Status.NOT_SIMULABLE.sentence
-            )
-            return Status.NOT_SIMULABLE, f"{sentence} {error}."
-        except KeyboardInterrupt:
-            return Status.INTERRUPTED, Status.INTERRUPTED.sentence
 
     def add_variables(self, number: int, z: Array, loss: float) -> None:
         """Evaluate the problem at variables z, and add the result to the history, see `add`.

@@ -531,8 +531,11 @@ class TrialSimulation:
         stored, neither the trajectories nor `failure`. Every parameter must have a guess.
         """
         p = self.collocation.guess_p
-        positions, failure = self._simulate(
-            p, None, rows=self.all_rows if is_complete else self.rows
+        positions, failure = simulate_trajectories(
+            self.collocation,
+            p,
+            rows=self.all_rows if is_complete else self.rows,
+            options=LOOSE,
         )
         if failure is not None:
             return np.nan, failure
@@ -552,7 +555,9 @@ class TrialSimulation:
             Trajectories at another modulus, near which equilibria are searched; None without.
         """
         p = self._p(young_pa)
-        positions, failure = self._simulate(p, guess, rows=self.rows)
+        positions, failure = simulate_trajectories(
+            self.collocation, p, rows=self.rows, options=LOOSE, guess=guess
+        )
         if failure is not None:
             self.failure = failure
             return np.nan, None
@@ -562,7 +567,12 @@ class TrialSimulation:
         """Simulate the complete recordings at a Young's modulus [Pa], and return whether that
         succeeds; if not, the error is stored in `failure`.
         """
-        _, failure = self._simulate(self._p(young_pa), None, rows=self.all_rows)
+        _, failure = simulate_trajectories(
+            self.collocation,
+            self._p(young_pa),
+            rows=self.all_rows,
+            options=LOOSE,
+        )
         self.failure = failure or self.failure
         return failure is None
 
@@ -593,30 +603,6 @@ class TrialSimulation:
         first = [x[:rows] for x, rows in zip(positions, self.rows, strict=True)]
         misfit = _misfit(self.collocation, p, positions=first)
         return misfit if np.isfinite(misfit) else np.nan
-
-    def _simulate(
-        self, p: Array, warm: list[Array] | None, rows: Sequence[int]
-    ) -> tuple[list[Array], SimulationError | None]:
-        """Return trajectories (rows, 3n) [m] of each experiment, and the first failure or None, see
-        `simulate_trajectories`.
-
-        Parameters
-        ----------
-        p : (np,) array
-            Parameters (q, φ).
-        warm : list of (N, 3n) array or None
-            Trajectories near which equilibria are searched [m]; None for no guess.
-        rows : sequence of int
-            Number of grid rows of each experiment.
-        """
-        return simulate_trajectories(
-            self.collocation,
-            p,
-            known_rows=None,
-            rows=rows,
-            options=LOOSE,
-            guess=warm,
-        )
 
 
 class ScanState:

@@ -15,6 +15,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..errors import SimulationError
 from ..program.collocation import ExperimentIterate
+from ..program.forward.loss_of_stability import explain_failure
 from ..program.forward.newton_solver import NewtonOptions
 from ..program.forward.scheme_simulation import continue_simulation
 from ..program.least_squares import SquareRootInformation
@@ -22,7 +23,6 @@ from ..program.measurement_residual import huber_as_least_squares
 from ..program.observable_response import ObservableResponse
 from ..program.sweep import Sweep, SweepResult
 from ..program.transcription import Transcription
-from .initial_trajectories import continue_trajectory
 
 # Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
 # part of the first sweep.
@@ -360,14 +360,18 @@ def simulate_rows(
         if known_rows is None
         else trajectory_positions(known_rows),
     )
-    guess_positions = None if guess is None else guess.x
-    x, failure = continue_trajectory(
-        part,
-        solver.dynamics.row_count,
+    x, failure = continue_simulation(
+        transcription.experiment,
+        part.equations.dynamics.truncated_to(solver.dynamics.row_count),
+        known=part.x if len(part.x) else None,
         options=MARCHED,
         stopwatch=solver.stopwatch,
-        guess=guess_positions,
+        approximate_solution=None if guess is None else guess.x,
     )
+    if failure is not None:
+        failure = explain_failure(
+            transcription.experiment, part.equations.theta, error=failure
+        )
     return SimulationResult(
         x, failure, times_s=solver.stopwatch.read_and_reset()
     )

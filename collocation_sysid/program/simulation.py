@@ -156,13 +156,27 @@ def simulate(
         ceased to be stable the mode, see `program.find_stability_loss`.
     """
     theta = resolve_theta(experiment.body, parameters)
+    steps = _steps_per_sample(
+        experiment, integrator, timestep_s=timestep_s, substeps=substeps
+    )
+    if (massless := experiment.body.mass_problem(theta)) is not None:
+        raise InputError(massless)
+    if (unreachable := experiment.body.rest_shape_failure(theta)) is not None:
+        raise InputError(unreachable)
     try:
-        return _simulate(
+        if steps == "auto":
+            return _with_automatic_steps(
+                experiment,
+                theta,
+                integrator=integrator,
+                options=options,
+                progress=progress,
+            )
+        return _with_steps(
             experiment,
             theta,
             integrator=integrator,
-            timestep_s=timestep_s,
-            substeps=substeps,
+            steps=steps,
             options=options,
             progress=progress,
         )
@@ -172,17 +186,18 @@ def simulate(
         raise reason from error
 
 
-def _simulate(
+def _steps_per_sample(
     experiment: Experiment,
-    theta: Array,
     integrator: str | Scheme,
     timestep_s: float | None,
     substeps: int | Literal["auto"],
-    options: NewtonOptions | None,
-    progress: Progress | None,
-) -> Trajectory:
-    """Return the result of `simulate`, with arguments as there except θ (`theta`); errors do not
-    contain the reasons that `simulate` adds.
+) -> int | Literal["auto"]:
+    """Return the time steps between samples, 1 in a static experiment; arguments as in `simulate`.
+
+    Raises
+    ------
+    InputError
+        For a step or substeps that are not positive, or too many steps.
     """
     if timestep_s is not None and not timestep_s > 0:
         raise InputError(
@@ -194,35 +209,12 @@ def _simulate(
         )
     if isinstance(substeps, int) and substeps < 1:
         raise InputError(f"substeps = {substeps}, expected at least 1")
-    if (massless := experiment.body.mass_problem(theta)) is not None:
-        raise InputError(massless)
-    if (unreachable := experiment.body.rest_shape_failure(theta)) is not None:
-        raise InputError(unreachable)
-    if (
-        integrator == NEWMARK
-        and timestep_s is not None
-        and not experiment.is_static
-    ):
-        require_steps(experiment, timestep_s)
-        substeps = max(1, round(experiment.timestep_s / timestep_s))
     if experiment.is_static:
-        substeps = 1
-    if isinstance(substeps, int):
-        return _with_steps(
-            experiment,
-            theta,
-            integrator=integrator,
-            steps=substeps,
-            options=options,
-            progress=progress,
-        )
-    return _with_automatic_steps(
-        experiment,
-        theta,
-        integrator=integrator,
-        options=options,
-        progress=progress,
-    )
+        return 1
+    if integrator != NEWMARK or timestep_s is None:
+        return substeps
+    require_steps(experiment, timestep_s)
+    return max(1, round(experiment.timestep_s / timestep_s))
 
 
 def _with_automatic_steps(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -133,7 +133,11 @@ class StreamingModel:
         Fitted experiment, as declared in the problem.
     collocation : Collocation
         Program of the still recording, the template of all rows.
+    rows_per_chunk : int
+        Largest number of rows that are linearised together.
     """
+
+    rows_per_chunk: ClassVar[int] = ROWS_PER_CHUNK
 
     experiment: Experiment
     collocation: Collocation
@@ -218,11 +222,6 @@ class StreamingModel:
     def parameter_count(self) -> int:
         """Number P of parameters p."""
         return self.collocation.nq + self.collocation.nphi
-
-    @property
-    def rows_per_chunk(self) -> int:
-        """Largest number of rows that are linearised together, `ROWS_PER_CHUNK`."""
-        return ROWS_PER_CHUNK
 
     @property
     def substeps(self) -> int:

@@ -192,11 +192,6 @@ class PrescribedColumns:
             | ~np.isin(dofs, sweep.free),
         )
 
-    @property
-    def column_count(self) -> int:
-        """Number c of right-hand sides to which the prescribed changes belong."""
-        return self.columns.shape[-1]
-
     def write_into(self, t: int, solution: Array) -> None:
         """Write the rows of the dofs that are prescribed at grid time t into `solution` (3n, c), in
         place; other rows are kept.
@@ -217,7 +212,7 @@ class PrescribedColumns:
             return 0.0
         p = step.row.p[0]
         q = step.row.q[0]
-        force = np.zeros((len(sweep.free), self.column_count))
+        force = np.zeros((len(sweep.free), self.columns.shape[-1]))
         skew = step.row.skew(0, step.skew, by_velocity_skew=step.rate_skew)
         matrix = sweep.prescribed_block.extract(
             p * step.by_position + q * step.by_velocity, skew
@@ -301,7 +296,7 @@ class SweepColumns:
         )
         return cls(
             equations,
-            grasped.column_count,
+            grasped.columns.shape[-1],
             has_parameters=False,
             prescribed=grasped,
         )

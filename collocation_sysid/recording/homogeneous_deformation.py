@@ -68,11 +68,6 @@ class HomogeneousDeformation:
     area_over_length_m: float = 0.0
 
     @property
-    def is_shear(self) -> bool:
-        """Whether the strain is an amount of shear, and not a change of a stretch."""
-        return self.test == "simple-shear"
-
-    @property
     def needs_inner_node(self) -> bool:
         """Whether the test prescribes all nodes of a single tetrahedron, so that a free node has to
         be added inside the cell.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -21,7 +21,15 @@ SMALLEST_SQUARE_M2 = 1e-24
 
 
 class Solid(ABC):
-    """A rigid solid in the frame of its obstacle: the world's frame if the obstacle is at rest."""
+    """A rigid solid in the frame of its obstacle: the world's frame if the obstacle is at rest.
+
+    Attributes
+    ----------
+    has_tilt : bool
+        Whether a tilt of the solid may be estimated.
+    """
+
+    has_tilt: ClassVar[bool] = False
 
     @abstractmethod
     def signed_distance(self, point: ca.SX) -> ca.SX:
@@ -47,11 +55,6 @@ class Solid(ABC):
         states another.
         """
         return np.array([0.0, 0.0, 1.0])
-
-    @property
-    def has_tilt(self) -> bool:
-        """Whether a tilt of the solid may be estimated: false unless a solid states otherwise."""
-        return False
 
     @property
     def tilt_centre_m(self) -> Array:
@@ -90,6 +93,8 @@ class Plane(Solid):
         A point on the plane.
     """
 
+    has_tilt: ClassVar[bool] = True
+
     normal: Array = key(
         Vector,
         converter=_unit_vector_converter("normal of a plane"),
@@ -105,11 +110,6 @@ class Plane(Solid):
     def offset_direction(self) -> Array:
         """Normal (3,) of the plane."""
         return self.normal
-
-    @property
-    def has_tilt(self) -> bool:
-        """Always true: a tilt of a plane may be estimated."""
-        return True
 
     @property
     def tilt_centre_m(self) -> Array:
@@ -282,6 +282,8 @@ class Cuboid(Solid):
         Radius of the rounded edges [m]; zero for sharp edges.
     """
 
+    has_tilt: ClassVar[bool] = True
+
     corners_m: Array = key(
         tuple[Vector, Vector], converter=float_converter((2, 3), "corners_m")
     )
@@ -294,11 +296,6 @@ class Cuboid(Solid):
                 f"a box has the corners {self.corners_m.tolist()}; expected the lower one first, "
                 "below the other along every axis"
             )
-
-    @property
-    def has_tilt(self) -> bool:
-        """Always true: a tilt of a box may be estimated."""
-        return True
 
     @property
     def tilt_centre_m(self) -> Array:

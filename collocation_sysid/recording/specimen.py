@@ -164,7 +164,7 @@ class Specimen:
                 )
         for name in ("strain", "second_strain"):
             values = getattr(self, name)
-            if values is None or self.deformation.is_shear:
+            if values is None or self.deformation.test == "simple-shear":
                 continue
             if (lowest := values.min(initial=0.0)) <= -1.0:
                 raise InputError(

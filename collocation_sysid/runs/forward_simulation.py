@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -98,36 +99,36 @@ def simulate_experiments(
     KeyboardInterrupt
         If the fit of the nuisance parameters of a validation experiment is interrupted.
     """
-    threads = solution.collocation.threads
-
-    def simulate_counted(experiment: Experiment) -> ForwardSimulation | str:
-        """Simulate an experiment, and report its completed share."""
-        completed = 0.0
-
-        def report(share: float) -> None:
-            """Add the increase of the completed share, from 0 to 1, to the counter of the phase."""
-            nonlocal completed
-            complete_steps(StepUnit.SIMULATION, share - completed)
-            completed = share
-
-        return simulate_experiment(
-            problem, experiment, solution=solution, report=report
-        )
-
-    with counted_phase(StepUnit.SIMULATION, len(problem.experiments)):
+    experiments = problem.experiments
+    with counted_phase(StepUnit.SIMULATION, len(experiments)):
         rollouts = map_experiments(
-            simulate_counted, problem.experiments, threads=threads
+            partial(simulate_experiment, problem, solution),
+            experiments,
+            [_report_completed_share() for _ in experiments],
+            threads=solution.collocation.threads,
         )
-    return {
-        e.name: each
-        for e, each in zip(problem.experiments, rollouts, strict=True)
-    }
+    return {e.name: each for e, each in zip(experiments, rollouts, strict=True)}
+
+
+def _report_completed_share() -> Callable[[float], None]:
+    """Return a function that reports the completed share of one simulation, from 0 to 1, to the
+    counters of `counted_phase`.
+    """
+    completed = 0.0
+
+    def report(share: float) -> None:
+        """Add the increase of the completed share to the counter of the phase."""
+        nonlocal completed
+        complete_steps(StepUnit.SIMULATION, share - completed)
+        completed = share
+
+    return report
 
 
 def simulate_experiment(
     problem: Problem,
-    experiment: Experiment,
     solution: Solution,
+    experiment: Experiment,
     report: Callable[[float], None] | None = None,
 ) -> ForwardSimulation | str:
     """Simulate an experiment with the parameters of a solution, and compare it with the
@@ -140,10 +141,10 @@ def simulate_experiment(
     ----------
     problem : Problem
         Problem with the options of forward simulations.
-    experiment : Experiment
-        Fitted experiment or one for validation.
     solution : Solution
         Solution of the problem.
+    experiment : Experiment
+        Fitted experiment or one for validation.
     report : callable, optional
         Called with the completed share of the simulation, from 0 to 1.
 

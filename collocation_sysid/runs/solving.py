@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -111,126 +111,94 @@ def solve(
             where="--scheduler",
         )
     with connect_executor(scheduler) as workers:
-        return _solve_with_likeliest_lengths(
-            problem,
-            start,
-            solve_once=partial(
-                _solve_once, solver=solver, watch=watch, workers=workers
-            ),
+        solve_once = partial(
+            _solve_once, solver=solver, watch=watch, workers=workers
         )
+        if any(
+            not modes.has_phases for modes in problem.two_phase_fields.values()
+        ):
+            return solve_two_phases(problem, start, solve_once=solve_once)
+        solution = solve_once(problem, start)
+        tried = [problem.lengths_m]
+        lengths_m = _likeliest_lengths(problem, solution)
+        while lengths_m is not None and lengths_m not in tried:
+            tried.append(lengths_m)
+            problem = problem.with_lengths(lengths_m)
+            solution = solve_once(problem, WarmStart.of(solution))
+            lengths_m = _likeliest_lengths(problem, solution)
+        return solution
 
 
-def _solve_with_likeliest_lengths(
-    problem: Problem,
-    start: str | Path | WarmStart | None,
-    solve_once: Callable[[Problem, str | Path | WarmStart | None], Solution],
-) -> Solution:
-    """Solve a problem with the most likely of the correlation lengths that its fields allow.
+def _likeliest_lengths(
+    problem: Problem, solution: Solution
+) -> dict[str, float] | None:
+    """Return the most likely of the correlation lengths [m] that the fields of a problem allow, by
+    name of the field; None if there is no choice or the solution did not converge.
 
-    The likelihood of each length follows to first order from a solution, see
-    `statistics.field_estimates`. The problem is solved again, from there, with the most likely
-    lengths, until these no longer change or were tried before, or a solve does not converge.
-    Two-phase fields without phases are solved by `solve_two_phases` instead.
-
-    Parameters
-    ----------
-    problem : Problem
-    start : str, Path, WarmStart or None
-        Start of the first solve, see `solve`.
-    solve_once : callable
-        ``solve_once(problem, start)``, the solution with the lengths of the problem.
-
-    Returns
-    -------
-    Solution
-        The last solution; its history, counts and times are those of the last solve alone.
+    The likelihood of each length follows to first order from the solution, see
+    `statistics.field_estimates`.
 
     Raises
     ------
-    InputError
-        As in `solve_once`, and for two-phase fields that cannot be searched.
     SimulationError
-        If the equations of motion are singular at a solution with a field whose correlation
-        length or phases are searched.
+        If the equations of motion are singular at the solution.
     """
-    if any(not modes.has_phases for modes in problem.two_phase_fields.values()):
-        return solve_two_phases(problem, start, solve_once=solve_once)
-    solution = solve_once(problem, start)
-    tried = [problem.lengths_m]
     fields = {
         part.field
         for body in problem.bodies
         for part in body.parts
         if part.field
     }
-    if all(len(field.field.lengths_m) == 1 for field in fields):
-        return solution
-    while solution.status.converged:
-        known = field_estimates_at(solution.collocation, solution.z)
-        best = {
-            name: max(f.modes.field.lengths_m, key=f.log_evidence_ratio)
-            for name, f in known.items()
-        }
-        if best in tried:
-            break
-        tried.append(best)
-        problem = problem.with_lengths(best)
-        solution = solve_once(problem, WarmStart.of(solution))
-    return solution
+    has_choice = any(len(field.field.lengths_m) > 1 for field in fields)
+    if not has_choice or not solution.status.converged:
+        return None
+    estimates = field_estimates_at(solution.collocation, solution.z)
+    return {
+        name: max(f.modes.field.lengths_m, key=f.log_evidence_ratio)
+        for name, f in estimates.items()
+    }
 
 
-def _solve_once(
+def _solve_by_coarse_start(
     problem: Problem,
-    start: str | Path | WarmStart | None,
-    solver: Method,
+    solver: ReducedSpace,
     watch: Watch | None,
     workers: ExperimentExecutor | None,
-) -> Solution:
-    """Solve a problem with fixed correlation lengths, with a coarse start if the method asks for
-    one and no earlier solution is given, else as `_solve_directly`, which describes the arguments
-    and errors.
+) -> Solution | None:
+    """Solve a problem with fixed correlation lengths on a coarser mesh first, and from there on its
+    own; None if the method's options or the sizes of the bodies do not call for a coarse start.
 
-    If the coarse start is not possible or fails, the problem is solved directly, with a note. After
-    an interrupt of the coarse solve its point is returned as an interrupted solution, see
-    `interrupted_solution`.
+    After an interrupt of the coarse solve its point is returned as an interrupted solution, see
+    `interrupted_solution`. The arguments are those of `_solve_once`.
+
+    Raises
+    ------
+    NoCoarseStartError
+        If the coarse start is not possible or fails.
     """
-
-    def solve_directly(from_problem: Problem) -> Solution:
-        """Solve a problem without a coarse start on its own mesh."""
-        return _solve_directly(
-            from_problem, start, solver=solver, watch=watch, workers=workers
+    coarse_start = plan_coarse_start(problem, solver)
+    if coarse_start is None:
+        return None
+    coarse = _solve_on_coarse_mesh(
+        coarse_start, solver=solver, watch=watch, workers=workers
+    )
+    if coarse.status is Status.INTERRUPTED:
+        return interrupted_solution(coarse_start, problem, coarse)
+    if not coarse.status.converged:
+        raise NoCoarseStartError(
+            f"the solve on {coarse_start.size} ended with: {coarse.message}"
         )
-
-    if start is not None or not isinstance(solver, ReducedSpace):
-        return solve_directly(problem)
-    try:
-        coarse_start = plan_coarse_start(problem, solver)
-        if coarse_start is None:
-            return solve_directly(problem)
-        coarse = _solve_on_coarse_mesh(
-            coarse_start, solver=solver, watch=watch, workers=workers
-        )
-        if coarse.status is Status.INTERRUPTED:
-            return interrupted_solution(coarse_start, problem, coarse)
-        if not coarse.status.converged:
-            raise NoCoarseStartError(
-                f"the solve on {coarse_start.size} ended with: {coarse.message}"
-            )
-        undetermined = undetermined_names(coarse)
-        require_determined_moduli(undetermined)
-        return _solve_from_coarse(
-            problem,
-            coarse_start,
-            coarse=coarse,
-            undetermined=undetermined,
-            solver=solver,
-            watch=watch,
-            workers=workers,
-        )
-    except NoCoarseStartError as reason:
-        solution = solve_directly(problem)
-        note = f"no coarse start: {reason}"
-        return replace(solution, notes=(note, *solution.notes))
+    undetermined = undetermined_names(coarse)
+    require_determined_moduli(undetermined)
+    return _solve_from_coarse(
+        problem,
+        coarse_start,
+        coarse=coarse,
+        undetermined=undetermined,
+        solver=solver,
+        watch=watch,
+        workers=workers,
+    )
 
 
 def _solve_on_coarse_mesh(
@@ -242,7 +210,7 @@ def _solve_on_coarse_mesh(
 ) -> Solution:
     """Return the solution on a coarser mesh, with a tolerance of at least `COARSE_TOLERANCE`; also
     if it did not converge. The problem is `coarse_start.problem`, solved from its guesses or a
-    scan; the other arguments are those of `_solve_directly`.
+    scan; the other arguments are those of `_solve_once`.
 
     Raises
     ------
@@ -287,7 +255,7 @@ def _solve_from_coarse(
     undetermined : sequence of str
         Parameters that it does not determine, see `undetermined_names`.
     solver, watch, workers
-        See `_solve_directly`.
+        See `_solve_once`.
 
     Raises
     ------
@@ -333,7 +301,7 @@ def _solve_from_coarse(
     )
 
 
-def _solve_directly(
+def _solve_once(
     problem: Problem,
     start: str | Path | WarmStart | None,
     solver: Method,
@@ -342,7 +310,8 @@ def _solve_directly(
 ) -> Solution:
     """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier solution.
 
-    If the search from guesses fails, a scan follows; if it converges near ν = ½ in reduced space
+    A coarse start is tried first if the method asks for one and there is no earlier solution. If
+    the search from guesses fails, a scan follows; if it converges near ν = ½ in reduced space
     and without an earlier solution, a second start is tried.
 
     Parameters
@@ -370,47 +339,40 @@ def _solve_directly(
         If the start is unsuitable or none is found, if the machine lacks memory, or if the method
         refuses the problem.
     """
+    notes: list[str] = []
+    if start is None and isinstance(solver, ReducedSpace):
+        try:
+            solution = _solve_by_coarse_start(
+                problem, solver, watch=watch, workers=workers
+            )
+        except NoCoarseStartError as reason:
+            solution = None
+            notes.append(f"no coarse start: {reason}")
+        if solution is not None:
+            return solution
     warm_start = (
         WarmStart.read(start) if isinstance(start, (str, Path)) else start
     )
-    problem = (
-        problem if warm_start is None else warm_start.apply_to_problem(problem)
-    )
+    if warm_start is not None:
+        problem = warm_start.apply_to_problem(problem)
     try:
-        needs_complete_start = getattr(solver, "needs_complete_start", False)
-        collocation = problem.collocation()
-        started_from: list[str] = []
-        for experiment in collocation.experiments:
-            for feature in FEATURES:
-                feature.require_valid(experiment)
-        if warm_start is not None and problem.substeps == "auto":
-            collocation = replace(collocation, substeps=warm_start.substeps)
-        has_guesses = not collocation.parameters.names_without_guess
-        if has_guesses:
-            require_memory(problem, collocation, method=solver)
-        collocation, scan = start_problem(collocation, needs_complete_start)
-        if not has_guesses:  # the estimate evaluates the program at a guess
-            require_memory(problem, collocation, method=solver)
-        collocation = associated_at_guess(collocation)
-        variables = None
-        if warm_start is not None and not scan:
-            collocation = warm_start.apply_to_places(collocation)
-            variables = warm_start.simulated_variables(collocation)
+        collocation, scan, variables = _program_and_start(
+            problem, solver, warm_start=warm_start
+        )
         solver = with_workers(solver, workers)
         solution = None
+        comparison = ""
         if scan is not None:
             scanned = follow_starts(
                 solver,
                 collocation,
                 scan=scan,
-                solve=lambda by, of: solve_with_renewed_correspondences(
-                    by, of, watch=watch
-                ),
+                solve=partial(solve_with_renewed_correspondences, watch=watch),
             )
             collocation = associated_at_guess(scanned.collocation)
             scan = scanned.scan
             solution = scanned.solution
-            started_from = [scanned.note] if scanned.note else []
+            comparison = scanned.note
         if solution is None:
             solution = solve_with_renewed_correspondences(
                 solver, collocation, watch=watch, start=variables
@@ -432,14 +394,64 @@ def _solve_directly(
             problem.path,
             where="solver",
         )
-    scan_notes = [] if scan is None else [scan.sentence]
-    notes = (
-        *scan_notes,
-        *started_from,
-        *solution.notes,
-        *_feature_notes(solution),
+    if scan is not None:
+        notes.append(scan.sentence)
+    if comparison:
+        notes.append(comparison)
+    return replace(
+        solution,
+        scan=scan or solution.scan,
+        notes=(*notes, *solution.notes, *_feature_notes(solution)),
     )
-    return replace(solution, scan=scan or solution.scan, notes=notes)
+
+
+def _program_and_start(
+    problem: Problem, solver: Method, warm_start: WarmStart | None
+) -> tuple[Collocation, Scan | None, Array | None]:
+    """Return the nonlinear program of a problem with complete guesses, and the start of its search.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem to which the earlier solution has been applied.
+    solver : Method
+        Method of the search.
+    warm_start : WarmStart or None
+        Earlier solution.
+
+    Returns
+    -------
+    collocation : Collocation
+        Program with measurements associated at the guess.
+    scan : Scan or None
+        Scan from which the guesses are; None if the problem has them.
+    variables : (variables,) array or None
+        Variables simulated at an earlier solution.
+
+    Raises
+    ------
+    InputError
+        If no start is found, an experiment is invalid, or the machine lacks memory.
+    """
+    collocation = problem.collocation()
+    for experiment in collocation.experiments:
+        for feature in FEATURES:
+            feature.require_valid(experiment)
+    if warm_start is not None and problem.substeps == "auto":
+        collocation = replace(collocation, substeps=warm_start.substeps)
+    has_guesses = not collocation.parameters.names_without_guess
+    if has_guesses:
+        require_memory(problem, collocation, method=solver)
+    collocation, scan = start_problem(
+        collocation, getattr(solver, "needs_complete_start", False)
+    )
+    if not has_guesses:  # the estimate evaluates the program at a guess
+        require_memory(problem, collocation, method=solver)
+    collocation = associated_at_guess(collocation)
+    if warm_start is None or scan:
+        return collocation, scan, None
+    collocation = warm_start.apply_to_places(collocation)
+    return collocation, scan, warm_start.simulated_variables(collocation)
 
 
 def _feature_notes(solution: Solution) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -109,7 +109,11 @@ class SensorExpression:
     Attributes
     ----------
     sensor : Gauge
+    t_s : float
+        Time at which the expression is evaluated [s].
     """
+
+    t_s: ClassVar[float] = 2.5 * TIMESTEP_S
 
     sensor: Gauge
 
@@ -125,11 +129,6 @@ class SensorExpression:
             name: points if name == "position_m" else np.zeros_like(points)
             for name in POINT_INPUTS
         }
-
-    @property
-    def t_s(self) -> float:
-        """Time at which the expression is evaluated [s]."""
-        return 2.5 * TIMESTEP_S
 
     def random_state(self, rng: np.random.Generator) -> Array:
         """Return u (k,): inputs near the undeformed ones, with deviations of `SIZES`, and unknowns

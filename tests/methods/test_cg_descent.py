@@ -126,7 +126,7 @@ def test_it_finds_the_minimum_that_scipy_finds(name: str):
     reference = scipy_minimise(
         function, start, jac=True, method="CG", options=settings
     )
-    assert result.is_converged
+    assert result.ending == "converged"
     assert np.abs(result.gradient).max() <= 1e-6
     assert result.value == pytest.approx(reference.fun, abs=1e-6)
     assert result.evaluations < 5 * reference.nfev + 50
@@ -166,7 +166,7 @@ def test_a_point_out_of_the_domain_is_stepped_back_from():
     result = minimise_cg_descent(
         barrier, np.array([-50.0, 0.5]), OPTIONS, states.append
     )
-    assert result.is_converged
+    assert result.ending == "converged"
     np.testing.assert_allclose(result.x, 0.8, atol=1e-6)
     assert all((state.x < 1).all() for state in states)
 

@@ -194,6 +194,6 @@ def test_friction_of_a_recording_for_validation_is_simulated_by_the_contacts_ene
     problem = cs.Problem(
         [seen(smooth), predicted], TRUTH, scheme="bdf2", method=hard
     )
-    simulated = simulate_experiment(problem, predicted, answer)
+    simulated = simulate_experiment(problem, answer, predicted)
     assert isinstance(simulated, ForwardSimulation), simulated
     assert simulated.rms_m < 1e-4

@@ -148,10 +148,10 @@ def test_an_unstable_equilibrium_is_found_out_by_its_own_factor(
     solver.definite_factor = solver.factoriser.factorise(entries)
     if checks_stability:
         with pytest.raises(NewtonFailure, match="positive definite"):
-            solver.solve(start, residual, linearise, keep_definite=True)
+            solver.solve_equilibrium(start, residual, linearise)
     else:
         # It is left to the caller, which the next test shows.
-        x = solver.solve(start, residual, linearise, keep_definite=True)
+        x = solver.solve_equilibrium(start, residual, linearise)
         assert np.abs(x - start).max() < 1e-12
 
 

@@ -371,7 +371,7 @@ def test_an_answer_without_mass_somewhere_is_doubtful_and_says_why_it_cannot_be_
     problem = cs.Problem(
         collocation.experiments, collocation.parameters, substeps=1
     )
-    said = simulate_experiment(problem, problem.experiments[0], light)
+    said = simulate_experiment(problem, light, problem.experiments[0])
     assert isinstance(said, str)
     assert "expected masses above zero" in said
 

@@ -405,7 +405,7 @@ def _stretches(experiment: Experiment) -> dict[str, Array]:
     """
     deformation = experiment.specimen
     assert deformation is not None
-    assert not deformation.is_shear
+    assert deformation.test != "simple-shear"
     first, second = specimen_strains(experiment)
     samples = np.arange(1.0, len(first) + 1)
     table = {SAMPLE_KEY: samples}

@@ -684,8 +684,8 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     # With the scheme that was fitted: what is compared are models, not integrators.
     rollout = simulate_experiment(
         replace(known, rollout=RolloutOptions("scheme")),
-        experiment,
-        solution=solution,
+        solution,
+        experiment=experiment,
     )
     if not isinstance(rollout, ForwardSimulation):
         return record | {"prediction": None, "failure": rollout}

@@ -120,31 +120,23 @@ class SimdEvaluator:
         data_of_points: Array | None = None,
     ) -> None:
         """Sum the kernel over elements and points into `out` (T, width); see `Evaluator`."""
-        addresses = [address(field) for field in fields]
-        constants = [*self._tables, address(theta), address(out)]
+        arguments = [
+            self._blocks,
+            fields[0].shape[1],
+            self._width,
+            int(add),
+            *(address(field) for field in fields),
+            *self._tables,
+            address(theta),
+            address(out),
+        ]
         if self._point_data_columns is not None and data_of_points is not None:
-            length = data_of_points.shape[1] if len(data_of_points) > 1 else 0
-            constants += [
-                length,
+            arguments += [
+                data_of_points.shape[1] if len(data_of_points) > 1 else 0,
                 address(self._point_data_columns),
                 address(data_of_points),
             ]
-        stride = fields[0].shape[1]
-
-        def run(start: int, stop: int) -> None:
-            """Evaluate the time steps `start` … `stop` − 1."""
-            self._run(
-                start,
-                stop,
-                self._blocks,
-                stride,
-                self._width,
-                int(add),
-                *addresses,
-                *constants,
-            )
-
-        run_in_slices(run, len(out), threads=threads)
+        run_in_slices(self._run, len(out), threads=threads, arguments=arguments)
 
 
 def _emit_kernel(kernel: ElementKernel, points: int, lanes: int) -> ir.Module:

@@ -51,10 +51,13 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
 
 
 def run_in_slices(
-    run: Callable[[int, int], None], count: int, threads: int
+    run: Callable[..., None],
+    count: int,
+    threads: int,
+    arguments: Sequence[Any] = (),
 ) -> None:
-    """Call ``run(start, stop)`` on consecutive slices of ``range(count)``, one per thread, and wait
-    for all.
+    """Call ``run(start, stop, *arguments)`` on consecutive slices of ``range(count)``, one per
+    thread, and wait for all.
 
     On a thread of `map_experiments`, or with one thread, it is called once for the complete range,
     also if `count` is 0. An exception of ``run`` is passed on.
@@ -68,12 +71,14 @@ def run_in_slices(
         raise KeyboardInterrupt
     threads = min(threads, count)
     if threads <= 1 or getattr(_alone, "in_experiment", False):
-        run(0, count)
+        run(0, count, *arguments)
         return
     bounds = [count * k // threads for k in range(threads + 1)]
     pool = _pool(os.getpid(), threads)
-    others = [pool.submit(run, a, b) for a, b in pairwise(bounds[1:])]
-    run(bounds[0], bounds[1])
+    others = [
+        pool.submit(run, a, b, *arguments) for a, b in pairwise(bounds[1:])
+    ]
+    run(bounds[0], bounds[1], *arguments)
     for other in others:
         other.result()
 

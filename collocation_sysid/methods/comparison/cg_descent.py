@@ -137,11 +137,6 @@ class CgResult:
     evaluations: int
     ending: Ending
 
-    @property
-    def is_converged(self) -> bool:
-        """Whether the gradient is within the tolerance."""
-        return self.ending == "converged"
-
 
 def minimise_cg_descent(
     fun_and_grad: ValueAndGradient,

@@ -35,7 +35,7 @@ from ...common.validated_types import (
 from ...errors import InputError
 from ...program.collocation import Collocation
 from ..solution import Solution, Status, Watch
-from ..solve_recorder import Recorder, SearchEnded
+from ..solve_recorder import SEARCH_ENDS, Recorder, SearchEnded, status_of_end
 from .inner import FIRST_ORDER, Inner, minimise_merit
 from .merit import MeritFunction, PenaltyProblem
 
@@ -177,8 +177,11 @@ class PenaltyOptions(Options):
             ),
             start=start,
         )
-        status, why = climb.recorder.run_search(climb.run)
-        return climb.solution(status, why)
+        try:
+            status, message = climb.run()
+        except SEARCH_ENDS as end:
+            status, message = status_of_end(end)
+        return climb.solution(status, message)
 
     @property
     def last_rho(self) -> float:

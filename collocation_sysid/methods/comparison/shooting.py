@@ -31,7 +31,7 @@ from ...program.stopwatch import Stopwatch
 from ..horizon import Horizon
 from ..initial_trajectories import complete_variables, simulate_trajectories
 from ..solution import Solution, Status, Watch, constraint_multipliers
-from ..solve_recorder import Recorder, SearchEnded
+from ..solve_recorder import SEARCH_ENDS, Recorder, SearchEnded, status_of_end
 
 # Relative decrease of the loss, or of one of a standard deviation, that is rounding.
 ROUNDING = 1e-14
@@ -83,7 +83,10 @@ class Shooting(Options):
             self.name, collocation, watch=watch, max_time_s=self.max_time_s
         )
         search = _ShootingSearch(self, recorder, start=start)
-        status, message = recorder.run_search(search.run)
+        try:
+            status, message = search.run()
+        except SEARCH_ENDS as end:
+            status, message = status_of_end(end)
         best = search.best
         shots = search.simulations
         if best is None:

@@ -14,7 +14,8 @@ over x converges as fast as that of a body without contact.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,55 +51,71 @@ class CondensationError(Exception):
     """
 
 
-@dataclass(frozen=True)
-class ContactEquations:
-    """Equations of motion of one time step, contact apart.
+class StepEquations(ABC):
+    """Equations of motion of one time step as functions of the positions at its end, contact apart.
 
     Attributes
     ----------
-    residual_without_contact : callable
-        Residual (3n,) [N] at positions (3n,) [m], without contact.
-    linearise_without_contact : callable
-        Residual (3n,) [N] at positions (3n,) [m], without contact, and its derivative by the
-        positions.
     contact : StepContact
         Contact in the step.
-    states : callable
-        State ξ [m] and velocity ν [m/s], (1, 3n) each, of positions (3n,).
     rates : (float, float)
-        Derivatives of ξ and of ν by the positions.
-    weight : float
+        Derivatives of the state ξ and of the velocity ν of contact by the positions.
+    contact_weight : float
         Factor of the contact forces in the residual.
+
+    Parameters
+    ----------
+    contact, rates, contact_weight
+        See the attributes.
     """
 
-    residual_without_contact: Callable[[Array], Array]
-    linearise_without_contact: Callable[[Array], NewtonLinearisation]
-    contact: StepContact
-    states: Callable[[Array], tuple[Array, Array]]
-    rates: tuple[float, float]
-    weight: float
+    def __init__(
+        self,
+        contact: StepContact,
+        rates: tuple[float, float],
+        contact_weight: float,
+    ) -> None:
+        self.contact = contact
+        self.rates = rates
+        self.contact_weight = contact_weight
 
-    def residual(self, x: Array) -> Array:
-        """Return the residual (3n,) [N] at positions x (3n,) [m], with contact."""
-        residual = self.residual_without_contact(x)
+    @abstractmethod
+    def states(self, x: Array) -> tuple[Array, Array]:
+        """Return the state ξ [m] and velocity ν [m/s], (1, 3n) each, at which contact acts if the
+        step ends at x (3n,) [m].
+        """
+
+    @abstractmethod
+    def residual(self, x: Array, with_contact: bool = True) -> Array:
+        """Return the residual (3n,) [N] at positions x (3n,) [m]."""
+
+    @abstractmethod
+    def linearise(
+        self, x: Array, with_contact: bool = True
+    ) -> NewtonLinearisation:
+        """Return the residual (3n,) [N] at positions x (3n,) [m], and its derivative by x."""
+
+    def add_contact_force(self, residual: Array, x: Array) -> Array:
+        """Return the residual (3n,) [N] without contact at x (3n,) [m] plus that of contact."""
         if not self.contact.acts:
             return residual
-        return residual + self.weight * self.contact.force(*self.states(x))
+        return residual + self.contact_weight * self.contact.force(
+            *self.states(x)
+        )
 
-    def linearise(self, x: Array) -> NewtonLinearisation:
-        """Return the residual (3n,) [N] with contact at positions x (3n,) [m], and its derivative
-        by x.
-        """
-        at = self.linearise_without_contact(x)
+    def add_contact(
+        self, at: NewtonLinearisation, x: Array
+    ) -> NewtonLinearisation:
+        """Return the linearisation without contact at x (3n,) [m] plus that of contact."""
         if not self.contact.acts:
             return at
         contact = self.contact.linearise(*self.states(x), self.rates)
         skew = at.skew
         if contact.skew.size:
-            skew = skew - self.weight * contact.skew
+            skew = skew - self.contact_weight * contact.skew
         return NewtonLinearisation(
-            at.residual + self.weight * contact.force,
-            at.symmetric - self.weight * contact.symmetric,
+            at.residual + self.contact_weight * contact.force,
+            at.symmetric - self.contact_weight * contact.symmetric,
             skew=skew,
         )
 
@@ -323,7 +340,7 @@ class CondensedSteps:
 
     Parameters
     ----------
-    equations : ContactEquations
+    equations : StepEquations
         Equations of the time step.
     compliance : Compliance
         Inverse of the matrix of the body without contact.
@@ -335,7 +352,7 @@ class CondensedSteps:
 
     def __init__(
         self,
-        equations: ContactEquations,
+        equations: StepEquations,
         compliance: Compliance,
         free: Index,
         size_m: float,
@@ -364,7 +381,7 @@ class CondensedSteps:
         if start is None or not np.array_equal(start.x, x):
             # A copy, because the caller may change x in place.
             start = self._forces_at(x.copy())
-        residual = self._equations.residual_without_contact(x)[self._free]
+        residual = self._equations.residual(x, with_contact=False)[self._free]
         residual[start.dofs] += start.force
         without_change = self._compliance.factor.solve(residual)
         now = start
@@ -454,8 +471,9 @@ class CondensedSteps:
         )
         if len(dofs) > MAX_TOUCHING_DOFS:
             raise CondensationError
-        present = self._equations.weight * now.touching.assemble_stiffness(
-            now.points
+        present = (
+            self._equations.contact_weight
+            * now.touching.assemble_stiffness(now.points)
         )
         stiffness = present
         if len(dofs) > len(now.dofs):
@@ -491,7 +509,8 @@ class CondensedSteps:
             x,
             points,
             touching=touching,
-            force=self._equations.weight * touching.assemble_force(points),
+            force=self._equations.contact_weight
+            * touching.assemble_force(points),
         )
 
 

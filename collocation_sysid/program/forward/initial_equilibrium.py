@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...common.array_types import Array
+from ...common.array_types import Array, Index
 from ...common.step_counting import report_state
 from ...common.time_dependence import scale_loads
 from ...model.contact import Contact
@@ -16,10 +16,12 @@ from ...recording.obstacle import Obstacle
 from ..linear_algebra.factorisation import NONE
 from ..linear_algebra.lapack import one_blas_thread
 from .newton_solver import (
+    Linearise,
     NewtonFailure,
     NewtonLinearisation,
     NewtonSolver,
-    follow_path,
+    Residual,
+    SolutionPath,
     simulation_error,
 )
 
@@ -101,27 +103,21 @@ def _solve_equilibrium(
     SimulationError
         If no stable equilibrium is found.
     """
-    zero_velocity = np.zeros((1, len(goals_m)))
     shape = experiment.rigid_positions([at_s])[0]
     forces = with_start_memory(forces, experiment.loaded_since_s)
     without_contact = _without_contact(forces, shape)
 
-    def solve(x: Array, share: float) -> Array:
-        loaded = scale_loads(forces, share)
-
-        def residual(state: Array) -> Array:
-            return loaded.total(state, zero_velocity)[0]
-
-        def linearise(state: Array) -> NewtonLinearisation:
-            # Nothing moves: there is no skew part.
-            at = loaded.linearise(state, zero_velocity)
-            report_state(
-                lambda: _describe_state(share, at.force[0][solver.free])
-            )
-            return NewtonLinearisation(
-                at.force[0], -at.by_position[0], skew=NONE
-            )
-
+    guess = shape.ravel() if start is None and experiment.obstacles else start
+    path = SolutionPath(
+        without_contact.ravel(),
+        halvings=solver.options.max_halvings,
+        guess=guess,
+    )
+    while path.share < 1.0:
+        x, share = path.next_guess()
+        residual, linearise = _static_equations(
+            scale_loads(forces, share), share, free=solver.free
+        )
         # Grasps that are off are there at the end: the way there may be any.
         goal = (
             goals_m
@@ -130,30 +126,54 @@ def _solve_equilibrium(
                 experiment, without_contact, time_s=at_s, share=share
             ).ravel()
         )
-        return solver.solve(
-            x,
-            residual,
-            linearise=linearise,
-            keep_definite=True,
-            prescribed_m=goal[solver.is_prescribed],
-        )
+        try:
+            solution = solver.solve_equilibrium(
+                x,
+                residual,
+                linearise=linearise,
+                prescribed_m=goal[solver.is_prescribed],
+            )
+        except NewtonFailure as failure:
+            if path.shorten():
+                continue
+            raise simulation_error(
+                solver,
+                failure,
+                time_s=at_s,
+                what="finding the rest state",
+                static=True,
+            ) from failure
+        path.accept(solution)
+    return path.x
 
-    guess = shape.ravel() if start is None and experiment.obstacles else start
-    try:
-        return follow_path(
-            solve,
-            without_contact.ravel(),
-            halvings=solver.options.max_halvings,
-            guess=guess,
-        )
-    except NewtonFailure as failure:
-        raise simulation_error(
-            solver,
-            failure,
-            time_s=at_s,
-            what="finding the rest state",
-            static=True,
-        ) from failure
+
+def _static_equations(
+    loaded: Forces, share: float, free: Index
+) -> tuple[Residual, Linearise]:
+    """Return the force balance (3n,) [N] of a body at rest as a function of its positions (3n,)
+    [m], and its linearisation, which also reports the state of the search.
+
+    Parameters
+    ----------
+    loaded : Forces
+        Forces with the share of the loads.
+    share : float
+        Share of loads and displacements, for the report.
+    free : (free,) array
+        Free dofs.
+    """
+    zero_velocity = np.zeros((1, loaded.pattern.size))
+
+    def residual(state: Array) -> Array:
+        return loaded.total(state, zero_velocity)[0]
+
+    def linearise(state: Array) -> NewtonLinearisation:
+        # Nothing moves: there is no skew part.
+        at = loaded.linearise(state, zero_velocity)
+        report_state(lambda: _describe_state(share, at.force[0][free]))
+        return NewtonLinearisation(at.force[0], -at.by_position[0], skew=NONE)
+
+    return residual, linearise
 
 
 def _describe_state(share: float, force_n: Array) -> str:

@@ -29,7 +29,7 @@ from ...model.internal_variables import (
 )
 from ...model.weight import Weight
 from ...recording.experiment import Experiment
-from ..contact.condensed_contact import ContactEquations
+from ..contact.condensed_contact import StepEquations
 from ..contact.step_contact import StepContact
 from ..linear_algebra.lapack import one_blas_thread
 from ..observables import ReactionForces
@@ -176,13 +176,12 @@ def simulate_newmark(
     )
 
 
-class _StepEquations:
-    """Equations of motion of one Newmark step as functions of the positions at its end.
+class _NewmarkEquations(StepEquations):
+    """Force balance F + 2 C − M a of one Newmark step as a function of the positions at its end,
+    with the contact forces C in the middle of the step.
 
     Attributes
     ----------
-    contact : StepContact
-        Contact in the step.
     mass_kg : (3n,) array
         Masses of the dofs [kg].
 
@@ -211,7 +210,7 @@ class _StepEquations:
         prescribed_dofs: Index,
         prescribed: _PrescribedMotion,
     ) -> None:
-        self.contact = contact
+        super().__init__(contact, rates=(0.5, 1 / step_s), contact_weight=2.0)
         self.mass_kg = forces.mass.inertia_kg[0]
         self._state = state
         self._step_s = step_s
@@ -259,19 +258,22 @@ class _StepEquations:
         a[self._prescribed_dofs] = self._prescribed.accelerations_m_s2
         return v, a
 
-    def middle_state(self, x: Array) -> tuple[Array, Array]:
+    def states(self, x: Array) -> tuple[Array, Array]:
         """Return the mean position ξ [m] and velocity ν [m/s] of the step, (1, 3n) each, if it ends
         at x (3n,) [m].
         """
         before = self._state.x
         return (before + x)[None] / 2, (x - before)[None] / self._step_s
 
-    def residual_without_contact(self, x: Array) -> Array:
-        """Return the force balance F − M a (3n,) [N] at the end positions x (3n,) [m]."""
+    def residual(self, x: Array, with_contact: bool = True) -> Array:
+        """Return the force balance (3n,) [N] at the end positions x (3n,) [m]."""
         v, a = self.kinematics(x)
-        return self._forces.total(x, v)[0] - self.mass_kg * a
+        residual = self._forces.total(x, v)[0] - self.mass_kg * a
+        return self.add_contact_force(residual, x) if with_contact else residual
 
-    def linearise_without_contact(self, x: Array) -> NewtonLinearisation:
+    def linearise(
+        self, x: Array, with_contact: bool = True
+    ) -> NewtonLinearisation:
         """Return the force balance (3n,) [N] at x (3n,) [m], and its derivative by x."""
         v, a = self.kinematics(x)
         slope = self._slope
@@ -281,21 +283,13 @@ class _StepEquations:
         skew = -at.by_position_skew[0]
         if at.by_velocity_skew.size:
             skew = skew - slope * at.by_velocity_skew[0]
-        return NewtonLinearisation(
+        linearisation = NewtonLinearisation(
             at.force[0] - self.mass_kg * a, matrix, skew=skew
         )
-
-    def with_contact(self) -> ContactEquations:
-        """Return the force balance F + 2 C − M a, with the contact forces C in the middle of the
-        step.
-        """
-        return ContactEquations(
-            self.residual_without_contact,
-            self.linearise_without_contact,
-            contact=self.contact,
-            states=self.middle_state,
-            rates=(0.5, 1 / self._step_s),
-            weight=2.0,
+        return (
+            self.add_contact(linearisation, x)
+            if with_contact
+            else linearisation
         )
 
 
@@ -488,7 +482,7 @@ class _Stepper:
             state.previous_histories,
             interval_s=h,
         ).without_contact()
-        equations = _StepEquations(
+        equations = _NewmarkEquations(
             state,
             h,
             forces=forces,
@@ -501,12 +495,12 @@ class _Stepper:
         guess = equations.extrapolation()
         if not solver.has_no_inverted_element(guess):
             guess = equations.with_prescribed_positions(state.x)
-        x = solver.solve_in_contact(guess, equations.with_contact())
+        x = solver.solve_step(guess, equations)
         v, a = equations.kinematics(x)
         contact_n = None
         if equations.contact.acts:
             mass = equations.mass_kg
-            xi, nu = equations.middle_state(x)
+            xi, nu = equations.states(x)
             contact_n = self._contact_n(xi[0], nu[0], load_s=load_s, step_s=h)
             # Prescribed dofs have the acceleration of the grasp.
             free = solver.free

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +17,12 @@ from ..contact.condensed_contact import (
     Compliance,
     CondensationError,
     CondensedSteps,
-    ContactEquations,
+    StepEquations,
 )
 from ..linear_algebra.factorisation import Factor, Factoriser
 from ..stopwatch import Stopwatch
 from .newton_linearisation import NewtonLinearisation
 from .retraction import Retraction, add_increment
-
-T = TypeVar("T")
 
 # Skew part of a matrix that is approximated by its symmetric part.
 NO_SKEW_PART = np.zeros(0)
@@ -137,7 +135,7 @@ class NewtonFailure(Exception):
 class NewtonSolver:
     """Newton's method with backtracking on the free dofs of a body, for one set of prescribed dofs.
 
-    The factor of the last solution is stored and reused by the next call of `solve`.
+    The factor of the last solution is stored and reused by the next call.
 
     Attributes
     ----------
@@ -188,22 +186,20 @@ class NewtonSolver:
         self.compliance: Compliance | None = None
         self.definite_factor: Factor | None = None
 
-    def solve(
+    def solve_equilibrium(
         self,
         x: Array,
         residual: Residual,
         linearise: Linearise,
-        keep_definite: bool = False,
         prescribed_m: Array | None = None,
     ) -> Array:
-        """Solve residual(x) = 0 for the free dofs.
+        """Solve residual(x) = 0 for a stable equilibrium of the free dofs.
 
-        A step is accepted when the next one, computed with the same factor, is shorter (Deuflhard's
-        natural monotonicity test), and no element is inverted. Equilibria may be far from x:
-        without obstacles their steps are applied as rotations and strains, see `Retraction`. Time
-        steps first reuse the factor of the previous solution as long as steps shrink fast, and
-        equilibria that of the previous equilibrium. Chord steps replace those of Newton where they
-        shrink fast.
+        States are accepted only while −∂residual/∂x is positive definite wherever it is
+        factorised, which includes the solution unless `checks_stability` of the options is false.
+        Equilibria may be far from x: without obstacles the steps are applied as rotations and
+        strains, see `Retraction`. The factor of the previous equilibrium is used first, and chord
+        steps replace those of Newton where they shrink fast.
 
         Parameters
         ----------
@@ -214,10 +210,6 @@ class NewtonSolver:
             Residual (3n,) of x.
         linearise : callable
             `NewtonLinearisation` at x.
-        keep_definite : bool
-            If true, solve for a stable equilibrium: accept states only while −∂residual/∂x is
-            positive definite wherever it is factorised, which includes the solution unless
-            `checks_stability` of the options is false.
         prescribed_m : (prescribed,) array, optional
             Positions of the prescribed dofs [m]. The free dofs first follow to first order, because
             moving prescribed dofs alone would crush adjacent elements.
@@ -230,8 +222,8 @@ class NewtonSolver:
         Raises
         ------
         NewtonFailure
-            If the method does not converge, a matrix is singular, or an element is inverted at the
-            start.
+            If the method does not converge, a matrix is singular or not positive definite, or an
+            element is inverted at the start.
         """
         x = (
             x.copy()
@@ -239,18 +231,86 @@ class NewtonSolver:
             else self._with_prescribed(x, prescribed_m, linearise=linearise)
         )
         self._require_upright(x)
-        if not keep_definite:
-            # If they do not converge, the search begins at x: their last state may be far off.
+        x, done = self._with_known_factor(x, residual)
+        if done and not self.options.checks_stability:
+            return x
+        return self._solve_with_backtracking(
+            x, residual, linearise=linearise, keep_definite=True
+        )
+
+    def solve_step(self, x: Array, equations: StepEquations) -> Array:
+        """Solve one implicit time step, with contact or without, for the free dofs.
+
+        Contact is condensed to the dofs that touch, with the factor of the body without contact of
+        earlier steps. Where that does not converge, the complete equations are solved, first with
+        the factor of the previous solution as long as steps shrink fast.
+
+        Parameters
+        ----------
+        x : (3n,) array
+            First guess [m]; not modified. Prescribed dofs keep their values.
+        equations : StepEquations
+            Equations of the step.
+
+        Returns
+        -------
+        (3n,) array
+            Solution [m].
+
+        Raises
+        ------
+        NewtonFailure
+            If no method converges, or an element is inverted at the start.
+        """
+        if equations.contact.acts and self.has_no_inverted_element(x):
             improved, done = self._simplified_newton(
-                x, _CompleteIteration(self, residual, linearise=linearise)
+                x, _CondensedIteration(self, equations)
             )
             if done:
                 return improved
-        else:
-            x, done = self._with_known_factor(x, residual)
-            if done and not self.options.checks_stability:
-                return x
-        at = self.timed(linearise, x)
+        self._require_upright(x)
+        # If they do not converge, the search begins at x: their last state may be far off.
+        improved, done = self._simplified_newton(
+            x, _CompleteIteration(self, equations)
+        )
+        if done:
+            return improved
+        return self._solve_with_backtracking(
+            x.copy(),
+            equations.residual,
+            linearise=equations.linearise,
+            keep_definite=False,
+        )
+
+    def _solve_with_backtracking(
+        self,
+        x: Array,
+        residual: Residual,
+        linearise: Linearise,
+        keep_definite: bool,
+    ) -> Array:
+        """Return the solution (3n,) [m] of residual(x) = 0 by Newton's method with backtracking.
+
+        A step is accepted when the next one, computed with the same factor, is shorter (Deuflhard's
+        natural monotonicity test), and no element is inverted.
+
+        Parameters
+        ----------
+        x : (3n,) array
+            First guess [m]; modified.
+        residual, linearise : callable
+            Functions of the state, see `solve_equilibrium`.
+        keep_definite : bool
+            Whether the matrix must be positive definite. Chord steps then replace those of Newton
+            where they shrink fast.
+
+        Raises
+        ------
+        NewtonFailure
+            If the method does not converge or a matrix is singular.
+        """
+        with self.stopwatch.evaluating():
+            at = linearise(x)
         factor = self.factorise(at, x, keep_definite=keep_definite)
         iterate = _Iterate(x, factor, step=self.step(factor, at.residual))
         for _ in range(self.options.max_iterations):
@@ -289,7 +349,9 @@ class NewtonSolver:
         factor = self.definite_factor
         if factor is None:
             return x, False
-        step = self.step(factor, self.timed(residual, x))
+        with self.stopwatch.evaluating():
+            value = residual(x)
+        step = self.step(factor, value)
         chords = self._static_chords(_Iterate(x, factor, step=step), residual)
         return (x, False) if chords is None else (chords.x, chords.converged)
 
@@ -318,7 +380,8 @@ class NewtonSolver:
             trial[self.free] += step
             if not self.has_no_inverted_element(trial):
                 break
-            value = self.timed(residual, trial)
+            with self.stopwatch.evaluating():
+                value = residual(trial)
             following = self.step(iterate.factor, value)
             length = float(np.linalg.norm(step))
             rate = float(np.linalg.norm(following)) / max(length, 1e-300)
@@ -341,43 +404,13 @@ class NewtonSolver:
         """Return the iterate at x (3n,) [m] with a factor of its own, or None if the matrix is
         singular or not positive definite there.
         """
-        at = self.timed(linearise, x)
+        with self.stopwatch.evaluating():
+            at = linearise(x)
         try:
             factor = self.factorise(at, x, keep_definite=True)
         except NewtonFailure:
             return None
         return _Iterate(x, factor, step=self.step(factor, at.residual))
-
-    def solve_in_contact(self, x: Array, equations: ContactEquations) -> Array:
-        """Solve one time step, with contact or without, for the free dofs.
-
-        Contact is condensed to the dofs that touch, with the factor of the body without contact of
-        earlier steps. Where that does not converge, `solve` treats the complete equations.
-
-        Parameters
-        ----------
-        x : (3n,) array
-            First guess [m]; not modified. Prescribed dofs keep their values.
-        equations : ContactEquations
-            Equations of the step.
-
-        Returns
-        -------
-        (3n,) array
-            Solution [m].
-
-        Raises
-        ------
-        NewtonFailure
-            If no method converges.
-        """
-        if equations.contact.acts and self.has_no_inverted_element(x):
-            improved, done = self._simplified_newton(
-                x, _CondensedIteration(self, equations)
-            )
-            if done:
-                return improved
-        return self.solve(x, equations.residual, linearise=equations.linearise)
 
     def _simplified_newton(
         self, x: Array, iteration: ChordIteration
@@ -458,7 +491,8 @@ class NewtonSolver:
         state[self.is_prescribed] = goal
         if not self._is_last(way):
             self._require_upright(x)
-            at = self.timed(linearise, x)
+            with self.stopwatch.evaluating():
+                at = linearise(x)
             coupling = self.pattern.products(at.symmetric[None], way[None])[0]
             factor = self.factorise(at, x, keep_definite=False)
             state[self.free] += self.step(factor, at.residual - coupling)
@@ -478,7 +512,7 @@ class NewtonSolver:
         iterate : _Iterate
             Present iterate; not modified.
         residual, linearise : callable
-            Functions of the state, see `solve`.
+            Functions of the state, see `solve_equilibrium`.
         keep_definite : bool
             Whether the matrix must be positive definite.
 
@@ -502,17 +536,17 @@ class NewtonSolver:
             trial = update(x, increment)
             if self.has_no_inverted_element(trial):
                 # A whole step is mostly taken: it is evaluated with its derivatives at once.
-                at = self.timed(linearise, trial) if share == 1 else None
-                value = (
-                    self.timed(residual, trial) if at is None else at.residual
-                )
+                with self.stopwatch.evaluating():
+                    at = linearise(trial) if share == 1 else None
+                    value = residual(trial) if at is None else at.residual
                 next_step = self.step(factor, value)
                 if np.linalg.norm(next_step) <= (1 - share / 4) * length:
                     is_last = self._is_last(next_step, OLD_FACTOR_SHARE)
                     if is_last and not keep_definite:
                         return _Iterate(trial, factor, step=next_step)
                     if at is None:
-                        at = self.timed(linearise, trial)
+                        with self.stopwatch.evaluating():
+                            at = linearise(trial)
                     try:
                         own = self.factorise(
                             at, trial, keep_definite=keep_definite
@@ -578,11 +612,6 @@ class NewtonSolver:
         with self.stopwatch.solving():
             return factor.solve(residual[self.free])
 
-    def timed(self, function: Callable[[Array], T], x: Array) -> T:
-        """Return `function(x)`; its time is added to the evaluations of the stopwatch."""
-        with self.stopwatch.evaluating():
-            return function(x)
-
     def has_no_inverted_element(self, x: Array) -> bool:
         """Return whether det F is positive at all quadrature points at x (3n,) [m]."""
         return bool(self.body.volume_ratios(x).min() > 0)
@@ -628,13 +657,12 @@ class _CompleteIteration:
     ----------
     solver : NewtonSolver
         Stores the factor.
-    residual, linearise : callable
-        Functions of the state, see `NewtonSolver.solve`.
+    equations : StepEquations
+        Equations of the step.
     """
 
     solver: NewtonSolver
-    residual: Residual
-    linearise: Linearise
+    equations: StepEquations
 
     @property
     def has_factor(self) -> bool:
@@ -642,13 +670,16 @@ class _CompleteIteration:
 
     def factorise_at(self, x: Array) -> None:
         solver = self.solver
-        at = solver.timed(self.linearise, x)
+        with solver.stopwatch.evaluating():
+            at = self.equations.linearise(x)
         solver.last_factor = solver.factorise(at, x, keep_definite=False)
 
     def step_from(self, x: Array) -> Array:
         solver = self.solver
         assert solver.last_factor is not None
-        return solver.step(solver.last_factor, solver.timed(self.residual, x))
+        with solver.stopwatch.evaluating():
+            residual = self.equations.residual(x)
+        return solver.step(solver.last_factor, residual)
 
 
 class _CondensedIteration:
@@ -658,13 +689,11 @@ class _CondensedIteration:
     ----------
     solver : NewtonSolver
         Stores the factor and its compliance.
-    equations : ContactEquations
+    equations : StepEquations
         Equations of the step.
     """
 
-    def __init__(
-        self, solver: NewtonSolver, equations: ContactEquations
-    ) -> None:
+    def __init__(self, solver: NewtonSolver, equations: StepEquations) -> None:
         self._solver = solver
         self._equations = equations
         self._use_compliance()
@@ -675,7 +704,8 @@ class _CondensedIteration:
 
     def factorise_at(self, x: Array) -> None:
         solver = self._solver
-        at = solver.timed(self._equations.linearise_without_contact, x)
+        with solver.stopwatch.evaluating():
+            at = self._equations.linearise(x, with_contact=False)
         symmetric = at._replace(skew=NO_SKEW_PART)
         factor = solver.factorise(symmetric, x, keep_definite=False)
         solver.compliance = Compliance(factor, len(solver.free))
@@ -683,7 +713,8 @@ class _CondensedIteration:
 
     def step_from(self, x: Array) -> Array:
         assert self._steps is not None
-        return self._solver.timed(self._steps.step_from, x)
+        with self._solver.stopwatch.evaluating():
+            return self._steps.step_from(x)
 
     def _use_compliance(self) -> None:
         """Prepare steps with the compliance of the solver, if there is one."""
@@ -700,65 +731,70 @@ class _CondensedIteration:
         )
 
 
-def follow_path(
-    solve: Callable[[Array, float], Array],
-    x: Array,
-    halvings: int,
-    guess: Array | None = None,
-) -> Array:
-    """Follow the solution x(s) from x(0) to x(1) in increments that shrink on failure, and grow
-    after two successes.
+class SolutionPath:
+    """Solution x(s) of equations that depend on a share s of the loads, followed from x(0) to x(1)
+    in increments that shrink on failure and grow after two successes.
+
+    The caller solves the equations: `next_guess` states where, and the result is given to `accept`,
+    or a failure to `shorten`.
+
+    Attributes
+    ----------
+    x : (3n,) array
+        Solution at `share` [m].
+    share : float
+        The s that has been reached; 1 at the end of the path.
 
     Parameters
     ----------
-    solve : callable
-        Returns x(s) from a first guess and s; raises NewtonFailure.
     x : (3n,) array
         x(0) [m]; not modified.
     halvings : int
         The smallest increment is 0.5 to this power.
     guess : (3n,) array, optional
-        Guess of x(1), which is tried first; if it fails and `halvings` is 0, the failure is raised.
-        Without it, or if it fails, the path begins at x(0).
-
-    Returns
-    -------
-    (3n,) array
-        x(1).
-
-    Raises
-    ------
-    NewtonFailure
-        If an increment of the smallest size fails.
+        Guess of x(1), which is tried first; the path begins at x(0) if it fails, unless `halvings`
+        is 0. By default the path begins at x(0).
     """
-    if guess is not None:
-        try:
-            return solve(guess, 1.0)
-        except NewtonFailure:
-            if not halvings:
-                raise
-    rate = np.zeros_like(x)
-    reached = 0.0
-    increment = 1.0
-    easy = False
-    while reached < 1.0:
-        step = min(increment, 1.0 - reached)
-        try:
-            solution = solve(x + step * rate, reached + step)
-        except NewtonFailure:
-            # What fails costs many times what succeeds: better short steps that grow.
-            increment = step / 4
-            easy = False
-            if increment < 0.5**halvings:
-                raise
-        else:
-            rate = (solution - x) / step
-            x = solution
-            reached = reached + step
-            # One step as long as that which failed would fail again.
-            increment = 2 * step if easy else step
-            easy = True
-    return x
+
+    def __init__(
+        self, x: Array, halvings: int, guess: Array | None = None
+    ) -> None:
+        self.x = x
+        self.share = 0.0
+        self._halvings = halvings
+        self._guess = guess
+        self._rate = np.zeros_like(x)
+        self._longest_step = 1.0
+        self._step = 1.0
+        self._last_succeeded = False
+
+    def next_guess(self) -> tuple[Array, float]:
+        """Return a guess (3n,) [m] of the next solution, and its share s."""
+        if self._guess is not None:
+            return self._guess, 1.0
+        self._step = min(self._longest_step, 1.0 - self.share)
+        return self.x + self._step * self._rate, self.share + self._step
+
+    def accept(self, solution: Array) -> None:
+        """Continue the path from the solution (3n,) [m] at the share of the last guess."""
+        self._rate = (solution - self.x) / self._step
+        self.x = solution
+        self.share += self._step
+        # One step as long as that which failed would fail again.
+        self._longest_step = (2 if self._last_succeeded else 1) * self._step
+        self._last_succeeded = True
+
+    def shorten(self) -> bool:
+        """Shorten the next increment, because no solution was found at the last guess, and return
+        whether it is not too short.
+        """
+        if self._guess is not None:
+            self._guess = None
+            return self._halvings > 0
+        # What fails costs many times what succeeds: better short steps that grow.
+        self._longest_step = self._step / 4
+        self._last_succeeded = False
+        return self._longest_step >= 0.5**self._halvings
 
 
 class NewtonSolvers:

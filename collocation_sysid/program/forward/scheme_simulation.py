@@ -20,7 +20,7 @@ from ...model.internal_variables import (
     insert_previous_states,
 )
 from ...recording.experiment import Experiment
-from ..contact.condensed_contact import ContactEquations
+from ..contact.condensed_contact import StepEquations
 from ..contact.step_contact import StepContact
 from ..linear_algebra.lapack import one_blas_thread
 from ..stopwatch import Stopwatch
@@ -31,7 +31,7 @@ from .newton_solver import (
     NewtonOptions,
     NewtonSolver,
     NewtonSolvers,
-    follow_path,
+    SolutionPath,
     simulation_error,
 )
 
@@ -255,7 +255,7 @@ def _extrapolate_static(x: Array, prescribed: Index, goal: Array) -> Array:
     return x[-1] + share * (x[-1] - x[-2])
 
 
-class RowEquations:
+class RowEquations(StepEquations):
     """Row t of the discrete equations of motion as a function of x_t alone.
 
     Parameters
@@ -295,10 +295,12 @@ class RowEquations:
             if dynamics.is_static
             else None
         )
-        self.contact = StepContact(
-            contacts, self.rest.theta, pattern=self.rest.pattern
-        )
         row = self.row
+        super().__init__(
+            StepContact(contacts, self.rest.theta, pattern=self.rest.pattern),
+            rates=(row.p[0], row.q[0]),
+            contact_weight=row.w[0],
+        )
         first = max(0, t - dynamics.largest_lag)
         shape = x.shape[1:]
         past = x[first:t][::-1]
@@ -322,18 +324,6 @@ class RowEquations:
             )
         return scaled
 
-    @property
-    def equations(self) -> ContactEquations:
-        """Equations of the row with contact apart."""
-        return ContactEquations(
-            self._residual_without_contact,
-            self._linearise_without_contact,
-            contact=self.contact,
-            states=self.states,
-            rates=(self.row.p[0], self.row.q[0]),
-            weight=self.row.w[0],
-        )
-
     def force(self, x: Array) -> Array:
         """Return the force F_t (3n,) [N] at the evaluation state that follows from x_t = `x` (3n,)
         [m], with contact.
@@ -353,22 +343,28 @@ class RowEquations:
         row = self.row
         return row.w[0] * force + self.known - row.s[0] * row.mass_kg * x
 
-    def _residual_without_contact(self, x: Array) -> Array:
-        """Return the constraints c_t (3n,) [N] at positions x_t (3n,) [m], without contact."""
-        return self._residual_from(self.rest.total(*self.states(x))[0], x)
+    def residual(self, x: Array, with_contact: bool = True) -> Array:
+        """Return the constraints c_t (3n,) [N] at positions x_t (3n,) [m]."""
+        residual = self._residual_from(self.rest.total(*self.states(x))[0], x)
+        return self.add_contact_force(residual, x) if with_contact else residual
 
-    def _linearise_without_contact(self, x: Array) -> NewtonLinearisation:
-        """Return c_t (3n,) [N] without contact at x_t = `x` (3n,) [m], and its derivative by
-        x_t.
-        """
+    def linearise(
+        self, x: Array, with_contact: bool = True
+    ) -> NewtonLinearisation:
+        """Return c_t (3n,) [N] at x_t = `x` (3n,) [m], and its derivative by x_t."""
         row = self.row
         at = self.rest.linearise(*self.states(x))
         matrix = row.block(
             at.by_position[0], at.by_velocity[0], pattern=self.rest.pattern
         )
         skew = row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
-        return NewtonLinearisation(
+        linearisation = NewtonLinearisation(
             self._residual_from(at.force[0], x), matrix, skew=skew
+        )
+        return (
+            self.add_contact(linearisation, x)
+            if with_contact
+            else linearisation
         )
 
 
@@ -403,28 +399,33 @@ def solve_row(
         If an increment fails after all halvings.
     """
     origin = previous[solver.is_prescribed]
-
-    def solve(guess: Array, share: float) -> Array:
-        start = guess.copy()
-        step = row.with_load_step(share)
+    path = SolutionPath(
+        previous, halvings=solver.options.max_halvings, guess=guess
+    )
+    while path.share < 1.0:
+        start, share = path.next_guess()
         # Exact at the end, because bounds of the collocation program are.
         goal = (
             prescribed_m
             if share == 1
             else origin + share * (prescribed_m - origin)
         )
-        equations = step.equations
-        if row.dynamics.is_static:
-            return solver.solve(
-                start,
-                equations.residual,
-                linearise=equations.linearise,
-                keep_definite=True,
-                prescribed_m=goal,
-            )
-        start[solver.is_prescribed] = goal
-        return solver.solve_in_contact(start, equations)
-
-    return follow_path(
-        solve, previous, halvings=solver.options.max_halvings, guess=guess
-    )
+        equations = row.with_load_step(share)
+        try:
+            if row.dynamics.is_static:
+                solution = solver.solve_equilibrium(
+                    start,
+                    equations.residual,
+                    linearise=equations.linearise,
+                    prescribed_m=goal,
+                )
+            else:
+                start = start.copy()
+                start[solver.is_prescribed] = goal
+                solution = solver.solve_step(start, equations)
+        except NewtonFailure:
+            if not path.shorten():
+                raise
+        else:
+            path.accept(solution)
+    return path.x

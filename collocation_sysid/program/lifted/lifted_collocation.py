@@ -80,7 +80,7 @@ class LiftedCollocation(Collocation):
         upper bound.
         """
         lower, upper = super().bounds()
-        least = [np.full(each.count, each.lower_bound) for each in self.lifted]
+        least = [np.full(each.count, -np.inf) for each in self.lifted]
         return (
             np.concatenate([lower, *least]),
             np.concatenate([upper, np.full(lifted_count(self), np.inf)]),

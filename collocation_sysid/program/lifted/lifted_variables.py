@@ -99,13 +99,6 @@ class LiftedVariables(ABC):
             - self.segment.nq
         )
 
-    @property
-    def lower_bound(self) -> float:
-        """Lower bound of the scaled variables; −∞ unless a subclass has one. There is no upper
-        bound.
-        """
-        return -np.inf
-
     def with_lifted(
         self, iterate: ExperimentIterate, z: Array
     ) -> ExperimentIterate:

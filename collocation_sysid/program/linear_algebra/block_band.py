@@ -191,9 +191,10 @@ class BlockBand:
             Largest number of threads; one is used for few blocks.
         """
         run_in_slices(
-            lambda start, stop: self._fill(start, stop, a, b, values),
+            self._fill,
             len(self._kinds),
             threads=threads if len(self._kinds) > 4 * threads else 1,
+            arguments=(a, b, values),
         )
 
 

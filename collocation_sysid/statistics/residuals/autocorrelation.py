@@ -332,11 +332,6 @@ class Dependence:
         return abs(self.lag1) > max(limit, NOTICEABLE)
 
     @property
-    def is_correlated_among_channels(self) -> bool:
-        """Whether markers or axes have errors in common: `shared_p` below `SIGNIFICANCE`."""
-        return self.shared_p < SIGNIFICANCE
-
-    @property
     def is_correlated_in_space(self) -> bool:
         """Whether errors of neighbours on the surface are correlated: `space_p` below
         `SIGNIFICANCE`.
@@ -348,7 +343,7 @@ class Dependence:
         """Whether the errors are correlated in any of these ways."""
         return (
             self.is_correlated_in_time
-            or self.is_correlated_among_channels
+            or self.shared_p < SIGNIFICANCE
             or self.is_correlated_in_space
         )
 

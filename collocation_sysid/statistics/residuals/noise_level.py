@@ -79,11 +79,6 @@ class NoiseLevel:
     sigma_key: str = "sigma_m"
 
     @property
-    def is_smaller(self) -> bool:
-        """Whether the residuals are significantly smaller than σ: `smaller_p` below `SMALLER`."""
-        return self.smaller_p < SMALLER
-
-    @property
     def is_unequal(self) -> bool:
         """Whether markers differ more than by chance: `unequal_p` below `UNEQUAL`."""
         return self.unequal_p < UNEQUAL
@@ -98,7 +93,7 @@ class NoiseLevel:
             return "by-marker"
         return (
             "estimated"
-            if self.larger_p < LARGER or self.is_smaller
+            if self.larger_p < LARGER or self.smaller_p < SMALLER
             else "given"
         )
 
