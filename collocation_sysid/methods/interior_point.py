@@ -97,8 +97,11 @@ ROW_SLOWNESS = 1e-9
 # Pivot tolerance of MUMPS: below the pivots that this diagonal gives, above those that rounding
 # gives in place of zero.
 PIVOT_TOLERANCE = 1e-12
-# Near the optimum variables and multipliers of bounds stay where they are, to this distance.
+# Near the optimum variables stay where they are, to this distance from their bounds.
 WARM_PUSH = 1e-9
+# Least multiplier of a bound there: with a logarithm of 20 from its bound, a fifth of the tolerance
+# of complementarity.
+WARM_MULTIPLIER = 1e-10
 # The barrier parameter begins there at this share of the tolerance, near where it ends.
 WARM_BARRIER = 0.1
 # Time that IPOPT is given at least, in which it begins and ends at once [s].
@@ -337,7 +340,7 @@ class InteriorPoint(Options):
                 "ipopt.warm_start_init_point": "yes",
                 "ipopt.warm_start_bound_push": WARM_PUSH,
                 "ipopt.warm_start_bound_frac": WARM_PUSH,
-                "ipopt.warm_start_mult_bound_push": WARM_PUSH,
+                "ipopt.warm_start_mult_bound_push": WARM_MULTIPLIER,
                 "ipopt.mu_init": WARM_BARRIER * self.tolerance,
             }
         if (
