@@ -1,8 +1,8 @@
 """Interior-point method: IPOPT solves the complete NLP with exact sparse derivatives.
 
-IPOPT starts from a coarse solution by reduced space (`initial_point`) or from a simulation at the
-guess. Use it where reduced space fails, because no simulation at the guess succeeds, or for contact
-as complementarity.
+IPOPT starts from a solution by reduced space (`initial_point`) or from a simulation at the guess.
+Use it where reduced space fails, because no simulation at the guess succeeds, or for contact as
+complementarity.
 """
 
 from __future__ import annotations
@@ -123,8 +123,9 @@ class InteriorPoint(Options):
         `warm_up` ("exact"), those of the loss with linearised measurements ("gauss-newton"), or
         IPOPT's own approximation ("limited-memory").
     initial : {"reduced-space", "simulation"}
-        Where IPOPT starts. "reduced-space": near the optimum, after a coarse solution of the same
-        program by reduced space, with multipliers of its adjoint. "simulation": from a simulation
+        Where IPOPT starts. "reduced-space": near the optimum, after a solution of the same program
+        by reduced space, with multipliers of its adjoint; IPOPT takes no iteration if its
+        conditions hold there. "simulation": from a simulation
         at the guess, or from the given start, with multipliers of zero; this is also the fallback
         if reduced space finds no motion.
     warm_up : float

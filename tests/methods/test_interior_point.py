@@ -603,7 +603,7 @@ def test_an_error_in_an_evaluation_reaches_the_caller(
 
     monkeypatch.setattr(Collocation, name, broken)
     with pytest.raises(KeyboardInterrupt, match=name):
-        InteriorPoint()(cube())
+        ALONE(cube())
     assert capfd.readouterr() == ("", "")
 
 
