@@ -28,9 +28,9 @@ from .solve_recorder import Recorder, SearchEnded
 LARGEST_CORRECTION = 1e-3
 # Sweeps after which the best point so far is taken: the work of a few iterations of IPOPT.
 MAX_SWEEPS = 100
-# Longest last step of the refinement, as in reduced space by default: IPOPT's conditions then hold,
-# or nearly.
-REFINED_CORRECTION = 1e-8
+# Longest last step of the refinement, below the tolerance of reduced space: times the curvature of
+# the loss it is the error of IPOPT's conditions.
+REFINED_CORRECTION = 1e-10
 # Sweeps of the refinement: less work than the factorisations of one iteration of IPOPT.
 REFINING_SWEEPS = 20
 # How a coarse solve may end without a point that is worth starting from.
