@@ -29,11 +29,19 @@ YOUNG_PA = 8e3
 COMPLIANCE_M_N, DEVIATION_M_N = 5e-5, 5e-6
 
 
-def bench(z_m: np.ndarray) -> Experiment:
-    """The block with its force measured under the upper platen, which is at heights `z_m`."""
+def bench(z_m: np.ndarray, symmetry: int = 1) -> Experiment:
+    """The block with its force measured under the upper platen, which is at heights `z_m`; it is one
+    part of `symmetry` equal ones of the specimen.
+    """
     pressed = block("xyz", z_m=z_m)
     lower, upper, *sides = pressed.grasps
-    sensor = Wrench(pressed.t_s, np.zeros((len(pressed.t_s), 6)), 1e-3, 1e-3)
+    sensor = Wrench(
+        pressed.t_s,
+        np.zeros((len(pressed.t_s), 6)),
+        1e-3,
+        1e-3,
+        symmetry=symmetry,
+    )
     return replace(
         pressed,
         markers=None,
@@ -41,22 +49,24 @@ def bench(z_m: np.ndarray) -> Experiment:
     )
 
 
-def measured() -> Experiment:
-    """The same in a machine that gives way, with the displacement behind its frame."""
+def measured(symmetry: int) -> Experiment:
+    """The same in a machine that gives way under the load of the specimen, with the displacement
+    behind its frame.
+    """
     z_m = np.array(PRESSED_M)
     for _ in range(6):
         (wrench_n,) = simulate(
             bench(z_m), {"young_pa": YOUNG_PA, **STATED}
         ).wrenches
         z_m = PRESSED_M - COMPLIANCE_M_N * wrench_n[:, 2]
-    return with_wrenches(bench(np.array(PRESSED_M)), [wrench_n])
+    return with_wrenches(bench(np.array(PRESSED_M), symmetry), [wrench_n])
 
 
-def solved(compliance: object):
+def solved(compliance: object, symmetry: int = 1):
     known = dict.fromkeys(Assumptions().deviations, "none")
     stated = Assumptions(**(known | {"machine_compliance_m_n": compliance}))
     problem = Problem(
-        [measured()],
+        [measured(symmetry)],
         {"young_pa": Unknown(5e3), **STATED},
         uncertainty=UncertaintyOptions(assumptions=stated),
     )
@@ -85,6 +95,15 @@ def test_a_stated_compliance_of_the_machine_corrects_the_modulus():
     assert corrected.combined_std_error / corrected.value == pytest.approx(
         ratio, rel=0.05
     )
+
+
+def test_the_machine_yields_to_the_load_of_the_whole_specimen():
+    stated = {
+        "mean": COMPLIANCE_M_N / 4,
+        "deviation": DEVIATION_M_N / 4,
+    }
+    estimate = solved(stated, symmetry=4).estimates["young_pa"]
+    assert estimate.value == pytest.approx(YOUNG_PA, rel=5e-3)
 
 
 def test_intervals_are_moved_by_what_is_known_and_respect_bounds():

@@ -639,8 +639,9 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of the compliance of a test bench, per m/N: displacements are measured
     behind its frame.
 
-    Each grasp that is moved along an axis lags behind by its force along it. Specimens are treated
-    by `_machine_of_specimen`.
+    Each grasp that is moved along an axis lags behind by the force of the specimen along it, which
+    is `Experiment.symmetry` times that of the modelled part. Specimens are treated by
+    `_machine_of_specimen`.
     """
     experiment = at.iterate.segment.experiment
     prescribed = at.iterate.equations.prescribed
@@ -659,7 +660,7 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
                 displacement_m[:, here] = -at.grasp_force_n[:, here].sum(
                     axis=1, keepdims=True
                 )
-    return Effect(displacement_m=displacement_m)
+    return Effect(displacement_m=experiment.symmetry * displacement_m)
 
 
 def _machine_of_specimen(
