@@ -3,13 +3,14 @@
 A step of interior point factorises the matrix of all positions and parameters, which takes as long
 as dozens of sweeps of reduced space. Far from the optimum its steps also move nuisance parameters
 by many prior deviations, because the equations of motion hold only at the end. So reduced space
-first brings the parameters near the optimum, along motions that satisfy the equations of motion.
-IPOPT then solves the whole program from these positions, parameters and multipliers.
+first brings the parameters near the optimum, along motions that satisfy the equations of motion,
+and then to its own tolerance, as long as that takes few sweeps. IPOPT solves the whole program from
+these positions, parameters and multipliers; where they satisfy its conditions it factorises nothing.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse.linalg as spla
@@ -27,6 +28,11 @@ from .solve_recorder import Recorder, SearchEnded
 LARGEST_CORRECTION = 1e-3
 # Sweeps after which the best point so far is taken: the work of a few iterations of IPOPT.
 MAX_SWEEPS = 100
+# Longest last step of the refinement, below the tolerance of reduced space: times the curvature of
+# the loss it is the error of IPOPT's conditions.
+REFINED_CORRECTION = 1e-10
+# Sweeps of the refinement: less work than the factorisations of one iteration of IPOPT.
+REFINING_SWEEPS = 20
 # How a coarse solve may end without a point that is worth starting from.
 UNUSABLE = (Status.NOT_SIMULABLE, Status.NUMERICAL_FAILURE, Status.DIVERGED)
 
@@ -72,25 +78,31 @@ def compute_initial_point(
     max_time_s : float
         Time after which the search ends with `Status.TIME_LIMIT` [s].
     """
-
-    def record(line: Iteration) -> None:
-        """Record an iteration, and raise `SearchEnded` if the time is over."""
-        recorder.add(line)
-        if recorder.elapsed_s > max_time_s:
-            raise SearchEnded(Status.TIME_LIMIT)
-
-    method = ReducedSpace(
-        tolerance=LARGEST_CORRECTION, max_iterations=MAX_SWEEPS
+    coarse = _search(
+        recorder,
+        recorder.collocation,
+        start=start,
+        method=ReducedSpace(
+            tolerance=LARGEST_CORRECTION, max_iterations=MAX_SWEEPS
+        ),
+        max_time_s=max_time_s,
     )
-    coarse = method(recorder.collocation, record, start)
-    # Reduced space gives multipliers only where a part of the trajectory was not simulated.
-    reached_end = coarse.initial_multipliers is None
-    is_usable = (
-        reached_end
-        and coarse.status not in UNUSABLE
-        and bool(np.isfinite(coarse.z).all())
-    )
+    is_usable = _reaches_end(coarse)
     is_close = is_usable and coarse.status is Status.CONVERGED
+    precision = LARGEST_CORRECTION
+    if is_close:
+        refined = _search(
+            recorder,
+            coarse.collocation,
+            start=coarse.z,
+            method=ReducedSpace(
+                tolerance=REFINED_CORRECTION, max_iterations=REFINING_SWEEPS
+            ),
+            max_time_s=max_time_s,
+        )
+        if refined.status is Status.CONVERGED:
+            precision = REFINED_CORRECTION
+        coarse = _refined_solution(coarse, refined)
     count = coarse.iterations
     sweeps = (
         f"{count} sweep{'s' * (count != 1)} of reduced space"
@@ -101,7 +113,7 @@ def compute_initial_point(
     if is_close:
         note = (
             f"initial point: {sweeps}, which determined the parameters to "
-            f"{100 * LARGEST_CORRECTION:g} %; {continuation}"
+            f"{100 * precision:g} %; {continuation}"
         )
     elif is_usable:
         note = (
@@ -110,6 +122,84 @@ def compute_initial_point(
     else:
         note = f"initial point: the method reduced-space found none ({coarse.message.rstrip('.')})"
     return InitialPoint(coarse, is_usable, is_close=is_close, note=note)
+
+
+def _search(
+    recorder: Recorder,
+    collocation: Collocation,
+    *,
+    start: Array | None,
+    method: ReducedSpace,
+    max_time_s: float,
+) -> Solution:
+    """Return the solution of a search by reduced space, and add every iteration to the recorder,
+    with its numbers continued.
+
+    Parameters
+    ----------
+    recorder : Recorder
+        Recorder of the solve that needs the point.
+    collocation : Collocation
+        Problem.
+    start : (variables,) array or None
+        Initial variables; None for the guess.
+    method : ReducedSpace
+        Method with its limits.
+    max_time_s : float
+        Time of the recorder after which the search ends with `Status.TIME_LIMIT` [s].
+    """
+    first_number = recorder.history[-1].number + 1 if recorder.history else 0
+
+    def record(line: Iteration) -> None:
+        """Record an iteration, and raise `SearchEnded` if the time is over."""
+        recorder.add(
+            replace(
+                line,
+                number=first_number + line.number,
+                time_s=recorder.elapsed_s,
+            )
+        )
+        if recorder.elapsed_s > max_time_s:
+            raise SearchEnded(Status.TIME_LIMIT)
+
+    return method(collocation, record, start)
+
+
+def _reaches_end(solution: Solution) -> bool:
+    """Return whether variables satisfy the equations of motion to the end of the recordings."""
+    # Reduced space gives multipliers only where a part of the trajectory was not simulated.
+    return (
+        solution.initial_multipliers is None
+        and solution.status not in UNUSABLE
+        and bool(np.isfinite(solution.z).all())
+    )
+
+
+def _refined_solution(coarse: Solution, refined: Solution) -> Solution:
+    """Return the refined solution, or the coarse one if the refinement failed, with the sweeps,
+    evaluations and times of both.
+
+    The status is that of the coarse solution, unless the refinement was interrupted or late.
+
+    Parameters
+    ----------
+    coarse : Solution
+        Solution to `LARGEST_CORRECTION`.
+    refined : Solution
+        Result of the search from there.
+    """
+    both = refined.after(coarse, why="")
+    if refined.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
+        return both
+    best = both if _reaches_end(refined) else coarse
+    return replace(
+        best,
+        status=coarse.status,
+        message=coarse.message,
+        iterations=both.iterations,
+        evaluations=both.evaluations,
+        timing=both.timing,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,12 +257,36 @@ def adjoint_multipliers(
         variables = convert_variables(z, collocation, target=program)
         gradient = program.gradient(variables)
         jacobian = program.jacobian(variables)
-    lower, upper = program.bounds()
-    bounded = (lower < upper) & (np.isfinite(lower) | np.isfinite(upper))
-    bounds = np.where(bounded, -(gradient + jacobian.T @ constraints), 0.0)
+    slope = gradient + jacobian.T @ constraints
+    bounds = _bound_multipliers(program, variables, slope)
     multipliers = InitialMultipliers(constraints, bounds)
     return (
         multipliers
         if np.isfinite(constraints).all() and np.isfinite(bounds).all()
         else None
     )
+
+
+def _bound_multipliers(
+    program: Collocation, variables: Array, slope: Array
+) -> Array:
+    """Return multipliers of the bounds (variables,), positive at upper bounds: those that balance
+    the slope where a bound is active, and zero elsewhere.
+
+    A bound is active if its multiplier is larger than the distance to it. Elsewhere a multiplier
+    that balances the slope would be an error of the complementarity instead of one of stationarity,
+    larger by the distance.
+
+    Parameters
+    ----------
+    program : Collocation
+        Program that is passed to IPOPT.
+    variables : (variables,) array
+        Its variables.
+    slope : (variables,) array
+        Derivatives of the Lagrangian without bounds.
+    """
+    lower, upper = program.bounds()
+    distance = np.where(slope > 0, variables - lower, upper - variables)
+    is_active = (lower < upper) & (np.abs(slope) > distance)
+    return np.where(is_active, -slope, 0.0)

@@ -1,8 +1,8 @@
 """Interior-point method: IPOPT solves the complete NLP with exact sparse derivatives.
 
-IPOPT starts from a coarse solution by reduced space (`initial_point`) or from a simulation at the
-guess. Use it where reduced space fails, because no simulation at the guess succeeds, or for contact
-as complementarity.
+IPOPT starts from a solution by reduced space (`initial_point`) or from a simulation at the guess.
+Use it where reduced space fails, because no simulation at the guess succeeds, or for contact as
+complementarity.
 """
 
 from __future__ import annotations
@@ -97,8 +97,11 @@ ROW_SLOWNESS = 1e-9
 # Pivot tolerance of MUMPS: below the pivots that this diagonal gives, above those that rounding
 # gives in place of zero.
 PIVOT_TOLERANCE = 1e-12
-# Near the optimum variables and multipliers of bounds stay where they are, to this distance.
+# Near the optimum variables stay where they are, to this distance from their bounds.
 WARM_PUSH = 1e-9
+# Least multiplier of a bound there: with a logarithm of 20 from its bound, a fifth of the tolerance
+# of complementarity.
+WARM_MULTIPLIER = 1e-10
 # The barrier parameter begins there at this share of the tolerance, near where it ends.
 WARM_BARRIER = 0.1
 # Time that IPOPT is given at least, in which it begins and ends at once [s].
@@ -120,8 +123,9 @@ class InteriorPoint(Options):
         `warm_up` ("exact"), those of the loss with linearised measurements ("gauss-newton"), or
         IPOPT's own approximation ("limited-memory").
     initial : {"reduced-space", "simulation"}
-        Where IPOPT starts. "reduced-space": near the optimum, after a coarse solution of the same
-        program by reduced space, with multipliers of its adjoint. "simulation": from a simulation
+        Where IPOPT starts. "reduced-space": near the optimum, after a solution of the same program
+        by reduced space, with multipliers of its adjoint; IPOPT takes no iteration if its
+        conditions hold there. "simulation": from a simulation
         at the guess, or from the given start, with multipliers of zero; this is also the fallback
         if reduced space finds no motion.
     warm_up : float
@@ -337,7 +341,7 @@ class InteriorPoint(Options):
                 "ipopt.warm_start_init_point": "yes",
                 "ipopt.warm_start_bound_push": WARM_PUSH,
                 "ipopt.warm_start_bound_frac": WARM_PUSH,
-                "ipopt.warm_start_mult_bound_push": WARM_PUSH,
+                "ipopt.warm_start_mult_bound_push": WARM_MULTIPLIER,
                 "ipopt.mu_init": WARM_BARRIER * self.tolerance,
             }
         if (

@@ -379,7 +379,8 @@ class ReducedSearch:
             is_short = is_full_step and length <= tolerance
             if is_short and point.feasibility_m <= FEASIBLE * self.size_m:
                 return Status.CONVERGED
-            rate = min(1.0, length / previous)
+            # The first step tells nothing of the rate of convergence.
+            rate = min(1.0, length / previous) if previous < np.inf else 1.0
             if is_last and is_full_step and length * rate <= SAFETY * tolerance:
                 final_positions = horizon.extrapolate(point, step)
                 summaries = horizon.fit_summaries(

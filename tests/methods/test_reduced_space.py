@@ -30,6 +30,7 @@ from collocation_sysid.methods.horizon import Horizon, Iterate
 from collocation_sysid.methods.initial_trajectories import (
     initial_variables,
     rigid_trajectory,
+    simulate_trajectories,
 )
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.loss_curvature import (
@@ -225,6 +226,21 @@ def test_it_starts_from_given_variables():
     assert again.iterations < 3
     assert seen[0].parameters == solved_cube().parameters
     assert seen[0].rms_m < 1e-9
+
+
+@pytest.mark.parametrize("distance", [1e-4, 1e-5, 1e-6])
+def test_a_start_near_the_optimum_is_solved_to_the_tolerance(distance: float):
+    """The first step tells nothing of the rate of convergence."""
+    collocation = Collocation([noisy(hung_cube(), noise_m=2e-3)], GUESS)
+    expected = ReducedSpace(tolerance=1e-12)(collocation)
+    p, _ = expected.collocation.unpack(expected.z)
+    near = p + distance * np.array([1, -1, 1, 1])
+    positions, failure = simulate_trajectories(collocation, near)
+    assert failure is None
+    start = collocation.pack(near, positions)
+    found = ReducedSpace()(collocation, start=start)
+    assert found.status is Status.CONVERGED
+    np.testing.assert_allclose(found.q, expected.q, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("make", [hung_cube, released_cube, bar_let_go])
