@@ -186,8 +186,8 @@ BAD = {
     "two": (
         "Time (s),Load (N),Force (N)\n0,1,1\n1,2,2\n",
         {},
-        "Load (N), Force (N) could all be force; expected one of them, or columns = { force = "
-        '"…" }',
+        "Load (N), Force (N) could all be force; expected one of them, or "
+        'columns = { force = "Load (N)" } or columns = { force = "Force (N)" }',
     ),
     "only stress": (
         "Time (s),Stress (kPa)\n0,1\n1,2\n",
