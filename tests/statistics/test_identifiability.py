@@ -163,9 +163,7 @@ def test_confounded_parameters_are_told_by_the_combination_that_is_fixed():
 def test_the_powers_of_a_combination_are_those_that_cancel():
     found = uncertainty(spread([0.4, 0.1, 0.02, 0.02], {(0, 1): 0.995}))
     (sentence,) = [
-        s
-        for s in identifiability_sentences(found)
-        if "combination" in s
+        s for s in identifiability_sentences(found) if "combination" in s
     ]
     assert "lambda_pa^-0.25 · mu_pa " in sentence
 
