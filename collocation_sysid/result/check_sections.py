@@ -313,7 +313,7 @@ def _solve_section(findings: CheckResult) -> Table:
     if findings.costs:
         rows["times"] = (
             f"rough estimates of the search for {findings.timesteps:,} time steps or equilibria, "
-            "with contact and friction; the checks of the result come on top"
+            "obstacles and friction included; the checks of the result come on top"
         )
     rows["derivatives"] = (
         f"relative errors of Jacobian and Hessian: {findings.jacobian_error:.0e}, "

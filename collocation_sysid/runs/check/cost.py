@@ -133,7 +133,7 @@ TIMED_ROWS = 12
 # Sweeps that the reduced space mostly takes.
 TYPICAL_SWEEPS = 10
 # Time of a search in equilibria over that of `TYPICAL_SWEEPS` sweeps, whose equilibria start from
-# solved ones: 1.9 and 2.5 with a prescribed platen, 1.6 and 2.0 with a platen in contact, 0.9 and
+# solved ones: 1.9 and 2.5 with a prescribed platen, 1.6 and 2.0 with an obstacle as platen, 0.9 and
 # 2.6 with friction, for quarter cylinders of 11 and 21 samples.
 STATIC_FACTOR = 2.2
 # The same ratio if a coefficient of friction is estimated, over that without: 1.3 and 3.5 for the
