@@ -32,8 +32,10 @@ from ..recording.nuisance import TIME
 
 
 def condense(complete: Collocation) -> Collocation:
-    """Return the program without the grasped positions that follow from φ; the same program if no
-    grasp and no clock is estimated.
+    """Return the program without the grasped positions that follow from φ, and with a sparser
+    Hessian; the argument itself if no grasp and no clock is estimated.
+
+    The given program is not modified.
     """
     if not any(
         s.nuisance.affects_grasps or len(s.nuisance.clock_indices)
@@ -104,7 +106,7 @@ class EliminatedDofs:
         cls, transcription: Transcription, complete: Collocation
     ) -> EliminatedDofs:
         """Return the grasped dofs of an experiment whose positions follow from φ: those that
-        constraints of the `complete` program prescribe.
+        constraints of the `complete` program prescribe, which contains the `transcription`.
         """
         rows = np.flatnonzero(transcription.is_grasp_constraint)
         time, place = np.divmod(rows, transcription.constraints_per_time)
@@ -290,7 +292,9 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def _remaining(self) -> tuple[Index, Index]:
-        """Indices of the variables and of the constraints that remain."""
+        """Indices in the complete program, ascending, of the variables and of the constraints that
+        remain: two int arrays.
+        """
         variables = np.arange(self.complete.variable_count)
         rows = np.arange(self.complete.constraint_count)
         for each in self.eliminated:
@@ -560,8 +564,8 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
-        """Indices, in the values of the Hessian, of the diagonal entries of q, and of those of the
-        positions that remain.
+        """Indices, in the values of the Hessian's upper triangle, of the diagonal entries of q
+        (nq,), and of those of the positions that remain.
         """
         places = np.full(len(self.complete.hessian_structure[1]), -1)
         places[self._hessian.remaining] = self._hessian.targets[0]

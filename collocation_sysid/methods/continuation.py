@@ -186,9 +186,9 @@ class _ContinuationState:
         self.iterations = self.evaluations = 0
 
     def solve(self, share: float) -> bool:
-        """Solve the first share of the samples, starting from the last solution, and store the
-        result; return whether to continue with a larger share: unless the solve was interrupted or
-        refused.
+        """Solve the first share of the samples, from 0 to 1, starting from the last solution, and
+        store the result; return whether to continue with a larger share: unless the solve was
+        interrupted or refused.
         """
         recorder = self.recorder
         part = (
@@ -248,7 +248,7 @@ class _ContinuationState:
 
     def _add(self, solution: Solution, share: float) -> None:
         """Store the solution of a part as the last one and its positions as known, and add its
-        counts, its times and a note, in place; `share` is that of the samples.
+        counts, its times and a note, in place; `share` is that of the samples, from 0 to 1.
         """
         self.last = solution
         part = solution.collocation

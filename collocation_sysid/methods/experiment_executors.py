@@ -43,7 +43,9 @@ class ExperimentExecutor(Protocol):
     """
 
     def store_segments(self, collocation: Collocation) -> list[Any]:
-        """Store the transcriptions of a problem, and return them as stored values."""
+        """Store the transcriptions of the fitted experiments of a problem, and return them as
+        stored values, in their order.
+        """
         ...
 
     def map_experiments(
@@ -86,7 +88,7 @@ class LocalExecutor:
         self.threads = threads
 
     def store_segments(self, collocation: Collocation) -> list[Any]:
-        """Return the transcriptions themselves, in a new list."""
+        """Return the transcriptions of the fitted experiments themselves, in a new list."""
         return list(collocation.transcriptions)
 
     def map_experiments(
@@ -349,7 +351,7 @@ def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
 
 
 def _require_package(client: Any) -> set[str]:
-    """Return the addresses of the workers.
+    """Return the addresses of the workers of a Dask client, after a check of their versions.
 
     Raises
     ------
@@ -383,7 +385,9 @@ def _refusal(message: str) -> InputError:
 
 
 def _require_workers(threads: dict[str, int]) -> None:
-    """Raise `SearchEnded` if no worker is left: `threads`, their numbers by address, is empty."""
+    """Raise `SearchEnded` if no worker is left: `threads`, the numbers of threads by address of the
+    worker, is empty.
+    """
     if not threads:
         raise _disconnection("No worker is left.")
 
@@ -430,8 +434,8 @@ def _identity(value: T) -> T:
 
 
 def _with_fields(instance: T, body: Body | None = None) -> T:
-    """Return a copy of an experiment or a marker association with another body; None removes it
-    for transfer.
+    """Return a copy of an experiment or a marker association, the `instance`, with another body,
+    without validation and caches; None removes the body for transfer.
     """
     names = [each.name for each in fields(instance)]  # pyright: ignore[reportArgumentType]
     field_values = {name: getattr(instance, name) for name in names}

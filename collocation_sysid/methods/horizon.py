@@ -82,7 +82,9 @@ class Iterate:
         return bool(np.isfinite(self.loss) and np.isfinite(self.feasibility_m))
 
     def predicted_loss(self, step: Array) -> float:
-        """Return the loss of the linearised problem after a step (np,) of the parameters."""
+        """Return the loss, priors included, of the linearised problem after a step (np,) of the
+        parameters.
+        """
         return self.fit.loss(step)
 
 
@@ -132,6 +134,8 @@ class Horizon:
     def set_collocation(self, collocation: Collocation) -> None:
         """Use another collocation of the same problem, with measurements associated differently, in
         place; iterates that were evaluated before are unchanged, see `reassociate`.
+
+        `SearchEnded` is raised if the workers are lost.
         """
         self.collocation = collocation
         self.segments = self.workers.store_segments(collocation)
@@ -161,6 +165,8 @@ class Horizon:
         ------
         SimulationError
             If a time step is singular or not finite, or a node has no mass.
+        SearchEnded
+            If the workers are lost.
         """
         known = (
             known_iterate.trajectories if known_iterate else self._repeat(None)
@@ -188,6 +194,8 @@ class Horizon:
         ------
         SimulationError
             If a time step is singular or not finite, or a node has no mass.
+        SearchEnded
+            If the workers are lost.
         """
         return self._run(
             p,
@@ -200,7 +208,8 @@ class Horizon:
         """Return an iterate at parameters p (np,) with the measurements of the present collocation;
         positions and sensitivities are those of `iterate`, not computed again.
 
-        Its changes since a previous iterate are zero, as in `evaluate`.
+        Its changes since a previous iterate are zero, as in `evaluate`. `SearchEnded` is raised if
+        the workers are lost.
         """
         return self._run(p, reassociate, iterate.trajectories)
 
@@ -280,6 +289,8 @@ class Horizon:
         """Simulate all experiments at parameters p, as far as the simulations succeed; their times
         are added to the stopwatch.
 
+        `SearchEnded` is raised if the workers are lost.
+
         Parameters
         ----------
         p : (np,) array
@@ -315,6 +326,8 @@ class Horizon:
     def extrapolate(self, iterate: Iterate, step: Array) -> list[Any]:
         """Return the positions of each experiment, stored by the workers, after the feasibility
         step of the iterate and a step (np,) of the parameters, to first order.
+
+        `SearchEnded` is raised if the workers are lost.
         """
         return self.workers.map_experiments(
             extrapolate,
@@ -328,6 +341,8 @@ class Horizon:
     ) -> list[FitSummary]:
         """Return the fit of trajectories, as the workers store them, at parameters p (np,), without
         a sweep; one summary for each experiment.
+
+        `SearchEnded` is raised if the workers are lost.
         """
         summaries = self.workers.map_experiments(
             fit_summary, self.segments, self._by_experiment(p), trajectories
@@ -336,6 +351,8 @@ class Horizon:
 
     def row_counts(self, trajectories: Sequence[Any]) -> list[int]:
         """Return the number of rows of each trajectory.
+
+        `SearchEnded` is raised if the workers are lost.
 
         Parameters
         ----------
@@ -351,6 +368,8 @@ class Horizon:
     ) -> list[Array]:
         """Return the first `counts[i]` rows of each trajectory i, as arrays (counts[i], 3n) [m].
 
+        `SearchEnded` is raised if the workers are lost.
+
         Parameters
         ----------
         trajectories : sequence
@@ -364,7 +383,7 @@ class Horizon:
         )
 
     def _by_experiment(self, p: Array) -> list[Array]:
-        """Return the entries of p (np,) that belong to each experiment."""
+        """Return the entries (k,) of p (np,), or of a step, that belong to each experiment."""
         return [p[own] for own in self.collocation.parameter_indices]
 
     def _repeat(self, value: Any) -> list[Any]:
@@ -385,8 +404,8 @@ def _row_count(result: LinearisedTrajectory | SimulationResult | Array) -> int:
 def _failure_and_times(
     result: SimulationResult,
 ) -> tuple[SimulationError | None, tuple[float, float, float]]:
-    """Return the failure (None if complete) and the times [s] of a simulation; workers run
-    this function.
+    """Return the failure (None if complete) and the times of building, evaluations and linear
+    algebra [s] of a simulation; workers run this function.
     """
     return result.failure, result.times_s
 
@@ -394,5 +413,7 @@ def _failure_and_times(
 def _first_rows(
     result: LinearisedTrajectory | SimulationResult | Array, count: int
 ) -> Array:
-    """Return the first `count` rows of a trajectory; workers run this function."""
+    """Return the positions (count, 3n) [m] of the first `count` rows of a trajectory, or all if
+    there are fewer; workers run this function.
+    """
     return trajectory_positions(result)[:count]

@@ -60,7 +60,8 @@ def compute_initial_point(
     """Compute an initial point by reduced space, and add every iteration to the recorder.
 
     Whether it can be used and whether it is near the optimum are attributes of the result; a failed
-    search is no error.
+    search is no error. The collocation of the recorder is unchanged; exceptions of its `watch` are
+    not caught.
 
     Parameters
     ----------

@@ -33,6 +33,7 @@ def associated_at_guess(collocation: Collocation) -> Collocation:
 
     The initial shape is the initial equilibrium or, if that fails, the undeformed shape moved with
     the grasp. The given problem is not modified; it is returned itself if all positions are known.
+    Every parameter must have a guess.
     """
     if not any(segment.rows_to_place for segment in collocation.transcriptions):
         return collocation
@@ -60,7 +61,7 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
 
     Each experiment is simulated at the guess with the collocation scheme. If that fails, the
     initial shape is moved rigidly with the grasp instead and a note is added, because collocation
-    needs no feasible start.
+    needs no feasible start. Every parameter must have a guess.
     """
     p = collocation.guess_p
     positions = []
@@ -226,7 +227,7 @@ def complete_variables(
 
 
 def _empty_trajectories(collocation: Collocation) -> list[Array]:
-    """Return an empty trajectory (0, 3n) of each experiment."""
+    """Return an empty trajectory (0, 3n) of each fitted experiment."""
     return [
         np.zeros((0, segment.dof_count))
         for segment in collocation.transcriptions

@@ -24,10 +24,11 @@ LARGEST_SHARE = 0.9
 
 
 def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
-    """Return B (np, np) after an accepted step, by the update of Dennis, Gay and Welsch; B itself
-    if the score does not increase along the step.
+    """Return B (np, np) after an accepted step, by the update of Dennis, Gay and Welsch; the given
+    array itself if the score does not increase along the step.
 
-    B is what Gauss–Newton neglects of the Hessian.
+    B is what Gauss–Newton neglects: the Hessian of the loss is 2 (SᵀS + B). The given array is not
+    modified.
 
     Parameters
     ----------
@@ -104,8 +105,9 @@ def with_curvature(
 
 
 def require_second_derivatives(collocation: Collocation) -> None:
-    """Raise an `InputError` if the problem has no exact second derivatives: for materials with
-    memory, forces with internal variables, measured wrenches and custom sensors of grasp forces.
+    """Do nothing, or raise an `InputError` if the problem has no exact second derivatives: for
+    materials with memory, forces with internal variables, measured wrenches and custom sensors of
+    grasp forces.
     """
     if collocation.has_eliminated_histories:
         raise InputError(
@@ -124,15 +126,17 @@ def exact_curvature(
     iterate: Iterate,
     stopwatch: Stopwatch | None = None,
 ) -> Array:
-    """Return B (np, np) at an iterate of the complete recordings, by one backward sweep.
+    """Return B (np, np), symmetric, at an iterate of the complete recordings, by one backward
+    sweep.
 
-    B follows from the reduced Hessian Wᵀ ∇²(L + yᵀ g) W of the Lagrangian with W = (I, Z), the
-    sensitivities Z and the multipliers y of the equations of motion.
+    B is what Gauss–Newton neglects of the Hessian, see `secant_update`. It follows from the reduced
+    Hessian Wᵀ ∇²(L + yᵀ g) W of the Lagrangian with W = (I, Z), the sensitivities Z and the
+    multipliers y of the equations of motion.
 
     Parameters
     ----------
     collocation : Collocation
-        Problem.
+        Problem with second derivatives, which is not checked, see `require_second_derivatives`.
     iterate : Iterate
         Iterate of all rows; its trajectories must be in this process.
     stopwatch : Stopwatch, optional
@@ -163,7 +167,8 @@ def _tangent_direction(
     collocation: Collocation, iterate: Iterate, k: int
 ) -> Array:
     """Return the change (variables,) of all variables per unit of the parameter with index k, along
-    the equations of motion linearised at `iterate`; other parameters do not change.
+    the equations of motion linearised at `iterate`; other parameters do not change. Both are those
+    of `collocation`, in its coordinates p and its scaling of z.
     """
     unit = np.eye(len(iterate.p))[k]
     position_changes = [

@@ -58,8 +58,8 @@ FEWEST = 8
 
 
 def samples_in_share(count: int, share: float) -> int:
-    """Return the number of samples in a share of `count` samples, at least `FEWEST` if
-    there are as many.
+    """Return the number of samples in a share, from 0 to 1, of `count` samples, rounded; at least
+    `FEWEST`, at most `count`.
     """
     return min(count, max(FEWEST, round(share * count)))
 

@@ -463,13 +463,15 @@ class ReducedSearch:
         return secant_update(curvature, previous, after=after)
 
     def _step_length(self, step: Array) -> float:
-        """Return the largest change of a parameter by a step (np,), relative to `reach`."""
+        """Return the largest change of a parameter by a step (np,), relative to `reach`; 0 without
+        parameters.
+        """
         return float(np.abs(step / self.reach).max(initial=0.0))
 
     def _next_step(self, point: Iterate, curvature: Array) -> Array:
         """Return the step (np,) from `point` that minimises the quadratic model of the loss, with
         the neglected curvature (np, np) added as far as `with_curvature` allows, within bounds and
-        trust region.
+        trust region; nothing is changed.
         """
         low = np.maximum(self.lower - point.p, -self.trust * self.reach)
         high = np.minimum(self.upper - point.p, self.trust * self.reach)
@@ -482,7 +484,8 @@ class ReducedSearch:
         self, horizon: Horizon, point: Iterate, step: Array
     ) -> Iterate | None:
         """Return the point after a step (np,) of the parameters from `point`, clipped to the
-        bounds, by one sweep, which is counted; None if that fails or is not finite.
+        bounds, by one sweep on the horizon, which is counted; None if that fails or is not finite.
+        Nothing else of the search changes.
         """
         self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
@@ -562,7 +565,7 @@ class ReducedSearch:
 
     def _are_feasible(self, summaries: list[FitSummary]) -> bool:
         """Return whether the largest residual of the equations of motion of every experiment is at
-        most `FEASIBLE_FORCE` times its unit of force.
+        most `FEASIBLE_FORCE` times its unit of force; one summary for each, in their order.
         """
         return all(
             each.violation_n <= FEASIBLE_FORCE * segment.force_n
@@ -731,7 +734,7 @@ class ReducedSearch:
         x : list
             Trajectories, as the workers store them.
         loss : float
-            Loss with priors.
+            Loss with priors, without the scaling of the NLP.
         summaries : sequence of FitSummary
             Fit of each experiment.
         """

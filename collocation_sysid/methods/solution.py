@@ -134,13 +134,14 @@ class Timing:
     total: float = 0.0
 
     def __add__(self, other: Timing) -> Timing:
-        """Return the sum of both times, entry by entry."""
+        """Return new times, the sums of the entries of both [s]."""
         pairs = zip(astuple(self), astuple(other), strict=True)
         return Timing(*(mine + its for mine, its in pairs))
 
     @classmethod
     def since(cls, watch: Stopwatch, start_s: float) -> Timing:
-        """Return the times that a stopwatch has measured.
+        """Return the times that a stopwatch has measured, and the total time from a start until
+        now.
 
         Parameters
         ----------
@@ -523,7 +524,8 @@ def custom_sensor_rms(
 
 
 def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:
-    """Return the RMS residuals of force [N] and torque [N m] over all fitted experiments.
+    """Return the RMS residuals of force [N] and torque [N m] over all fitted experiments of a
+    solution.
 
     All experiments have equal weight. None means that no experiment measured the component.
     """

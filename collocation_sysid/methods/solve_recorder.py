@@ -87,6 +87,8 @@ class Recorder:
     def initial_variables(self, start: Array | None) -> Array:
         """Return the initial variables (variables,).
 
+        In that case every parameter must have a guess.
+
         Parameters
         ----------
         start : (variables,) array or None
@@ -148,7 +150,7 @@ class Recorder:
         z : (variables,) array
             Variables.
         loss : float
-            Loss L at z, which is not evaluated again.
+            Loss L at z, without the scaling of the NLP; it is not evaluated again.
         """
         collocation = self.collocation
         violation_n = max(

@@ -127,7 +127,8 @@ def start_problem(
     """Return the problem with a guess of every parameter, and the scan; None if there was no scan.
 
     Given guesses are kept, unless the body cannot be simulated with them or fits worse than an
-    undeformed one, and the scan finds better ones.
+    undeformed one, and the scan finds better ones. The given problem is not modified; it is
+    returned itself if nothing changes.
 
     Parameters
     ----------
@@ -328,8 +329,8 @@ def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
 
 
 def typical_constants(parameters: Parameters) -> dict[str, float]:
-    """Return values of all parameters by name: guesses, or typical ones of a
-    soft body (`SOFT_PA`).
+    """Return values of all parameters by name, in SI units: guesses, or typical ones of a soft body
+    (`SOFT_PA`).
     """
     return typical_parameters(parameters, SOFT_PA).guesses
 
@@ -356,8 +357,8 @@ def _ranked_moduli(young_pa: Array, misfit: Array) -> list[float]:
 
 
 def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
-    """Return the parameters with a unit for those linear ones that have none, a tenth of Young's
-    modulus [Pa].
+    """Return the parameters with a unit for those linear ones that have none (NaN): a tenth of the
+    Young's modulus `young_pa` [Pa].
     """
     unit = young_pa / 10
     return parameters.map_components(
@@ -366,7 +367,7 @@ def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
 
 
 def _has_free_modulus(collocation: Collocation) -> bool:
-    """Return whether a free modulus on a logarithmic scale exists."""
+    """Return whether the problem has an estimated modulus on a logarithmic scale."""
     free = collocation.parameters.free
     return any(is_modulus(item.name) and item.scale == "log" for item in free)
 
@@ -417,11 +418,12 @@ def _misfit(
 
 
 def _residuals(iterate: ExperimentIterate) -> Array:
-    """Return the residuals of all measurements of one experiment, in standard deviations.
+    """Return the residuals (m,) of all measurements of one experiment, in standard deviations;
+    missing values are left out.
 
     Offsets, clocks and tool parameters of sensors have the values that fit best, because nothing
-    else determines them beforehand and the residuals are nearly linear in them; their priors are
-    included.
+    else determines them beforehand and the residuals are nearly linear in them; their m − M priors
+    follow the M measurements.
     """
     residuals = []
     slopes = []
@@ -504,7 +506,9 @@ class TrialSimulation:
 
     @cached_property
     def rigid_misfit(self) -> float:
-        """Misfit of an undeformed body that moves with the grasp, in standard deviations."""
+        """Misfit of an undeformed body that moves with the grasp in the first part of the
+        recordings, in standard deviations; every parameter must have a guess.
+        """
         positions = []
         for segment, rows in zip(
             self.collocation.transcriptions, self.rows, strict=True
@@ -553,16 +557,16 @@ class TrialSimulation:
         return self._evaluate(p, positions), positions
 
     def is_simulable(self, young_pa: float) -> bool:
-        """Return whether the complete recordings can be simulated at a Young's modulus [Pa]; if
-        not, the error is stored in `failure`.
+        """Simulate the complete recordings at a Young's modulus [Pa], and return whether that
+        succeeds; if not, the error is stored in `failure`.
         """
         _, failure = self._simulate(self._p(young_pa), None, rows=self.all_rows)
         self.failure = failure or self.failure
         return failure is None
 
     def parameter_key(self, young_pa: float) -> tuple[float, ...]:
-        """Return the parameters at a Young's modulus; moduli beyond all bounds have the
-        same key.
+        """Return the parameters p, in the solver's coordinates, at a Young's modulus [Pa] as a
+        tuple, by which trials are compared; moduli beyond all bounds have the same key.
         """
         return tuple(self._p(young_pa).tolist())
 
@@ -638,8 +642,8 @@ class ScanState:
         self.is_ended_early = False
 
     def try_sequence(self, young_pa: Sequence[float]) -> None:
-        """Try Young's moduli in the given order [Pa] until `CONSECUTIVE_FAILURES` in a row fail or
-        fit badly; then `is_ended_early` is set. Their misfits are stored.
+        """Try Young's moduli in the given order [Pa], at least one, until `CONSECUTIVE_FAILURES` in
+        a row fail or fit badly; then `is_ended_early` is set. Their misfits are stored.
 
         Failures before the first simulation that succeeds do not count. Of neighbours that give the
         same parameters only one is tried.
@@ -691,7 +695,8 @@ class ScanState:
     def is_best_at_end(self, softest: bool) -> bool:
         """Return whether the best modulus is the softest (or else the stiffest) that was tried.
 
-        False for the softest end if the scan ended before it.
+        False if no modulus could be simulated, and for the softest end if the scan ended before it.
+        `softest` selects the end.
         """
         finite_misfits = {
             young: m for young, m in self.misfits.items() if np.isfinite(m)

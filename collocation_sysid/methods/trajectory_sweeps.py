@@ -98,7 +98,7 @@ class SweepReport(FitSummary):
     indefinite_steps : int
         Number of time steps whose matrix is not positive definite.
     times_s : tuple of three floats
-        Times for `Stopwatch.add` [s].
+        Times of building, evaluations and linear algebra, as for `Stopwatch.add` [s].
     """
 
     fit: SquareRootInformation
@@ -154,7 +154,7 @@ class SimulationResult:
     failure : SimulationError or None
         Reason why the simulation ended early; None if it is complete.
     times_s : tuple of three floats
-        Times for `Stopwatch.add` [s].
+        Times of building, evaluations and linear algebra, as for `Stopwatch.add` [s].
     """
 
     x: Array
@@ -179,7 +179,10 @@ def sweep(
     known_sweep: LinearisedTrajectory | None = None,
     previous: LinearisedTrajectory | None = None,
 ) -> LinearisedTrajectory:
-    """Return the result of one sweep at parameters p and given positions.
+    """Return the result of one sweep at parameters p and given positions: the feasibility step, the
+    sensitivities, and the measurement residuals linearised after that step.
+
+    A sweep solves the linearised equations of motion once, forward in time.
 
     Parameters
     ----------
@@ -190,11 +193,11 @@ def sweep(
     p : (k,) array
         Parameters (q, φ) of the experiment.
     trajectory : LinearisedTrajectory, SimulationResult or (rows, 3n) array
-        Positions [m].
+        Positions [m], with as many rows as the solver.
     known_sweep : LinearisedTrajectory, optional
         Sweep of the first rows at the same p and positions, which is continued.
     previous : LinearisedTrajectory, optional
-        Previous trajectory, from which changes are measured.
+        Previous trajectory, from which changes are measured; without one they are zero.
 
     Raises
     ------
@@ -316,7 +319,8 @@ def extrapolate(
     step: Array,
 ) -> Array:
     """Return positions (rows, 3n) [m] after the feasibility step of `sweep_result` and a step (k,)
-    of the experiment's parameters, to first order.
+    of the experiment's parameters, to first order. The sweep is that of the `transcription`; it is
+    not modified.
     """
     return (
         sweep_result.x
@@ -347,7 +351,7 @@ def simulate_rows(
     known_rows : LinearisedTrajectory, SimulationResult, (m, 3n) array or None
         First rows, which are continued; None for none.
     guess : LinearisedTrajectory or None
-        Trajectory at other parameters, near which equilibria are searched first.
+        Trajectory at other parameters, near which equilibria are searched first; None for none.
     """
     part = _iterate(
         transcription,
@@ -370,8 +374,8 @@ def simulate_rows(
 
 
 def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
-    """Return the fit of positions x (rows, 3n) [m] at the experiment's parameters p (k,), with
-    residuals of the equations of motion evaluated at x.
+    """Return the fit of an array of positions x (rows, 3n) [m] to the markers at the experiment's
+    parameters p (k,), with residuals of the equations of motion evaluated at x.
     """
     part = _iterate(transcription, p, x=x)
     return FitSummary.from_iterate(
@@ -407,7 +411,7 @@ def _linearised_trajectory(
         Previous trajectory; for None the change of positions and `previous_slopes_residual` are
         zero.
     times_s : tuple of three floats
-        Times for `Stopwatch.add` [s].
+        Times of building, evaluations and linear algebra, as for `Stopwatch.add` [s].
     """
     response = ObservableResponse.from_array(
         iterate, swept.by_p, swept.grasp_forces, step=swept.step

@@ -102,13 +102,13 @@ def read_only_nodes(
     indices = np.asarray(values)
     if indices.size and not np.issubdtype(indices.dtype, np.integer):
         raise InputError(
-            f"{name} must hold node numbers (integers), not {indices.dtype}"
+            f"{name} must hold node indices, whole numbers from 0, not {indices.dtype}"
         )
     _require_shape(indices.shape, shape, name=name)
     nodes = indices.astype(np.int64)
     if nodes.size and nodes.min() < 0:
         raise InputError(
-            f"{name} must hold node numbers from 0 upwards, not {nodes.min()}"
+            f"{name} must hold node indices from 0 upwards, not {nodes.min()}"
         )
     nodes.setflags(write=False)
     return nodes

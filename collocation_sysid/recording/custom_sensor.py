@@ -172,7 +172,7 @@ class Gauge:
             )
         if not np.isfinite(values).any():
             raise InputError(
-                f"{where} has no sample; remove it, or check its file"
+                f"all values of {where} are missing; remove it, or check its file"
             )
         if values.shape[1] != count:
             raise InputError(

@@ -61,7 +61,7 @@ class Grasp:
         Standard deviation of the noise in each rotation, about each axis [rad]; estimated from the
         roughness of the poses by default.
     selection : Selection, optional
-        The selection that the nodes come from; None for node numbers. On a finer mesh it is
+        The selection that the nodes come from; None for node indices. On a finer mesh it is
         evaluated again.
     axes : str
         Axes of the world along which the nodes are prescribed; they slide along the others.

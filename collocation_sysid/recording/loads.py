@@ -158,7 +158,7 @@ class Load:
 
     def on_body(self, body: Body) -> Self:
         """Return the load with its selection replaced by the selected nodes of a body; self if it
-        has node numbers already.
+        has node indices already.
         """
         nodes = select_on_body(self.nodes, body)
         return self if nodes is self.nodes else replace(self, nodes=nodes)
@@ -182,7 +182,7 @@ class PointMass(Load):
         Time at which the mass leaves the body [s], with the same uncertainty; after the recording
         by default.
     selection : Selection, optional
-        The selection that the nodes come from; None for node numbers. On a finer mesh it is
+        The selection that the nodes come from; None for node indices. On a finer mesh it is
         evaluated again.
     """
 
@@ -225,7 +225,7 @@ class Force(Load):
     t_s : (m,) array, optional
         Times of the rows of `force_n`, where it is not constant; it is zero outside them.
     selection : Selection, optional
-        The selection that the nodes come from; None for node numbers. On a finer mesh it is
+        The selection that the nodes come from; None for node indices. On a finer mesh it is
         evaluated again.
     from_s : float
         Time at which the force begins [s], with the uncertainty nuisance.joining; before the

@@ -1,4 +1,4 @@
-"""Selections of mesh nodes: node numbers, geometric selections, or tables in a problem file."""
+"""Selections of mesh nodes: node indices, geometric selections, or tables in a problem file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class NodesSection(Section):
     ball_m : list, optional
         Centre and radius [[x, y, z], radius].
     indices : list of int, optional
-        List of node numbers as in the mesh file, counted from 0.
+        List of node indices as in the mesh file, counted from 0.
     face : str, optional
         top or bottom: nodes with the highest or lowest z of the body; side_x or side_y: nodes with
         its lowest x or y that are on neither.
@@ -85,7 +85,7 @@ def selection_from_section(section: NodesSection | str) -> Selection:
 
 
 def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
-    """Return a converter to sorted distinct node numbers; a `Selection` is returned unchanged.
+    """Return a converter to sorted distinct node indices; a `Selection` is returned unchanged.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
     """
 
     def chosen(selection: Any) -> Any:
-        """Return sorted distinct read-only node numbers, or a `Selection` unchanged."""
+        """Return sorted distinct read-only node indices, or a `Selection` unchanged."""
         if isinstance(selection, Selection):
             return selection
         nodes = np.unique(
@@ -116,7 +116,7 @@ def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
 
 
 def select_on_body(nodes: Index | Selection, body: Body) -> Index:
-    """Return the nodes of a body that a selection selects, sorted; node numbers are returned
+    """Return the nodes of a body that a selection selects, sorted; node indices are returned
     unchanged, without a check.
 
     Raises

@@ -894,7 +894,8 @@ class Nuisance:
             _check_custom_kind(row)
             if [each.name for each in self.kinds].count(row.name) > 1:
                 raise InputError(
-                    f"two nuisance parameters are named {row.name!r}"
+                    f"two nuisance parameters are named {row.name!r}; expected a name that no "
+                    "other kind has, custom or built-in"
                 )
         for row in self.kinds:
             value = self.sigma(row)

@@ -291,7 +291,8 @@ class Cuboid(Solid):
         """Raise an `InputError` unless the first corner is lower than the second along all axes."""
         if not (self.corners_m[0] < self.corners_m[1]).all():
             raise InputError(
-                "the corners of a box have to be its lowest, then its highest"
+                f"a box has the corners {self.corners_m.tolist()}; expected the lower one first, "
+                "below the other along every axis"
             )
 
     @property

@@ -29,7 +29,7 @@ PLANE_TOLERANCE = 1e-9
 
 
 def _checked_faces(faces: Selection | ArrayLike) -> Selection | Index:
-    """Return a selection unchanged, or a copy of node numbers (F, 3) of triangles; an `InputError`
+    """Return a selection unchanged, or a copy of node indices (F, 3) of triangles; an `InputError`
     for anything else.
     """
     if isinstance(faces, Selection):
@@ -38,7 +38,7 @@ def _checked_faces(faces: Selection | ArrayLike) -> Selection | Index:
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
         raise InputError(
             f"faces of a pressure are {faces.dtype} {faces.shape}; expected a selection or a "
-            "(F, 3) array of node numbers"
+            "(F, 3) array of node indices from 0"
         )
     return faces
 
@@ -114,7 +114,7 @@ class Pressure(Actuator[EnclosedVolume]):
         Raises
         ------
         InputError
-            If a selection has no faces, a face given by node numbers is not on the boundary, or
+            If a selection has no faces, a face given by node indices is not on the boundary, or
             closed faces enclose the body instead of a cavity.
         """
         mesh = body.mesh
@@ -144,8 +144,8 @@ class Pressure(Actuator[EnclosedVolume]):
         """Return the pressure on the body `finer`, whose mesh is that of `body` with every element
         split in eight; without `body_measure`, which an experiment sets.
 
-        A selection by position or name stays as it is. Faces given as node numbers, (F, 3) or as
-        `Indices`, become the four triangles of each, (4F, 3) node numbers of `finer`.
+        A selection by position or name stays as it is. Faces given as node indices, (F, 3) or as
+        `Indices`, become the four triangles of each, (4F, 3) node indices of `finer`.
 
         Raises
         ------

@@ -107,7 +107,8 @@ def animate(
     ------
     InputError
         If `run` is not a run folder or has no such experiment, for another kind of file, if ffmpeg
-        is missing, for numbers out of range, and if the film would have too many frames.
+        is missing, if `fps` or `slowdown` is not above zero, if the film would have too many
+        frames, and if the file cannot be written.
     """
     for name, value in (("--fps", fps), ("--slow", slowdown)):
         if not 0 < value < np.inf:
@@ -153,9 +154,9 @@ def film(
     Parameters
     ----------
     replay : MotionRecord
-        Experiment with at least one trajectory.
+        Experiment with at least one trajectory, see `FilmFigure`.
     file : Path
-        Ends in .mp4 or .gif.
+        Ends in .mp4 or .gif; KeyError for another ending. Missing parent folders are made.
     fps, slowdown, progress
         See `animate`. A static experiment is shown with `STATIC_SAMPLES_PER_SECOND` samples per
         second.
@@ -167,7 +168,8 @@ def film(
     Raises
     ------
     InputError
-        If ffmpeg is missing for .mp4, or the film would have too many frames.
+        If ffmpeg is missing for .mp4, the film would have too many frames, or the file cannot be
+        written.
     """
     picture = FilmFigure(replay, names, headline=headline)
     t_s = replay.t_s
@@ -282,7 +284,8 @@ class FilmFigure:
     Parameters
     ----------
     replay : MotionRecord
-        Experiment with at least one trajectory.
+        Experiment with at least one trajectory of nodes and markers; the first of these, the fitted
+        one if there is one, must be finite at one sample at least.
     names : (str, str)
         Labels of the fitted and of the simulated trajectory.
     headline : str
@@ -506,7 +509,9 @@ class FilmFigure:
         )
 
     def show_sample(self, sample: int) -> None:
-        """Change the figure to the sample with index `sample`."""
+        """Change the figure in place to the sample with index `sample`: bodies, markers, distances
+        in the titles, time, and the line in the panel of errors.
+        """
         replay = self.replay
         measured = replay.measured_m[sample]
         for drawn in self.drawings:
@@ -575,16 +580,16 @@ def _points_to_show_m(
 
 
 def _with_even_pixels(height_mm: float) -> float:
-    """Return the next larger height [mm] that is an even number of pixels in a film, as H.264
-    needs.
+    """Return the least height [mm], not below `height_mm`, that is an even number of pixels in an
+    MP4 film, as H.264 needs.
     """
     per_mm = PIXELS_WIDE[".mp4"] / FILM_WIDTH_MM
     return float(2 * np.ceil(height_mm * per_mm / 2) / per_mm)
 
 
 def _frame_writer(fps: float, ffmpeg: str | None) -> AbstractMovieWriter:
-    """Return the writer of frames: for GIF if `ffmpeg` is None, else for H.264 by that program;
-    `fps` is the number of frames per second.
+    """Return the writer of frames with `fps` frames per second: for GIF if `ffmpeg` is None, else
+    for H.264; the path of ffmpeg has to be in matplotlib's ``animation.ffmpeg_path`` then.
     """
     if ffmpeg is None:
         return PillowWriter(fps=fps)  # type: ignore[arg-type]

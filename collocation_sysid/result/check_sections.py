@@ -29,7 +29,9 @@ SHOWN_RECORDINGS = 4
 
 
 def quick_check_tables(quick_check: QuickCheck) -> list[Shown]:
-    """Return a table for each body and one of the measurements, which need no simulation."""
+    """Return a table for each body, also that of specimens without a mesh, then one of the
+    measurements; they need no simulation.
+    """
     return [
         *map(_body_section, quick_check.bodies),
         _measurements_section(quick_check),
@@ -102,7 +104,12 @@ def _point_masses(body: BodyCheck) -> str:
 
 
 def _body_section(body: BodyCheck) -> Table:
-    """Return the table of a body: size, mass, mesh, element quality, rest shape and fields."""
+    """Return the table "Body": size, volume, mass, mesh, element quality, the rest shape unless the
+    mesh is free of stress, and fields.
+
+    For specimens, which have no mesh, it is the table "Specimens" with the names of the experiments
+    alone.
+    """
     if body.is_homogeneous:
         names = ", ".join(f"'{name}'" for name in body.experiments)
         return labelled(

@@ -81,9 +81,10 @@ class DepthProjection:
     def image_points(self, camera_m: Array, world_m: Array) -> Array:
         """Return image coordinates u, v [pixels] and depth [m] of points, as (P, 3).
 
-        For a point cloud, u and v are millimetres to the right and downwards in the parallel view,
-        and the depth is measured from the origin of the world away from the viewer; it may be
-        negative.
+        The depth is along the camera's axis, and the pixels are those of the image without
+        distortion. For a point cloud, u and v are millimetres to the right and downwards in the
+        parallel view, and the depth is measured from the origin of the world away from the viewer;
+        it may be negative.
 
         Parameters
         ----------
@@ -109,8 +110,8 @@ class DepthProjection:
         """Return u and v (5 F, 2) of the edges of the F faces that are turned to the camera, as
         closed lines: for each face its three corners, the first corner again, and a row of NaN.
 
-        Faces that are partly behind a camera with an image are left out. Units are those of
-        `image_points`.
+        They are pixels of the image without distortion, and for a point cloud millimetres in the
+        parallel view. Faces that are partly behind a camera with an image are left out.
 
         Parameters
         ----------
@@ -152,9 +153,9 @@ class DepthProjection:
         sample : int
             Index of the camera's sample.
         points_m, rays : (P, 3)
-            Points and viewing directions in the camera's frame.
+            Points [m] and viewing directions in the camera's frame.
         distances_m : (P,)
-            Distance behind the surface; NaN for points that do not count.
+            Distance behind the surface [m]; NaN for points that do not count.
         """
         world = self.view.to_world(self.phi, points_m, rays=rays, image=sample)
         t_s = np.full(len(points_m), self.view.depth.sample_times_s[sample])
@@ -238,8 +239,9 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
     """Return the first image of each depth camera with the undeformed body, before anything is
     fitted.
 
-    The arrays (k, 8) have the rows of `MotionRecord.visible_points`, by name of the camera; the
-    body is where the grasps carry it rigidly, and distances from it are NaN.
+    The arrays (k, 8), by name of the camera, have the rows of `MotionRecord.visible_points`; empty
+    without depth cameras. The body is where the grasps carry it rigidly, and distances from it are
+    NaN. The first image is the first one that has points.
     """
     nuisance = NuisanceMap.from_experiment(experiment)
     by_camera = {}

@@ -122,8 +122,8 @@ class ElementFields:
 
 
 def field_kernel(element: Element, law: PointLaw) -> ElementKernel:
-    """Return the compiled fields of `FIELD_NAMES` at a quadrature point times its volume; see
-    `ElementKernel` for the inputs.
+    """Return the compiled function "fields", the values of `FIELD_NAMES` in this order at a
+    quadrature point times its undeformed volume; see `ElementKernel` for the inputs.
     """
     point = quadrature_point(element, law, "x")
     fields = ca.vertcat(*_point_fields(law, point.local_constants))

@@ -47,9 +47,9 @@ def export_page(
     run : str or Path
         A run folder.
     file : str or Path
-        HTML file to write.
+        HTML file to write; missing parent folders are made.
     experiment : str, optional
-        Name of the experiment; the first with a trajectory by default.
+        Name of the experiment; by default the first with a trajectory, fitted or simulated.
     field : str, optional
         Point or cell data of the frames that colour the fitted body, or the quantities of faces
         "pressures_pa" or "gaps_m", which experiments for validation have, too; by default the
@@ -58,7 +58,9 @@ def export_page(
     Raises
     ------
     InputError
-        If `run` is not a run folder, or has no such experiment or field.
+        If `run` is not a run folder or a damaged one, has no such experiment or field, or the file
+        cannot be written; and if the `field` needs frames and the experiment has none, as one for
+        validation.
     """
     result, replays = read_run(run)
     replay = experiment_named(replays, experiment, run=run)
@@ -92,7 +94,7 @@ def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
     Raises
     ------
     InputError
-        If the frames have no such field, or there are none.
+        If the frames have no such field, are damaged, or there are none.
     """
     if (
         field in SURFACE_FIELDS
@@ -135,15 +137,16 @@ def view_run(
     field : str
         Point or cell data of the frames that colour the body.
     experiment : str, optional
-        Name of the experiment; the first by default.
+        Name of a fitted experiment; by default the first with a trajectory.
     screenshot : str or Path, optional
-        Draw the middle of the motion into this file instead, without a window.
+        Picture file, with an ending such as .png, into which the middle frame is drawn instead,
+        without a window; an existing file is replaced.
 
     Raises
     ------
     InputError
-        If pyvista is missing, `run` is not a run folder, or it has no frames, no such experiment or
-        no such field.
+        If pyvista is missing, `run` is not a run folder or a damaged one, or it has no such
+        experiment, no frames of it, or no such field.
     """
     if find_spec("pyvista") is None:
         raise InputError(

@@ -192,12 +192,15 @@ class ParameterSliders:
     ) -> ParameterSliders:
         """Return the sliders of a run, see `Run.interactive`; the first simulation is made at once.
 
+        If that fails, `simulation` is None and the message says why.
+
         Parameters
         ----------
         run : SolvedProblem
             Run with at least one estimated parameter.
         experiment : str, optional
-            Name of the recording; the first of the problem by default.
+            Name of the recording, which may be one for validation; the first of the problem by
+            default.
 
         Raises
         ------
@@ -345,7 +348,9 @@ class ParameterSliders:
         return self._shapes_figure(simulation)
 
     def _shapes_figure(self, simulation: ForwardSimulation) -> Figure:
-        """Return the picture of the simulated shapes."""
+        """Return the picture of the simulated shapes of the body at several times, with the
+        measured markers.
+        """
         from .pictures.shapes import shapes_picture
         from .replay import MotionRecord
 

@@ -73,9 +73,10 @@ def probe_section(result: Result) -> TitledParts:
 
 
 def probe_lines(result: Result) -> list[str | Table]:
-    """Return the conclusions of the probes for a terminal.
+    """Return the table of the probes, how to read it, and their conclusions, for a terminal.
 
-    After routine probes without a significant result the table is left out; empty without probes.
+    After the probes of every solve alone, without a significant result, only the conclusions are
+    returned. Empty without probes.
     """
     if is_routine(result) and not any(
         probe.sentences for probe in result.probes
@@ -98,7 +99,9 @@ def _size_and_gain(probe: Probe) -> str:
 
 
 def is_routine(result: Result) -> bool:
-    """Return whether only the probes of every solve were made, not those of a deeper check."""
+    """Return whether only the probes of every solve were made, not those of a deeper check; true if
+    there are no probes.
+    """
     return all(probe.routine for probe in result.probes)
 
 
@@ -208,7 +211,9 @@ def _conclusions(result: Result) -> Iterator[str]:
 
 
 def _named_change(probe: Probe, result: Result, name: str) -> str:
-    """Return the change of the estimate `name` in a refit, with its symbol; the refit must have it."""
+    """Return the symbol of the estimate `name` and its change in a refit, as text such as
+    "λ +1.20 %"; KeyError if the refit or the result does not have it.
+    """
     return f"{symbol_of(name)} {_change_text(probe.moves[name], result.values[name].value)}"
 
 

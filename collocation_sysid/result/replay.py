@@ -142,10 +142,10 @@ class MotionRecord:
         For each spatially varying constant: the estimate, the ends of its 95 % interval, and its
         posterior over its prior standard deviation; NaN in elements of other regions.
     visible_points : mapping of name to (k, 8)
-        For each depth camera, rows of points: time [s], image coordinates u and v, depth [m],
-        distance behind the surface [m] (NaN for points that do not count), and position in the
-        world [m]. For some samples, rows of outlines follow: time, u, v, and NaN else; a row
-        without u and v ends each face.
+        For each depth camera, rows of points: time [s], image coordinates u and v (pixels, or mm
+        for a point cloud), depth [m], distance behind the surface [m] (NaN for points that do not
+        count), and position in the world [m]. For some samples, rows of outlines follow: time, u,
+        v, and NaN else; a row without u and v ends each face.
     reading_units : mapping of name to str
         Units of the custom sensors that state one.
     strain : (T,), or None
@@ -202,8 +202,8 @@ class MotionRecord:
         experiment : Experiment
             Recording with the measured markers.
         fitted, simulated : ((T, n, 3), (T, M, 3)), optional
-            Positions of nodes and markers [m], of the fit and of the forward simulation; None if
-            there is none.
+            Positions of nodes and markers [m], of the fit and of the forward simulation, whose
+            nodes may be followed by those of obstacles; None if there is none.
         natural_hz : (k,), optional
             Natural frequencies [Hz].
         places_m : (M, 3), optional
@@ -271,8 +271,9 @@ class MotionRecord:
         """Return the points (P, 3) [m] of all depth cameras at the time of the sample with index
         `sample`.
 
-        Of each camera, the image nearest in time counts if it is at most half a timestep away;
-        without one the camera adds no points.
+        Of each camera, the image nearest in time counts if it is at most half of the largest
+        distance between samples away; without one the camera adds no points, and P may be 0.
+        Points that do not count are left out.
         """
         tolerance_s = (
             float(np.diff(self.t_s).max(initial=0.0)) / 2 + TIME_TOLERANCE_S
@@ -350,7 +351,9 @@ class MotionRecord:
         """Return the experiment called `name` from the arrays of a run, see
         `MotionRecord.to_arrays`.
 
-        Names begin with `name` and a slash, or have no prefix if there are no such names.
+        The names of the arrays begin with `name` and a slash, or have no prefix if there is no
+        `name`/t_s. Those of the body (`BODY_ARRAYS`), which experiments of a run share, have no
+        prefix either, unless the experiment has its own, as a specimen. Other arrays are ignored.
 
         Raises
         ------
@@ -424,7 +427,9 @@ def _obstacle_outlines(experiment: Experiment) -> Array | None:
 
 
 def _join_polylines(lines_m: Sequence[Array]) -> Array | None:
-    """Join polylines (P, 3) into one array (p, 3), NaN after each; None without lines."""
+    """Return polylines (P, 3), with any number of points P each, joined into one array (p, 3) with
+    a row of NaN after each; None without lines.
+    """
     if not lines_m:
         return None
     return np.concatenate(
@@ -448,6 +453,8 @@ def nodes_of_faces(
     Returns
     -------
     (F, 3) or (F, 6) array
+        The columns of `faces`, and for cells of ten nodes the nodes at the middles of the three
+        sides, in the order of the edges of the cell.
     """
     if cells.shape[1] != 10:
         return faces
@@ -459,8 +466,9 @@ def nodes_of_faces(
 def _require_shapes(arrays: Mapping[str, Any]) -> None:
     """Raise a `ValueError` if sizes, types or values of arrays from a file are inconsistent.
 
-    `arrays` are by name as in `ARRAY_LAYOUT`, where None means that an array is missing, and by the
-    groups of `GROUP_PREFIXES`.
+    `arrays` are by name as in `ARRAY_LAYOUT`, where None means that an optional array is missing;
+    those that every `MotionRecord` has must be present. Under each group of `GROUP_PREFIXES` is a
+    mapping of name to array, which may be empty.
     """
     sizes: dict[str, int] = {}
     for key, (kinds, letters) in ARRAY_LAYOUT.items():
@@ -522,7 +530,7 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
 
 
 def read_run(folder: str | Path) -> tuple[Result, list[MotionRecord]]:
-    """Read the result and the motion of all experiments from a run folder.
+    """Return the result and the motion of all experiments, as stored in a run folder.
 
     The fitted experiments come first, then those for validation that could be simulated.
 
@@ -568,7 +576,7 @@ def read_arrays(run: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     InputError
-        If the folder has no file of arrays.
+        If the folder has no file of arrays, or this is a link to elsewhere or no regular file.
     ValueError
         If the file is damaged.
     """

@@ -71,7 +71,9 @@ class StudySummary:
 
 
 def comparison_report(folder: str | Path) -> TitledParts:
-    """Return the report of the folder of a study.
+    """Return the report of the folder of a study, which compare-methods, compare-models or sweep
+    wrote: headline, notes, tables, runs without a result, and the pictures that this program wrote
+    there.
 
     Raises
     ------

@@ -44,24 +44,27 @@ def write_run(
     """Write the folder of a run completely or not at all, then its pictures, and return the folder.
 
     The folder gets ``result.json``, ``problem.toml`` as it was run if the problem has a file,
-    ``trajectory.npz``, and ``frames/`` with ``trajectory.pvd`` for ParaView. With several
-    experiments, the name of the experiment precedes the names of arrays and the folders of
-    frames. `draw_run` adds the pictures after the folder is in its place, so that an error while
-    drawing does not lose the result.
+    ``refinement.json`` if the discretisation error was measured, ``trajectory.npz``, and
+    ``frames/`` with ``trajectory.pvd`` for ParaView. With several fitted experiments, the name of
+    the experiment precedes the names of its arrays, and each has a subfolder with its frames;
+    arrays of an experiment for validation always have its name. `draw_run` adds
+    the pictures after the folder is in its place, so that an error while drawing does not lose the
+    result.
 
     Parameters
     ----------
     solved : SolvedProblem
         The solved problem.
     folder : str or Path
-        An earlier, unchanged run at this place is replaced.
+        Made with its parents if missing; an earlier, unchanged run at this place is replaced.
     frames, pictures : bool
         Whether to write ParaView frames, and pictures.
 
     Raises
     ------
     InputError
-        If the folder holds anything but an earlier run; see `replaced_folder`.
+        If the folder holds anything but an earlier run, see `replaced_folder`, or a file or
+        picture cannot be written.
     """
     result = build_result(solved)
     with replaced_folder(folder) as place:
@@ -196,6 +199,8 @@ def write_all_frames(finished: SolvedProblem, place: Path) -> None:
     exist.
 
     With several fitted experiments each has a subfolder of its name, which is made if missing.
+    Besides the data of `write_frames` and `_constant_cell_data`, the frames have the residuals of
+    the equations of motion, "residual_force_n" [N], which are zero at prescribed dofs.
     """
     for part in finished.solution.parts:
         segment = part.segment
@@ -230,8 +235,9 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
     """Return each experiment with its measured, fitted and simulated motion, for pictures and
     files.
 
-    The fitted experiments come first, then those for validation. A validation experiment whose
-    forward simulation failed is left out.
+    The fitted experiments come first, then those for validation; specimens are included. A
+    validation experiment whose forward simulation failed is left out; a fitted one whose forward
+    simulation failed has no simulated motion.
     """
     fitted = {}
     collected = []
@@ -288,8 +294,8 @@ def _depth_rows(
 ) -> dict[str, Array]:
     """Return the points of each depth camera on the fitted surface, or else on the simulated one.
 
-    The arrays are as in `MotionRecord.visible_points`, by name of the camera; empty where neither
-    surface is known.
+    The arrays (k, 8), by name of the camera, have the rows of `MotionRecord.visible_points`. The
+    mapping is empty where neither surface is known, or without depth cameras.
     """
     part = finished.solution.part_of(experiment.name)
     rollout = finished.rollouts[experiment.name]
@@ -325,7 +331,8 @@ def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
 
 def _marker_places_m(finished: SolvedProblem, experiment: str) -> Array | None:
     """Return the estimated places (M, 3) [m] of the markers of an experiment on the undeformed
-    body; None for a validation experiment whose forward simulation failed.
+    body, in the order of its marker names; None for a validation experiment whose forward
+    simulation failed.
     """
     if experiment in finished.places:
         places = [

@@ -69,8 +69,8 @@ def refine_run(
     Raises
     ------
     InputError
-        If the folder holds no converged run of a problem file, files of the problem are missing, or
-        a finer problem cannot be solved.
+        If the folder holds no converged run of a problem file, files of the problem are missing,
+        `levels` is out of range, or a finer problem cannot be solved.
     KeyboardInterrupt
         After an interrupt; the levels that were finished are in the folder.
     """
@@ -117,7 +117,11 @@ def refine_run(
 def with_refinement(
     before: Result, refinement: Refinement, parameters: Parameters
 ) -> Result:
-    """Return a result with the measured discretisation error in place of the estimated one.
+    """Return a result with the measured discretisation error in place of the estimated one; nothing
+    is written.
+
+    Values, intervals and budget of the estimates whose error was measured are updated, and so is
+    the verdict with its concerns; other estimates are unchanged.
 
     Parameters
     ----------

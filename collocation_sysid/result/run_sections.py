@@ -138,8 +138,8 @@ def run_summary(
 
 
 def estimate_sections(result: Result) -> list[Shown]:
-    """Return the verdict, the recommended remedies, and the table of parameters with their
-    intervals.
+    """Return the verdict, the command that explains its remedies, the advice of a deeper check
+    where that is worthwhile, and the table of parameters with their intervals.
     """
     sections = [
         verdict_section(result.trust),
@@ -150,7 +150,8 @@ def estimate_sections(result: Result) -> list[Shown]:
 
 
 def run_report(run: str | Path) -> TitledParts:
-    """Return the complete report of a run folder, with its pictures.
+    """Return the complete report of a run folder, with the pictures that this program wrote there;
+    nothing is written.
 
     Raises
     ------
@@ -420,11 +421,13 @@ def budget_table(result: Result) -> Table:
 
 
 def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
-    """Return the cells of an estimate after its name: value, combined uncertainty and interval,
-    statistical and systematic uncertainty, guess, and a remark.
+    """Return the seven cells of an estimate after its name: value, combined standard uncertainty
+    and interval, statistical and systematic standard uncertainty, guess, and a remark.
 
-    Unknown numbers are empty. Instead of an interval the cell says whether the parameter is at its
-    bound or not determined, and instead of a guess whether it is fixed or tied.
+    Numbers are in the unit of the name and without it; unknown ones are empty. Instead of an
+    interval the cell is "at its bound"; if the estimate has a `reason`, which is the remark, it is
+    "not identifiable", or "not determined" without a statistical interval. Instead of the guess of
+    a fixed or tied parameter the cell is "fixed" or "tied".
     """
     each = result.values[name]
     interval = _interval_text(each.combined95)
@@ -541,7 +544,9 @@ def _fit_section(result: Result) -> TitledParts:
 
 
 def _elapsed_text(elapsed: Elapsed) -> str:
-    """Return how long each part of a run took; pictures that were not drawn are left out."""
+    """Return the times of search, checks and pictures as text, such as "search 1.2 s, checks
+    3.4 s"; pictures that were not drawn are left out.
+    """
     parts = {
         "search": elapsed.search,
         "checks": elapsed.checks,
@@ -637,7 +642,7 @@ def _notes_section(result: Result) -> TitledParts:
 
 def _cards(result: Result) -> Cards:
     """Return the three main numbers: the most important stiffness (or else the first estimate), the
-    misfit of the markers, and that of the forward simulation.
+    misfit of the markers, and that of the forward simulation. The result must have an estimate.
     """
     values = result.values
     fit = result.fit
@@ -688,7 +693,9 @@ def _error_bars(result: Result) -> Iterator[Shown]:
 
 
 def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
-    """Yield for each experiment a table of the estimated places of its markers [mm]."""
+    """Yield for each experiment a table of the estimated places of its markers [mm]; an experiment
+    without markers is left out.
+    """
     explanation = (
         "Positions on the undeformed body in millimetres, each with its standard error. "
         "Positions that were not given have a prior as wide as the body."
@@ -726,7 +733,9 @@ def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
 
 
 def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
-    """Yield for each experiment a table of its other nuisance parameters, in mm, ms or degrees."""
+    """Yield for each experiment a table of its other nuisance parameters in readable units such as
+    mm, ms or degrees, see `_size_text`.
+    """
     explanation = (
         "Estimated for this recording alone, together with the parameters; the prior has a mean "
         "of zero."
@@ -746,7 +755,14 @@ def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
 
 def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
     """Yield a table with the diagnosis of each marker's residuals, and a headed table of the
-    largest errors in the folder `run`; a table without rows is left out.
+    largest marker errors in the arrays of the folder `run`; a table without rows is left out.
+
+    Raises
+    ------
+    InputError
+        If the folder has no file of arrays.
+    ValueError
+        If that file is damaged.
     """
     if result.residuals:
         rows = tuple(
@@ -775,12 +791,16 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
     """Return the largest marker residuals of a run folder as (error [m], time [s], marker), largest
     first.
 
-    Of each marker, two listed errors are more than `ERROR_SPACING_SAMPLES` samples apart.
+    At most `SHOWN_ERRORS` are returned; empty without fitted markers. Of each marker, two listed
+    errors are more than `ERROR_SPACING_SAMPLES` samples apart.
 
     Raises
     ------
+    InputError
+        If the folder has no file of arrays.
     ValueError
-        If an array of residuals does not have the size of its times and markers.
+        If that file is damaged, or an array of residuals does not have the size of its times and
+        markers.
     """
     arrays = read_arrays(run)
     worst = []
@@ -849,7 +869,9 @@ def _captioned_pictures(run: Path) -> list[Picture]:
 
 
 def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:
-    """Yield a table of the problem and software versions, and the problem file as it was run."""
+    """Yield a table of the problem and software versions, and the problem file as it was run, if
+    this program wrote one into the folder `run`.
+    """
     rows = content(result.problem) | content(result.provenance)
     listed_rows = (
         (key, each if isinstance(each, list) else [each])
@@ -871,8 +893,8 @@ def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:
 
 
 def _size_text(value: float | None, unit: str) -> str:
-    """Return a value, given in `unit`, in a readable unit, such as millimetres for "m"; "–" for
-    None.
+    """Return a value in `unit` as text in a readable unit, see `in_readable_unit`, such as "1.2 mm"
+    for 0.0012 in "m"; a unit that `in_readable_unit` does not know is kept, and None becomes "–".
     """
     factor, shown = in_readable_unit(1.0, unit)
     # No powers of ten for the sizes of bodies.

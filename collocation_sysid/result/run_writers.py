@@ -45,16 +45,16 @@ def write_vtu(
     point_data: Mapping[str, ArrayLike] | None = None,
     cell_data: Mapping[str, ArrayLike] | None = None,
 ) -> None:
-    """Write an unstructured grid of one cell type as VTK XML with base64 data.
+    """Write an unstructured grid of one cell type as a .vtu file, VTK XML with base64 data.
 
     Parameters
     ----------
     path : str or Path
         File to write; an existing one is replaced.
     points_m : (n, 3)
-        Positions of the points.
+        Positions of the points [m].
     cells : (E, nodes per cell)
-        Point indices of each cell.
+        Point indices of each cell, in the order of meshio for this type.
     meshio_type : {"tetra", "tetra10"}
         Kind of the cells.
     point_data : mapping of name to (n,) or (n, k), optional
@@ -66,6 +66,8 @@ def write_vtu(
     ------
     InputError
         For an unknown cell type, or data of another length.
+    OSError
+        If the file cannot be written, as without its folder.
     """
     import meshio  # which takes a while to import
 
@@ -135,7 +137,13 @@ def write_pvd(
     path : str or Path
         File to write.
     frames : sequence of (float, str or Path)
-        Time [s] and file of each frame; files are stored relative to the folder of `path`.
+        Time [s] and file of each frame; files are stored relative to the folder of `path`, and
+        need not exist yet.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written, as without its folder.
     """
     folder = Path(path).parent.resolve()
     lines = []
@@ -164,7 +172,7 @@ def write_frames(
     cell_data: Mapping[str, ArrayLike] | None = None,
 ) -> Path:
     """Write a trajectory as frames/frame_0000.vtu, … and trajectory.pvd, and return the latter;
-    existing files of these names are replaced.
+    existing files of these names are replaced, and frames with higher numbers stay.
 
     Every frame has `displacement_m` and `velocity_m_s` (finite differences; zero if there is only
     one sample) at the points, and the `fields` in the cells. Of more than `max_frames` samples
@@ -175,28 +183,31 @@ def write_frames(
     folder : str or Path
         An existing folder.
     t_s : (T,)
-        Evenly spaced times [s].
+        Ascending times [s], at least one.
     positions_m : (T, n, 3)
-        Positions of the nodes.
+        Positions of the nodes [m].
     cells : (E, nodes per element)
         Node indices of each element.
     element : Element
         Kind of the elements.
     undeformed_m : (n, 3)
-        Nodes of the undeformed body.
+        Nodes of the undeformed body [m].
     point_series : mapping of name to (T, n) or (T, n, k), optional
         Further data at the points.
     max_frames : int
         Largest number of frames.
     fields : ElementFields, optional
-        Stress, energy density and det F of each element.
-    cell_data : mapping of name to (E,), optional
+        Evaluator of von Mises stress [Pa], energy density [J/m³] and det F of each element; none
+        of these by default.
+    cell_data : mapping of name to (E,) or (E, k), optional
         Further data of the cells, the same in every frame.
 
     Raises
     ------
     InputError
         For point or cell data of another length.
+    OSError
+        If `folder` does not exist, or a file cannot be written.
     """
     times = np.asarray(t_s, dtype=float)
     positions = np.asarray(positions_m, dtype=float)
@@ -268,7 +279,7 @@ def replaced_folder(
     marker_file : str
         Name of a file by which an earlier run is recognised.
     content_word : str
-        Word for the content in messages.
+        Word for the content in messages, such as "run".
 
     Raises
     ------
@@ -363,8 +374,12 @@ def require_replaceable(
     ----------
     target : Path
         Place of the folder.
-    overwrite, marker_file, content_word
-        See `replaced_folder`.
+    overwrite : bool
+        Whether an earlier run passes, if this program wrote every file in it and none was changed.
+    marker_file : str
+        Name of a file by which an earlier run is recognised.
+    content_word : str
+        Word for the content in messages, such as "run".
 
     Raises
     ------
@@ -396,7 +411,8 @@ def require_replaceable(
         )
     if not overwrite:
         raise InputError(
-            "the folder holds an earlier run; choose another, or allow it to be overwritten",
+            f"the folder holds an earlier {content_word}, and overwrite is false; choose another "
+            "folder, or pass overwrite=True",
             target,
         )
     require_only_written(target)

@@ -71,12 +71,13 @@ class Recipe(Options):
     timestep_s : float
         Time step of newmark [s]; by default so small that the motion does not depend on it.
     noise_m : float
-        Standard deviation of the markers' noise.
+        Standard deviation of the noise of each coordinate of a marker [m].
     noise_n : float
         Standard deviation of the noise of measured forces [N]. If a quarter of the specimen is
         modelled (``symmetry = 4``), that of the force on the whole specimen.
     noise_nm : float
-        Standard deviation of the noise of measured torques.
+        Standard deviation of the noise of measured torques [N m]; with ``symmetry``, of the torque
+        on the whole specimen.
     noise_own : float
         Standard deviation of the noise of custom sensors, in multiples of their sigma.
     seed : int
@@ -121,7 +122,10 @@ def write_data(
     recipe: Recipe | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> list[Path]:
-    """Simulate every experiment at the parameters' guesses and write poses, markers and wrenches.
+    """Simulate every experiment at the parameters' guesses and write tables of its measurements,
+    with noise, and of its poses.
+
+    Images of depth cameras are not written.
 
     Parameters
     ----------
@@ -134,8 +138,10 @@ def write_data(
         force sensor, ``<experiment>_reading_<name>.csv`` for custom sensors, and ``<experiment>/``
         with frames if requested. An experiment whose displacements come from a table, as on a test
         bench, gets its tables of displacement and load under their names in the problem file, in
-        place of poses and wrenches. Earlier files of these names that this program wrote are
-        replaced. The list of written files `LIST_FILE` in the folder is made or extended.
+        place of poses and wrenches. A specimen gets one table, of its stresses, under its name in
+        the problem file, or ``<experiment>.csv`` for a problem without a file. Earlier files of
+        these names that this program wrote are replaced. The list of written files `LIST_FILE` in
+        the folder is made or extended.
     recipe : Recipe, optional
         Integrator, noise and seed; without noise by default.
     progress : callable, optional
@@ -248,7 +254,8 @@ def _write_tables(
 
     The measurements are those of markers, force sensors and custom sensors; on a test bench, tables
     of displacement and load replace those of poses and force sensors. A specimen has one table, of
-    its stresses. Images of depth cameras are not written.
+    its stresses. Components that a force sensor does not measure are left out or NaN. Images of
+    depth cameras are not written.
 
     Parameters
     ----------
@@ -263,7 +270,9 @@ def _write_tables(
     rng : Generator
         Source of the noise; its state advances.
     recipe : Recipe
-        Its noise_m, noise_n, noise_nm and noise_own are the standard deviations of the noise.
+        Its noise_m, noise_n and noise_nm are standard deviations, [m], [N] and [N m]; the last two
+        are of the load on the whole specimen if only a part is modelled. Its noise_own is the noise
+        of custom sensors and of a specimen's stresses in multiples of their sigma.
     """
     if experiment.specimen is not None or isinstance(section, SpecimenSection):
         stated = section if isinstance(section, SpecimenSection) else None

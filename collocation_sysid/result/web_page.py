@@ -115,9 +115,10 @@ def write_page(
     Parameters
     ----------
     replay : MotionRecord
-        Experiment with at least one trajectory.
+        Experiment with at least one trajectory, finite at one sample at least.
     file : str or Path
-        HTML file to write; it is replaced only after the page is complete.
+        HTML file to write; it is replaced only after the page is complete, and missing parent
+        folders are made.
     headline : str
         One line with the main result, below the title.
     colouring : Colouring, optional
@@ -128,6 +129,11 @@ def write_page(
     -------
     Path
         The file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
     """
     template = (
         files("collocation_sysid.result")

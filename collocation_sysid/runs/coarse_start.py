@@ -75,7 +75,9 @@ class CoarseStart:
 
     @property
     def edge_ratio(self) -> float:
-        """Smallest ratio of the mean edge lengths of coarse and given mesh."""
+        """Mean edge length of the coarse mesh over that of the given one, the smallest of all
+        coarsened bodies; mostly above 1.
+        """
         return min(
             each.coarse.mesh.quality().edge_mean_m
             / each.body.mesh.quality().edge_mean_m
@@ -114,6 +116,8 @@ class CoarseStart:
     def variables(self, collocation: Collocation, solution: Solution) -> Array:
         """Return variables z (variables,) of the given problem from a coarse solution.
 
+        Nuisance parameters are limited to their bounds.
+
         Parameters
         ----------
         collocation : Collocation
@@ -128,8 +132,11 @@ class CoarseStart:
         return collocation.pack(p, self.interpolated(coarse_positions))
 
     def interpolated(self, coarse_positions: Sequence[Array]) -> list[Array]:
-        """Return positions (N, 3n) [m] of each fitted experiment on the given bodies from those
-        on the coarse ones, (N, 3m).
+        """Return positions (N, 3n) [m] of each fitted experiment on the given bodies from those on
+        the coarse ones, (N, 3m).
+
+        Both lists are in the order of the experiments of `problem`; the positions of experiments
+        whose body is not coarsened are returned themselves.
         """
         names = [each.name for each in self.problem.experiments]
         return [
@@ -139,7 +146,8 @@ class CoarseStart:
 
     def _interpolated(self, experiment: str, x: Array) -> Array:
         """Return positions (N, 3n) of the given body from those of the coarse one (N, 3m); nodes of
-        obstacle frames, which come last, are copied.
+        obstacle frames, which come last, are copied, and positions of an experiment whose body is
+        not coarsened are returned themselves.
         """
         relation = self.relations.get(experiment)
         if relation is None:
@@ -157,8 +165,11 @@ class CoarseStart:
 def plan_coarse_start(
     problem: Problem, method: ReducedSpace
 ) -> CoarseStart | None:
-    """Return the problem on coarser meshes, or None if the method's options or the sizes of the
-    bodies do not call for a coarse start.
+    """Return the fitted experiments of a problem on coarser meshes, or None if the method's options
+    or the sizes of the bodies do not call for a coarse start.
+
+    Validation experiments and notes are left out, and small bodies keep their mesh; the problem is
+    not modified.
 
     Raises
     ------
@@ -241,6 +252,15 @@ def interrupted_solution(
 
     Its history has one entry, the evaluation at that point; no iteration was done on the given
     mesh.
+
+    Parameters
+    ----------
+    start : CoarseStart
+        Relation of the coarse and the given problem.
+    problem : Problem
+        Given problem; not modified.
+    coarse : Solution
+        Solution of `start.problem`, interrupted.
     """
     collocation = start.given_collocation(
         problem, coarse, undetermined=undetermined_names(coarse)
@@ -270,11 +290,14 @@ def interrupted_solution(
 
 
 def undetermined_names(solution: Solution) -> tuple[str, ...]:
-    """Return the names of the estimated parameters that a coarse solution does not determine: those
-    at a bound, and those with a standard error above `LARGEST_STANDARD_ERROR`.
+    """Return the names of the estimated parameters, coefficients of fields included, that a
+    solution does not determine, in their order.
 
-    On a mesh that is too coarse, weakly determined parameters compensate its error: a search from
-    such values would take many steps. One sweep is needed; where it fails, only bounds count.
+    They are those within `BOUND_DISTANCE` of a bound, and those with a statistical standard error
+    above `LARGEST_STANDARD_ERROR` or not finite, both in the coordinates q of the solver, as a rule
+    logarithms. On a mesh that is too coarse, weakly determined parameters compensate its error: a
+    search from such values would take many steps. One sweep is needed; where it fails, only bounds
+    count.
     """
     collocation = solution.collocation
     q = solution.q
@@ -296,6 +319,7 @@ def undetermined_names(solution: Solution) -> tuple[str, ...]:
 def require_determined_moduli(undetermined: Sequence[str]) -> None:
     """Raise `NoCoarseStartError` if a modulus is among the parameters that a coarse solution does
     not determine, see `undetermined_names`: the coarse mesh then does not describe the motion.
+    `undetermined` contains names of parameters, with their regions; nothing is returned.
     """
     for name in undetermined:
         if is_modulus(name):
@@ -305,7 +329,9 @@ def require_determined_moduli(undetermined: Sequence[str]) -> None:
 
 
 def start_note(start: CoarseStart, coarse: Solution, given: Solution) -> str:
-    """Return a note on a coarse start: size, sweeps and time of both solves."""
+    """Return a note on the coarse start `start` with its size, and the number of sweeps and the
+    time [s] of the solutions on the coarse and on the given mesh.
+    """
     return (
         f"coarse start: solved on {start.size} first, with {coarse.iterations} sweeps in "
         f"{coarse.timing.total:.2g} s, then on the given mesh with {given.iterations} sweeps in "
@@ -316,13 +342,20 @@ def start_note(start: CoarseStart, coarse: Solution, given: Solution) -> str:
 def mesh_error_note(
     start: CoarseStart, coarse: Solution, given: Solution
 ) -> str | None:
-    """Return a note with the estimated error of the given mesh in each estimated parameter; None
-    if no parameter is estimated.
+    """Return a note with the estimated error of the given mesh [%] in each estimated scalar
+    parameter; None if none is estimated, or every estimate is zero or has no finite error.
 
     With edge lengths in the ratio r, elements of order 2 leave the r² − 1-th part of the difference
     of both solutions (Richardson's extrapolation, as in `discretisation_error`), in the coordinate
     in which the interval of the parameter is symmetric. The difference includes that of the
     surfaces.
+
+    Parameters
+    ----------
+    start : CoarseStart
+        Relation of the coarse and the given problem, which has the ratio of the edges.
+    coarse, given : Solution
+        Converged solutions on the coarse and on the given mesh.
     """
     before = parameter_values(coarse.collocation, coarse.q)
     after = parameter_values(given.collocation, given.q)

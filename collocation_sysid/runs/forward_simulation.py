@@ -201,16 +201,16 @@ def simulate_with_parameters(
     segment : Transcription
         The recording as it was fitted, see `transcription_and_nuisance`.
     phi : (k,) array
-        Nuisance parameters of the recording.
+        Nuisance parameters of the recording, in units of their prior standard deviations.
     parameters : mapping of name to value
-        All parameters of the problem.
+        All parameters of the problem, in SI units.
     report : callable, optional
         Called with the completed share, from 0 to 1.
 
     Returns
     -------
     ForwardSimulation
-        Without what concerns validation.
+        `nuisance`, `places_m`, `blind_error` and `copy_error` are empty or None.
 
     Raises
     ------
@@ -245,8 +245,8 @@ def _simulate(
     parameters: Mapping[str, float],
     report: Callable[[float], None] | None = None,
 ) -> Trajectory:
-    """Simulate a recording with its nuisance parameters φ (k,), in units of their priors, and the
-    values of the parameters.
+    """Simulate the recording of `segment` with its nuisance parameters `phi` (k,), in units of
+    their prior standard deviations, and the values of the parameters; return the trajectory.
 
     Integrator and step are those of `problem.rollout`: Newmark's scheme by default, and a finer
     step than in the fit. `parameters` are in SI units by name. `report` is called with the
@@ -307,10 +307,11 @@ def transcription_and_nuisance(
     experiment: Experiment, solution: Solution
 ) -> tuple[Transcription, Array]:
     """Return an experiment's transcription and its nuisance parameters φ (k,) in units of their
-    priors; k is 0 without any.
+    prior standard deviations; k is 0 without any.
 
     For a fitted experiment φ is the estimate; for validation φ is fitted to its measurements in
     reduced space, with the material at its estimate. Whether that solve converged is not checked.
+    `experiment` must belong to the problem of `solution`.
 
     Raises
     ------
@@ -402,7 +403,8 @@ def step_error(
 
 def _step_error_share(problem: Problem, segment: Transcription) -> float | None:
     """Return the share of the difference between forward simulation and fit that half the time step
-    would remove, from the orders of both schemes.
+    would remove, from the orders of both schemes: that of the fit of `segment`, and that of the
+    simulation by `problem.rollout`.
 
     None if the simulation is not Newmark's or its step is not at most half as large; 1 for static
     experiments.
@@ -421,8 +423,8 @@ def _step_error_share(problem: Problem, segment: Transcription) -> float | None:
 
 
 def _step_s(problem: Problem, segment: Transcription) -> float:
-    """Return the step of the forward simulation of a recording [s]: the stated one, by default
-    finer than the grid of the fit.
+    """Return the step of the forward simulation of the recording of `segment` [s]: the one of
+    `problem.rollout`, by default finer than the grid of the fit.
 
     The default is the sample interval over four, or over twice the substeps of the fit if these are
     more, unless that makes more than the largest number of steps.

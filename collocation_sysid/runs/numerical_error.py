@@ -75,7 +75,7 @@ def refine(
     Parameters
     ----------
     run : SolvedProblem
-        Run that has converged; not modified.
+        Run that has converged, which is not checked; not modified, apart from cached properties.
     levels : int
         Number of discretisations of each kind, see `solve_refined`.
     report_progress : callable, optional
@@ -200,6 +200,15 @@ def _errors_from_levels(
 ) -> Refinement:
     """Return the numerical errors of the estimates from the levels solved so far, with these
     levels.
+
+    Parameters
+    ----------
+    levels : sequence of RefinementLevel
+        Levels of the step, of the mesh, or of both, in ascending order.
+    problem : Problem
+        Problem that was refined, with its time scheme.
+    estimates : mapping of name to Estimate
+        Estimates at the given discretisation, with their statistical intervals.
     """
     by_step, by_mesh = (
         [each.values for each in levels if each.refined == kind]
@@ -219,7 +228,8 @@ def _errors_from_levels(
 def _solve_refined_problem(
     problem: Problem, start: WarmStart, what: str
 ) -> Solution:
-    """Return the solution of a finer problem in reduced space, starting from an earlier answer.
+    """Return the converged solution of a finer problem in reduced space, starting from the answer
+    `start` on a coarser one.
 
     Raises
     ------
@@ -244,6 +254,9 @@ def _level_summary(
     kind: str, level: int, solution: Solution
 ) -> RefinementLevel:
     """Return size, cost and estimates of a solved level.
+
+    Nodes and time steps are sums over the bodies and the fitted experiments; the values, also of
+    fixed parameters and derived moduli, are physical.
 
     Parameters
     ----------

@@ -79,11 +79,13 @@ def instrument_misfits(
 def nuisance_of_fitted_recordings(
     segment: Transcription, solution: Solution
 ) -> Array:
-    """Return the nuisance parameters (k,) of a recording by those of the fitted recordings.
+    """Return the nuisance parameters φ (k,) of a recording by those of the fitted recordings, in
+    units of their prior standard deviations.
 
-    Each is the mean over the fitted recordings that have one of the same label, such as the place
-    of a marker by its name, and zero, the mean of its prior, where none has: nothing of the
-    recording's own measurements is used.
+    Each is the mean of the physical values in the fitted recordings that have one of the same
+    label, such as the place of a marker by its name, over the recording's own prior standard
+    deviation; it is zero, the mean of its prior, where no fitted recording has one. Nothing of the
+    recording's own measurements is used, and bounds are not regarded.
 
     Parameters
     ----------
@@ -137,12 +139,13 @@ def nearest_recording_error(
     experiment : Experiment
         Recording to predict.
     fitted : iterable of Experiment
-        Fitted recordings.
+        Fitted recordings; may be empty.
 
     Returns
     -------
     CopyError or str
-        A text with the reasons if no fitted recording has the same instruments and times.
+        Name and errors of the nearest recording; a text with the reasons if no fitted recording has
+        the same instruments and times.
     """
     reasons = {}
     copies = []

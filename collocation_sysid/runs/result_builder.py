@@ -50,8 +50,11 @@ from .solved_problem import SolvedProblem
 
 
 def build_result(answer: SolvedProblem) -> Result:
-    """Return the content of ``result.json`` for an answer, which is not modified; properties of the
-    answer that are not known yet, such as the natural modes, are computed.
+    """Return the content of ``result.json`` for an answer.
+
+    Cached properties of the answer that are not known yet, such as the natural modes, are computed
+    and stored; nothing else of it changes, and no file is written. The answer must have an entry in
+    `rollouts` for every experiment of the problem.
     """
     solution = answer.solution
     problem = answer.problem
@@ -261,7 +264,7 @@ def _recordings_agreement(
 
 def _fit_result(answer: SolvedProblem) -> FitResult:
     """Return the residuals of the fit of each experiment and of all together, with expected noise
-    and sentences on nuisance parameters.
+    and sentences on nuisance parameters; cached properties of the answer are computed.
     """
     solution = answer.solution
     experiments = {}
@@ -337,7 +340,7 @@ def _forward_result(
     answer: SolvedProblem, experiment: Experiment
 ) -> SimulatedExperiment:
     """Return the errors of the forward simulation of an experiment; if it failed, only the reason
-    and whether the experiment was fitted.
+    and whether the experiment was fitted. `answer.rollouts` must have an entry for it.
     """
     fitted = experiment.name in answer.solution.rms_by_experiment_m
     simulated = answer.rollouts[experiment.name]
@@ -369,8 +372,11 @@ def _forward_result(
 
 
 def _nuisance(answer: SolvedProblem) -> dict[str, dict[str, NuisanceResult]]:
-    """Return the nuisance parameters with priors and standard errors (None without error bars),
-    without the places of markers, by experiment and label.
+    """Return the nuisance parameters of the fitted experiments, without the places of markers, by
+    experiment and label.
+
+    Values, prior standard deviations and standard errors are in the unit of the label; the standard
+    error is None without error bars. Experiments without such parameters have no entry.
     """
     deviations = (
         answer.uncertainty.nuisance if answer.uncertainty is not None else {}
@@ -472,7 +478,7 @@ def _nuisance_sentence(
     part : ExperimentIterate
         Experiment at the solution.
     components : sequence of int
-        Indices of its components in φ.
+        Indices of its components in φ, at least one; the first gives label, unit and prior.
     values : (k,) array
         Their values in the unit of the row.
     answer : SolvedProblem

@@ -75,6 +75,9 @@ class ReportedEstimate(Estimate):
         """Return the estimate before the correction of the discretisation error: with the value
         `optimum`, and the statistical interval and standard error moved with it.
 
+        Without an interval the standard error is unchanged, and without an `optimum` also the
+        value.
+
         Parameters
         ----------
         name : str

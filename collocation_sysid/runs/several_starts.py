@@ -87,7 +87,8 @@ def follow_starts(
 
     The best start of the scan is returned without a solution if the scan found only one start, if
     the problem has no local minima, if no start converges, or after an interrupt; an interrupted
-    solution is returned with it if the method is reduced space.
+    solution is returned with it if the method is reduced space. Exceptions of `solve` are not
+    caught.
 
     Parameters
     ----------
@@ -100,6 +101,12 @@ def follow_starts(
         Scan with its starts; not modified.
     solve : callable
         ``solve(method, collocation)``, with renewed correspondences.
+
+    Returns
+    -------
+    CompletedStart
+        The best start, with the solution from there if the method is reduced space, and a note
+        on the losses. Its collocation is not associated with the body at the new guess.
     """
     first = CompletedStart(collocation, scan, solution=None, note="")
     if not scan.others or not has_local_minima(collocation):

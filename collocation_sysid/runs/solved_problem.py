@@ -116,7 +116,9 @@ class SolvedProblem:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Every parameter by name, corrected for the known discretisation error."""
+        """Values of all parameters by name in SI units, also fixed ones, corrected for the known
+        discretisation error and known effects.
+        """
         return {
             name: self.estimates[name].value
             for name in self.solution.parameters
@@ -254,8 +256,9 @@ class SolvedProblem:
     def trust(self) -> Assessment:
         """Verdict (good, check or doubtful) with its concerns.
 
-        After an interruption it is doubtful, and contains concerns about the solution only if the
-        error bars were computed.
+        It is computed from estimates, budget and natural modes at the first access. After an
+        interruption it is doubtful, and contains concerns about the solution only if the error bars
+        were computed.
         """
         of_fit = solution_concerns(
             self.solution,
@@ -315,14 +318,19 @@ class SolvedProblem:
 
     @cached_property
     def modes_by_experiment(self) -> dict[str, ModesCheck]:
-        """Natural modes of the body at the estimates, by name of the experiment; without static
-        experiments and those without an equilibrium. Empty if the solve did not converge.
+        """Natural modes of the body at the estimates, by name of the experiment, also of those for
+        validation; see `verdict.modes_by_experiment`.
+
+        Static experiments are left out, and those whose modes cannot be computed. Empty if the
+        solve did not converge.
         """
         return modes_by_experiment(self.problem, self.solution)
 
     @cached_property
     def fields(self) -> dict[str, FieldEstimate]:
-        """Estimated fields (spatially varying constants), by name."""
+        """Estimated fields (spatially varying constants), by name of the constant; empty without
+        fields. Without error bars their standard deviations are NaN.
+        """
         collocation = self.solution.collocation
         q = self.solution.q
         bodies = dict.fromkeys(
@@ -339,12 +347,13 @@ class SolvedProblem:
     @property
     def noise_rms_m(self) -> float:
         """RMS distance [m] of the fitted markers that is expected from noise with the stated
-        `sigma_m`, less what the fitted parameters absorb.
+        `sigma_m`, less what the fitted parameters absorb; 0 without markers.
         """
         return expected_rms_m(self.solution, self.uncertainty)
 
     def interval(self, name: str) -> tuple[float, float]:
-        """Return the combined 95 % interval of a parameter or derived modulus, the one to publish.
+        """Return the combined 95 % interval (lower, upper) of a parameter or derived modulus in its
+        SI unit, the one to publish.
 
         Both ends are NaN if there is none: the solve has not converged, or the parameter was not
         estimated, is at a bound or has no error bar, see `ReportedEstimate`.
@@ -357,7 +366,8 @@ class SolvedProblem:
         return self._estimate(name).combined95 or (np.nan, np.nan)
 
     def std_error(self, name: str) -> float:
-        """Return the combined standard uncertainty of a parameter or derived modulus.
+        """Return the combined standard uncertainty of a parameter or derived modulus, in its SI
+        unit.
 
         NaN under the same conditions as `interval`.
 
@@ -369,12 +379,13 @@ class SolvedProblem:
         return _or_nan(self._estimate(name).combined_std_error)
 
     def nuisance(self, name: str) -> float:
-        """Return the value of a nuisance parameter of a recording, see `Solution.nuisance`.
+        """Return the value of a nuisance parameter of a recording in its unit; `name` is as in
+        `Solution.nuisance`, for example "swing: time shift [s]".
 
         Raises
         ------
         InputError
-            If no parameter, or several with different values, have this name.
+            If no nuisance parameter has this name, or several, even with equal values.
         """
         return self.solution.nuisance(name)
 
@@ -403,7 +414,9 @@ class SolvedProblem:
         return pandas.DataFrame.from_dict(rows, orient="index")
 
     def _row(self, name: str) -> dict[str, float | str]:
-        """Return the row of an estimate in `to_frame`, by column; NaN for unknown numbers."""
+        """Return the row of the estimate `name`, which must exist, in `to_frame`, by column; NaN
+        for unknown numbers.
+        """
         each = self.estimates[name]
         combined = each.combined95 or (np.nan, np.nan)
         statistical = each.statistical95 or (np.nan, np.nan)

@@ -66,8 +66,8 @@ def solve(
     missing or a search from guesses fails; a second one in reduced space, if the first converges
     near ν = ½; with correspondences of measurements that the estimates change; with other
     correlation lengths or phases of fields; and, of a large body, one on a coarser mesh first, see
-    `coarse_start`. `watch` receives the iterations of all of them, and one
-    of them gives the solution. Nothing is written.
+    `coarse_start`. `watch` receives the iterations of all of them, and one of them gives the
+    solution. Nothing is written.
 
     Parameters
     ----------
@@ -97,6 +97,9 @@ def solve(
         found, if the machine lacks memory, for a scheduler that does not answer or a method that
         cannot use it, for two-phase fields that cannot be searched, and when the solver refuses the
         problem.
+    SimulationError
+        If the equations of motion are singular at a solution with a field whose correlation
+        length or phases are searched.
     """
     solver = problem.solver(method)
     if scheduler is not None and not isinstance(solver, ReducedSpace):
@@ -145,6 +148,9 @@ def _solve_with_likeliest_lengths(
     ------
     InputError
         As in `solve_once`, and for two-phase fields that cannot be searched.
+    SimulationError
+        If the equations of motion are singular at a solution with a field whose correlation
+        length or phases are searched.
     """
     if any(not modes.has_phases for modes in problem.two_phase_fields.values()):
         return solve_two_phases(problem, start, solve_once=solve_once)
@@ -183,7 +189,9 @@ def _solve_once(
     one and no earlier solution is given, else as `_solve_directly`, which describes the arguments
     and errors.
 
-    If the coarse start is not possible or fails, the problem is solved directly, with a note.
+    If the coarse start is not possible or fails, the problem is solved directly, with a note. After
+    an interrupt of the coarse solve its point is returned as an interrupted solution, see
+    `interrupted_solution`.
     """
 
     def solve_directly(from_problem: Problem) -> Solution:
@@ -232,7 +240,8 @@ def _solve_on_coarse_mesh(
     workers: ExperimentExecutor | None,
 ) -> Solution:
     """Return the solution on a coarser mesh, with a tolerance of at least `COARSE_TOLERANCE`; also
-    if it did not converge. The arguments are those of `_solve_directly`.
+    if it did not converge. The problem is `coarse_start.problem`, solved from its guesses or a
+    scan; the other arguments are those of `_solve_directly`.
 
     Raises
     ------
@@ -348,6 +357,11 @@ def _solve_directly(
     workers : ExperimentExecutor or None
         Workers for reduced space; None for this process.
 
+    Returns
+    -------
+    Solution
+        Also if the search failed: see its `status`.
+
     Raises
     ------
     InputError
@@ -427,7 +441,9 @@ def _solve_directly(
 
 
 def _feature_notes(solution: Solution) -> list[str]:
-    """Return the notes of all features on the experiments of a solution."""
+    """Return the notes of all features on the fitted experiments of a solution, in their order;
+    empty without any.
+    """
     return [
         note
         for part in solution.parts
@@ -437,9 +453,9 @@ def _feature_notes(solution: Solution) -> list[str]:
 
 
 def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:
-    """Return the reduced-space method with workers that solve its experiments, as a
-    `functools.partial` of it; any other method, and any method if `workers` is None, is returned
-    unchanged.
+    """Return the method `solver` with workers that solve its experiments, as a `functools.partial`
+    of it, if it is the reduced-space method; any other method, and any method if `workers` is None,
+    is returned unchanged.
     """
     if workers is None or not isinstance(solver, ReducedSpace):
         return solver
@@ -486,8 +502,9 @@ def best_of_second_start(
     """Return the better of a solution and of the solution from its `second_start_parameters`, with
     a note if that is the second one.
 
-    Without a second start the first solution is returned; after an interrupt it is returned as
-    interrupted. The history of the first search is not part of the second solution.
+    The second is better if it converges with a loss that is lower by more than `LEAST_GAIN`.
+    Without a second start the first solution is returned; after an interrupt a copy of it with the
+    status of the interrupt. The history of the first search is not part of the second solution.
 
     Parameters
     ----------
@@ -568,8 +585,8 @@ def second_start_parameters(solution: Solution) -> Parameters | None:
     usual one at the same Young's modulus.
 
     A ratio is high above `NEARLY_INCOMPRESSIBLE`. Only ratios of regions count in which both
-    moduli, or the ratio alone, are estimated. None if no ratio is high, or if a replaced value is
-    not within its bounds.
+    moduli, or the ratio alone, are estimated. Other estimated parameters have their estimates as
+    guesses. None if no ratio is high, or if a replaced value is not within its bounds.
     """
     collocation = solution.collocation
     values = parameter_values(solution.collocation, solution.q)

@@ -105,8 +105,8 @@ class _SmoothFitQuality:
     determined: float
 
     def lack_of_fit(self, chi_squared: float) -> float:
-        """Return the temperature T of `statistics.phase_sampling` for an answer with this χ²: its
-        excess over the smooth fit per determined parameter, at least one.
+        """Return the temperature T of `statistics.phase_sampling` for a fit with phases of this χ²:
+        its excess over the smooth fit per determined parameter, at least one.
         """
         return max(
             1.0, (chi_squared - self.chi_squared) / max(1.0, self.determined)
@@ -114,7 +114,9 @@ class _SmoothFitQuality:
 
 
 def _smooth_fit(fit: LinearisedFit) -> _SmoothFitQuality:
-    """Return the quality of the fit with the smooth field, linearised at its solution."""
+    """Return the quality of the fit with the smooth field: its χ² and the number of parameters that
+    it determines, from `fit`, linearised at its solution.
+    """
     return _SmoothFitQuality(
         fit.chi_squared,
         _chi_squared_per_measurement(fit),
@@ -148,6 +150,8 @@ def solve_two_phases(
     ------
     InputError
         For several two-phase fields, or too many elements.
+    SimulationError
+        If the equations of motion are singular at a solution.
     """
     search = _two_phase_search(problem)
     solution = solve_once(
@@ -369,6 +373,11 @@ def _linearise_in_elements(
     search : _PhaseSearch
     solution : Solution
         Solution with a smooth field or with phases.
+
+    Raises
+    ------
+    SimulationError
+        If the equations of motion are singular at a solution.
     """
     body = _two_phase_body(solution, search)
     part = body.parts[search.number]
@@ -465,6 +474,11 @@ def _fit_with_elements(
         Solution that gives positions and all other parameters.
     search : _PhaseSearch
         Names of the elements' logarithms.
+
+    Raises
+    ------
+    SimulationError
+        If the equations of motion are singular at a solution.
     """
     solved = solution.collocation
     elements = set(search.elements)
@@ -541,7 +555,9 @@ def _normal_equations(
 
 
 def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
-    """Return the solution with a body whose two-phase fields have these samples."""
+    """Return a copy of the solution with bodies whose two-phase fields have these samples;
+    variables and associations are the same.
+    """
     collocation = solution.collocation
     bodies: dict[int, Body] = {}
     for body in dict.fromkeys(
@@ -569,8 +585,11 @@ def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
 def _associations(
     collocation: Collocation, experiments: Sequence[Experiment]
 ) -> dict[str, Association]:
-    """Return the associations of a program, by experiment, for the bodies of
-    `experiments`, which differ from those of the program in their fields only.
+    """Return new associations of the measurements of a program, by name of the fitted experiment,
+    that refer to the bodies of `experiments`.
+
+    The associations themselves are unchanged: the bodies differ from those of the program in their
+    fields only. `experiments` must contain every fitted experiment.
     """
     bodies = {experiment.name: experiment.body for experiment in experiments}
     return {

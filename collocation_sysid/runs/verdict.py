@@ -201,7 +201,8 @@ def _undetermined_concern(
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:
     """Yield concerns about implausible sizes and densities, or else about an implausible stiffness
-    at the estimates, of each fitted body, and about an unknown scale of the moduli.
+    at the estimates, of each fitted body, and about an unknown scale of the moduli; all are
+    doubtful.
     """
     for body in dict.fromkeys(
         segment.body for segment in solution.collocation.transcriptions
@@ -246,7 +247,8 @@ def _prediction_concerns(
     rollouts: Mapping[str, ForwardSimulation | str],
 ) -> Iterator[Concern]:
     """Yield concerns about forward simulations that differ from the measurements by more than the
-    noise; failed simulations, given by their reason, are ignored.
+    noise; failed simulations, given by their reason, are ignored. `rollouts` are by name of the
+    experiment.
     """
     for name, rollout in rollouts.items():
         for misfit in (
@@ -311,7 +313,7 @@ def expected_rms_m(
     solution: Solution, uncertainty: Uncertainty | None
 ) -> float:
     """Return the RMS distance [m] of the fitted markers that is expected from noise with the stated
-    σ, less what the fitted parameters absorb.
+    σ, less what the fitted parameters absorb; 0 without markers.
 
     Parameters
     ----------
@@ -341,8 +343,8 @@ def expected_rms_m(
 def modes_by_experiment(
     problem: Problem, solution: Solution
 ) -> dict[str, ModesCheck]:
-    """Return the natural modes of each body at the estimates, by experiment; empty if the search
-    failed.
+    """Return the natural modes of each body at the estimates of `solution`, by name of the
+    experiment; empty if the search failed.
 
     The search failed if its status is not that of convergence. All moving experiments of the
     problem count, also those for validation; those whose modes cannot be computed, as without a

@@ -29,11 +29,12 @@ class WarmStart:
     folder : Path
         Run folder, for messages; empty for a solution from memory.
     values : mapping of name to value
-        Parameters, and moduli derived from them.
+        Physical values of the parameters, and of moduli derived from them, in SI units.
     nuisance : mapping of name to value
-        Nuisance parameters by "experiment: label", as in `Collocation.parameter_names`.
+        Nuisance parameters by "experiment: label", as in `Collocation.parameter_names`,
+        in the unit of the label.
     places_m : mapping of experiment to mapping of marker to (3,)
-        Places of the markers.
+        Places of the markers on the undeformed body [m].
     substeps : int
         Time steps per sample.
     """
@@ -51,7 +52,7 @@ class WarmStart:
         Raises
         ------
         InputError
-            If the folder is no run folder, or damaged.
+            If the folder is no run folder, or damaged, or a value is not finite.
         """
         return cls.from_result(
             Result.read(folder, "the folder of an earlier run"), Path(folder)
@@ -61,6 +62,8 @@ class WarmStart:
     def from_result(cls, result: Result, folder: Path) -> WarmStart:
         """Return the estimates of a result at its optimum, that is without the correction for
         discretisation errors.
+
+        No file is read: `folder` is stored, and named in messages.
 
         Raises
         ------
@@ -162,7 +165,8 @@ class WarmStart:
 
     def apply_to_places(self, collocation: Collocation) -> Collocation:
         """Return the discretised problem in which markers whose place is estimated start at the
-        earlier places; markers without an earlier place keep theirs.
+        earlier places; markers without an earlier place keep theirs. Their prior is then centred
+        there; the given problem is not modified.
         """
         places_m = []
         for segment in collocation.transcriptions:
@@ -184,11 +188,12 @@ class WarmStart:
         }
 
     def apply_to_nuisance(self, collocation: Collocation) -> tuple[Array, int]:
-        """Return p, the guesses of parameters and nuisance parameters in the solver's coordinates,
-        with the earlier nuisance parameters, and the number of these.
+        """Return p (np,), the guesses of parameters and nuisance parameters in the solver's
+        coordinates with the earlier nuisance parameters, and the number of these.
 
-        Only nuisance parameters with the same experiment and label are replaced, and not limited to
-        their bounds. Places of markers are those of the discretised problem.
+        Nuisance parameters are in units of their prior standard deviations. Only those with the
+        same experiment and label are replaced, and not limited to their bounds. Places of markers
+        are those of the discretised problem. Every parameter must have a guess.
         """
         p = collocation.guess_p
         matches = 0
@@ -205,10 +210,12 @@ class WarmStart:
         return p, matches
 
     def simulated_variables(self, collocation: Collocation) -> Array | None:
-        """Return the variables z of a simulation at the guess with the earlier nuisance parameters.
+        """Return the variables z (variables,) of a simulation at the guess with the earlier
+        nuisance parameters, limited to their bounds.
 
         None if no nuisance parameter or place matches, or if the simulation fails. Places of
-        markers are those of the discretised problem.
+        markers are those of the discretised problem, see `apply_to_places`. Every parameter must
+        have a guess.
         """
         p, matches = self.apply_to_nuisance(collocation)
         matches += sum(

@@ -57,10 +57,10 @@ AMPLITUDES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 
 
 def phase_concerns(phases: PhaseSummary, name: str) -> list[Concern]:
-    """Return concerns about a two-phase field, all "check": "field/one-phase" if the interval of
-    the contrast contains 1, "field/few" if the smaller phase has fewer than `FEWEST_ELEMENTS`
-    elements, "field/phases" if χ² per measurement exceeds `WORSE` times the larger of 1 and that
-    of the smooth field.
+    """Return concerns about a two-phase field, all "check": always "field/narrow", because intervals
+    of two phases are often too narrow; "field/one-phase" if the interval of the contrast contains
+    1, "field/few" if the smaller phase has fewer than `FEWEST_ELEMENTS` elements, "field/phases" if
+    χ² per measurement exceeds `WORSE` times the larger of 1 and that of the smooth field.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def phase_concerns(phases: PhaseSummary, name: str) -> list[Concern]:
     name : str
         Name of the constant, with its region in front.
     """
-    concerns: list[Concern] = []
+    concerns = [Concern("field/narrow", data={"name": name})]
     lower, median, upper = phases.contrast
     if lower <= 1 <= upper:
         ends = {"name": name, "lower": lower, "median": median, "upper": upper}

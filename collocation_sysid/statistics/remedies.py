@@ -26,8 +26,8 @@ REMEDIES: Mapping[str, str] = {
     "stiffness_drift": "repeat the first recording at the end",
     "time_scale": "compare all clocks with a reference clock",
     "poisson": "measure Poisson's ratio in a tension test, or estimate it; solid rubber is nearly "
-    "incompressible: state poisson = 0.499 and its small deviation, poisson = 0.0005, in "
-    "[uncertainty.assumptions]",
+    "incompressible: state poisson = 0.499 in [parameters], and the deviation of this value, "
+    "poisson = 0.0005, in [uncertainty.assumptions]",
     "damping_law": "compare the laws with compare-models --damping on faster and slower motions, "
     'or state damping_law = "none" where the law is known',
     "rayleigh_damping": "compare the laws with compare-models --damping on motions that rotate "

@@ -97,8 +97,8 @@ def test_an_empty_selection_tells_where_the_body_is(box, selection):
         (Box, ([0, 0, "a"], [1, 1, 1]), "low_m must be three numbers"),
         (Ball, ([0, 0, 0], 0), "radius_m must be a positive number"),
         (Ball, ([0, 0, np.nan], 1), "center_m must be three numbers"),
-        (Indices, ([1.5],), "whole node numbers"),
-        (Indices, ([True],), "whole node numbers"),
+        (Indices, ([1.5],), "whole numbers from 0"),
+        (Indices, ([True],), "whole numbers from 0"),
     ],
 )
 def test_ill_formed_selections_are_refused(kind, values, message):

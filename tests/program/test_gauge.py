@@ -150,7 +150,10 @@ def test_error_bars_and_verdict_know_them():
             "bias_m_s2 of the reading 'accelerometer' is -1",
         ),
         ({"points_m": [[0.0, 0.0]]}, "points_m of the reading 'accelerometer'"),
-        ({"values": np.full((9, 3), np.nan)}, "has no sample"),
+        (
+            {"values": np.full((9, 3), np.nan)},
+            "all values of the reading .* are missing",
+        ),
         ({"t_s": np.zeros(9)}, "of the reading 'accelerometer'"),
         ({"values": np.zeros((9, 2))}, "gives 3 numbers; expected 2"),
         (

@@ -156,6 +156,12 @@ def test_every_assumption_has_a_remedy():
     assert "measure gravity_rad" in remedy_for("gravity_rad")
 
 
+def test_the_remedy_of_poissons_ratio_names_the_table_of_each_value():
+    remedy = remedy_for("poisson")
+    assert "poisson = 0.499 in [parameters]" in remedy
+    assert "poisson = 0.0005, in [uncertainty.assumptions]" in remedy
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("huber", [None, 1.0])
 def test_a_considered_nuisance_moves_estimates_as_a_recording_that_is_off_by_it(

@@ -58,7 +58,9 @@ class BenchmarkBody:
 
     @property
     def data_folder(self) -> Path | None:
-        """Folder with the problem file and all data; None if files are missing."""
+        """Folder with the problem file and all data of the body on this computer; None if files are
+        missing.
+        """
         folder = CHECKOUT / "problems" / self.folder
         if not self.script:
             try:
@@ -71,7 +73,9 @@ class BenchmarkBody:
 
     @property
     def licence_file(self) -> Path | None:
-        """Text of the licence of the recordings; None if there is none in the repository."""
+        """Path of the licence of the recordings in a checkout of the repository; None if
+        `licence_path` is empty. Whether the file exists is not checked.
+        """
         return CHECKOUT / self.licence_path if self.licence_path else None
 
     @property

@@ -59,7 +59,10 @@ class BenchmarkContent:
 
     @classmethod
     def read(cls, folder: Path) -> BenchmarkContent:
-        """Read a benchmark folder.
+        """Return the bodies and recordings of a benchmark folder, with all measured and simulated
+        values.
+
+        Predictions in the folder are not read.
 
         Raises
         ------
@@ -121,7 +124,7 @@ def _read_recordings(folder: Path, body: str) -> list[StoredRecording]:
 def _read_signals(
     folder: Path, body: str, recording: Mapping[str, Any]
 ) -> RecordingSignals:
-    """Return the measured and predicted signals of a recording of a body.
+    """Return the measured and predicted signals of a recording of a body; blank cells are NaN.
 
     Parameters
     ----------
@@ -130,7 +133,8 @@ def _read_signals(
     body : str
         Name of the body.
     recording : mapping
-        Entry of "recordings" in body.json.
+        Entry of "recordings" in body.json, with the names of the tables under "files", by the roles
+        "measured", "simulated" and "undeformed", and "quantity", "key", "columns" and "sigma".
 
     Raises
     ------

@@ -102,7 +102,7 @@ class BodyTask:
 
     @property
     def experiments(self) -> list[Experiment]:
-        """Recordings to be predicted."""
+        """Recordings to be predicted, in the order of the problem."""
         return _recordings(self.problem, self.body)
 
 
@@ -134,7 +134,8 @@ def write_benchmark(
     Raises
     ------
     InputError
-        If there are no bodies, the data of a body are missing, or the folder has other files.
+        If there are no bodies, the data of a body or the value of a parameter are missing, or the
+        folder has other files; nothing is written then.
     SimulationError
         If a simulation fails; nothing is written then.
     """
@@ -169,12 +170,13 @@ def _recordings(problem: Problem, body: BenchmarkBody) -> list[Experiment]:
 def _parameter_values(
     problem: Problem, entry: CatalogueEntry
 ) -> dict[str, float]:
-    """Return the values of all parameters: those of the catalogue, else the fixed ones.
+    """Return the values of all parameters by name, in the units of the problem file: those of the
+    catalogue, else those of fixed parameters.
 
     Raises
     ------
     InputError
-        If a parameter has neither.
+        If a parameter is neither in the catalogue nor fixed.
     """
     identified = {each.name: each.value for each in entry.constants}
     values = {}
@@ -192,11 +194,12 @@ def _parameter_values(
 
 def _write_body(task: BodyTask, folder: Path) -> None:
     """Write the data of a body to a new folder: mesh, nodes and tetrahedra, licence if there is
-    one, recordings, description and README.
+    one, recordings, description (body.json) and README.
 
     Parameters
     ----------
     task : BodyTask
+        Task with at least one recording, of a body that `_body_content` can describe.
     folder : Path
         Folder of the body, which is created; its parent must exist.
 
@@ -229,7 +232,9 @@ def _write_body(task: BodyTask, folder: Path) -> None:
 
 
 def _mesh(experiment: Experiment) -> TetMesh:
-    """Return the mesh of a body; a cube for a material test without a mesh."""
+    """Return the mesh of the body of an experiment; for a material test without a mesh a cube of
+    `CUBE_DIVISIONS`, with sides of `CELL_SIZE_M` and a corner at the origin.
+    """
     if experiment.specimen is None:
         return experiment.body.mesh
     return box_mesh(
@@ -238,9 +243,22 @@ def _mesh(experiment: Experiment) -> TetMesh:
 
 
 def _body_content(task: BodyTask) -> dict[str, Any]:
-    """Return what is written about a body as JSON, without its recordings; quantities that do not
-    apply, such as the damping of static tests or the density of a specimen without a mesh, are
-    None. The body must have a single part.
+    """Return the content of body.json without its "recordings": names, source, licence, law,
+    damping, element, density and constants of a body.
+
+    "damping" and "damping_force" are None for a static test, "element" and "density_kg_m3" for a
+    specimen without a mesh.
+
+    Parameters
+    ----------
+    task : BodyTask
+        Task with at least one recording, the first of which decides; its body must have a single
+        part.
+
+    Raises
+    ------
+    KeyError
+        If `body_description` has no formula for the law or the damping law.
     """
     experiment = task.experiments[0]
     body = experiment.body
@@ -273,11 +291,14 @@ def _body_content(task: BodyTask) -> dict[str, Any]:
 def _write_recording(
     task: BodyTask, experiment: Experiment, folder: Path
 ) -> dict[str, Any]:
-    """Write the tables of a recording to the existing folder of its body, and return what the
-    description of the body states about it, for JSON.
+    """Write the tables of a recording to the existing folder of its body, and return its entry of
+    "recordings" in body.json.
 
-    Its "files" are names in this folder by role: "times", "measured", "simulated", "undeformed",
-    and "stretches" of a specimen without a mesh or "markers" where markers were measured.
+    The keys of the entry are "name", "file_name", "is_held_out", "kind", "start" (None for a static
+    test), "gravity_m_s2", "air_density_kg_m3", "quantity", "key", "columns", "sigma" and "files";
+    with a mesh also "grasps", and "symmetry" unless markers were measured. "files" are names in
+    this folder by role: "times", "measured", "simulated", "undeformed", and "stretches" of a
+    specimen without a mesh or "markers" where markers were measured.
 
     Parameters
     ----------
@@ -378,8 +399,9 @@ def _marker_table(experiment: Experiment) -> str:
 
 
 def _stretches(experiment: Experiment) -> dict[str, Array]:
-    """Return the stretches of a material test along x, y and z by column; NaN where the stretch is
-    free and the stress vanishes.
+    """Return the columns of a table of a material test: "sample", numbers from 1, and "stretch_x",
+    "stretch_y" and "stretch_z" (T,), which are NaN along axes whose stretch is free and whose
+    stress vanishes. The experiment must be a specimen without a mesh and without shear.
     """
     deformation = experiment.specimen
     assert deformation is not None

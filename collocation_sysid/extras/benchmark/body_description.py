@@ -65,21 +65,24 @@ Then `collocation-sysid benchmark FOLDER` prints the scores; `--body NAME` score
 
 
 def law_description(name: str) -> str:
-    """Return the energy density of a material law as a formula; `KeyError` for laws that no body of
-    the benchmark has.
+    """Return the energy density of the material law called `name`, such as "yeoh", as a formula;
+    `KeyError` for laws that no body of the benchmark has.
     """
     return LAWS[name]
 
 
 def damping_description(name: str) -> str:
-    """Return the stress or force of a damping law as a formula; `KeyError` for laws that no body of
-    the benchmark has.
+    """Return the stress or force of the damping law called `name`, such as "rayleigh", as a
+    formula; `KeyError` for laws that no body of the benchmark has.
     """
     return DAMPING_LAWS[name]
 
 
 def body_readme(content: Mapping[str, Any]) -> str:
-    """Return the README of a body as Markdown; `content` is that of its body.json."""
+    """Return the README of a body as one text of Markdown, with a section for each recording.
+
+    `content` is that of body.json: `_body_content` of `benchmark_folder`, with "recordings".
+    """
     parts = [
         f"# {content['body']}\n",
         *_introduction(content),
@@ -92,8 +95,10 @@ def body_readme(content: Mapping[str, Any]) -> str:
 
 
 def _introduction(content: Mapping[str, Any]) -> Iterator[str]:
-    """Yield Markdown paragraphs on the specimen, the source and the licence; `content` is that of
-    body.json.
+    """Yield Markdown paragraphs on the specimen, the note if it is not empty, source and licence.
+
+    `content` is that of body.json; its "specimen", "is_measured", "note", "source" and "licence"
+    are used.
     """
     kind = (
         "Measured data."
@@ -111,8 +116,12 @@ def _introduction(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _material(content: Mapping[str, Any]) -> Iterator[str]:
-    """Yield lines of the Markdown section on the material and its constants; `content` is that of
-    body.json.
+    """Yield lines of the Markdown section on the material: laws, density, and a table of the
+    constants with their intervals.
+
+    `content` is that of body.json: "law", "energy", "damping" (None: no line), "damping_force",
+    "density_kg_m3" (None: no line), "constants" (with "combined95" None for stated ones) and
+    "identified_from".
     """
     yield "## Material\n"
     yield f"- Energy density, law `{content['law']}`: {content['energy']}."
@@ -138,7 +147,12 @@ def _material(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _mesh(content: Mapping[str, Any]) -> Iterator[str]:
-    """Yield lines of the Markdown section on the mesh; `content` is that of body.json."""
+    """Yield lines of the Markdown section on the mesh: its files, which homogeneous tests have too,
+    and what it was used for.
+
+    `content` is that of body.json, of which "element" is used: the name of the element, or None for
+    a homogeneous test.
+    """
     yield "## Mesh\n"
     yield "`mesh.vtu`, and the same as tables: `nodes.csv` with the undeformed, stress-free nodes, and"
     yield "`tetrahedra.csv` with the nodes of each tetrahedron. Indices count from 0, in the order of"
@@ -154,7 +168,12 @@ def _mesh(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _recording(recording: Mapping[str, Any]) -> Iterator[str]:
-    """Yield lines of the Markdown section on a recording, an entry of "recordings" in body.json."""
+    """Yield lines of the Markdown section on a recording: its task, its files and the format of the
+    prediction.
+
+    `recording` is an entry of "recordings" in body.json, see `_write_recording` of
+    `benchmark_folder`.
+    """
     name = recording["file_name"]
     files = recording["files"]
     held_out = (
@@ -181,8 +200,10 @@ def _recording(recording: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _homogeneous_test(files: Mapping[str, str]) -> Iterator[str]:
-    """Yield lines of Markdown on a material test without a mesh, from the names of its files by
-    kind.
+    """Yield two lines of Markdown on a material test without a mesh: the stretches that are given,
+    and the stresses to be predicted.
+
+    `files` are names of files by role, of which "stretches" and "times" are used.
     """
     yield (
         f"- `{files['stretches']}` has the stretches along x, y and z of each sample. Where a cell is "
@@ -195,8 +216,10 @@ def _homogeneous_test(files: Mapping[str, str]) -> Iterator[str]:
 
 
 def _motion(recording: Mapping[str, Any]) -> Iterator[str]:
-    """Yield lines of Markdown on the motion or the equilibria of a body in a recording, an entry of
-    "recordings" in body.json.
+    """Yield lines of Markdown on gravity, start, air and grasps of a recording of a body with a
+    mesh, and on the forces to be predicted if its "quantity" is "forces".
+
+    `recording` is an entry of "recordings" in body.json.
     """
     gravity = ", ".join(f"{value:.6g}" for value in recording["gravity_m_s2"])
     yield f"- Gravity: [{gravity}] m/s²."

@@ -74,7 +74,9 @@ class CatalogueEntry:
 
 @cache
 def _catalogue() -> dict[str, dict[str, Any]]:
-    """Return the entries of the catalogue by name.
+    """Return the entries of the catalogue, as they are in its JSON file, by name.
+
+    The result is cached and must not be modified.
 
     Raises
     ------

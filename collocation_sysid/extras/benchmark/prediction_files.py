@@ -23,8 +23,8 @@ TIME_TOLERANCE = 1e-3
 
 
 def prediction_name(recording: str) -> str:
-    """Return the name of the prediction file of a recording, without its suffix, from the file name
-    of the recording.
+    """Return the name of the prediction file of a recording without its suffix, "swing_prediction"
+    for the recording with the file name "swing".
     """
     return f"{recording}_prediction"
 
@@ -85,8 +85,8 @@ def read_prediction(file: Path, measured: Signal) -> Signal:
 
 
 def _read_table(file: Path, measured: Signal) -> tuple[Array, Array]:
-    """Return the keys (N,) and the values (N, C) of a CSV table, with the columns of `measured` in
-    their order; blank lines are skipped.
+    """Return the keys (N,) and the values (N, C) of all rows of a CSV table, with the columns of
+    `measured` in their order; blank lines are skipped, other columns ignored.
 
     Raises
     ------
@@ -163,7 +163,8 @@ def _number(
 
 
 def _read_archive(file: Path, measured: Signal) -> tuple[Array, Array]:
-    """Return the keys (N,) and the values (N, C) of an NPZ archive, markers (N, M, 3) as (N, 3 M).
+    """Return the keys (N,) and the values (N, C) of an NPZ archive: its arrays called
+    `measured.key` and "values". Positions of markers (N, M, 3) become (N, 3 M).
 
     Raises
     ------

@@ -71,7 +71,7 @@ UNITS = {"markers": "m", "forces": "N", "stresses": "Pa"}
 
 
 def score_benchmark(folder: str | Path, body: str | None = None) -> list[Score]:
-    """Score the predictions in a benchmark folder.
+    """Return the scores of the predictions in a benchmark folder; nothing is written.
 
     Parameters
     ----------
@@ -79,18 +79,19 @@ def score_benchmark(folder: str | Path, body: str | None = None) -> list[Score]:
         Folder that `write_benchmark` wrote, with a prediction file of each recording added to the
         folder of its body.
     body : str, optional
-        Only this body; all by default.
+        Name of the only body to score; all by default.
 
     Returns
     -------
     list of Score
-        For each recording the prediction, the forward simulation of this package, and the
+        For each recording three: the prediction, the forward simulation of this package, and the
         undeformed body.
 
     Raises
     ------
     InputError
-        If the folder is no benchmark or was changed, or if a prediction is missing or invalid.
+        If the folder is no benchmark or was changed, has no such body, or if a prediction is
+        missing or invalid.
     """
     content = BenchmarkContent.read(Path(folder))
     names = content.bodies
@@ -156,11 +157,13 @@ def score(recording: StoredRecording, source: str, predicted: Signal) -> Score:
     Parameters
     ----------
     recording : StoredRecording
-        Recording with at least one measured value.
+        Recording with at least one measured value, which must not all equal those of the undeformed
+        body (otherwise `ZeroDivisionError`).
     source : str
         Who predicted it, see `Score`.
     predicted : Signal
-        Prediction at the samples of the measured signal, with the same columns.
+        Prediction at the samples of the measured signal, with the same columns; a NaN counts as not
+        measured.
     """
     signals = recording.signals
     measured = signals.measured
@@ -195,8 +198,15 @@ def _errors(predicted: Signal, measured: Signal) -> Array:
 
 
 def _distances(errors: Array, measured: Signal) -> Array:
-    """Return the distances (k,) of markers, or the magnitudes of the differences of loads, from
-    errors (T, C); those that are NaN are left out.
+    """Return the distances (k,) of markers [m], or the magnitudes of the differences of loads, of
+    all samples in one array; those that are NaN are left out.
+
+    Parameters
+    ----------
+    errors : (T, C) array
+        Predicted minus measured values; three columns for each marker.
+    measured : Signal
+        The measured signal, whose quantity decides.
     """
     sizes = np.abs(errors)
     if measured.quantity == "markers":
@@ -207,5 +217,5 @@ def _distances(errors: Array, measured: Signal) -> Array:
 
 
 def _rms(values: Array) -> float:
-    """Return the root of the mean square of values."""
+    """Return the root of the mean square of at least one value, of any shape; NaN if one is NaN."""
     return float(np.sqrt(np.mean(values**2)))

@@ -50,12 +50,12 @@ class Signal:
 
     @property
     def table(self) -> dict[str, Array]:
-        """Columns by name, the keys first."""
+        """Columns (T,) of the table by name, the keys first; views of the arrays, not copies."""
         columns = dict(zip(self.columns, self.values.T, strict=True))
         return {self.key: self.keys, **columns}
 
     def with_values(self, values: Array) -> Signal:
-        """Return the signal with other values (T, C)."""
+        """Return a copy of the signal with other values (T, C), in the same order and units."""
         return replace(self, values=values)
 
 
@@ -83,18 +83,20 @@ class RecordingSignals:
     def from_trajectory(
         cls, experiment: Experiment, trajectory: Trajectory
     ) -> RecordingSignals:
-        """Return the signals of an experiment that was simulated.
+        """Return the measured signals of an experiment, with its simulation and the undeformed body
+        as the two predictions.
 
-        An experiment with markers has their positions; a material test without a mesh has its
-        stresses; another experiment has the forces of its grasps, of which at least one must be
-        measured.
+        An experiment with markers has their positions [m]; otherwise a material test without a mesh
+        has its stresses [Pa]; another experiment has the forces [N] of its grasps, of which at
+        least one must be measured.
 
         Parameters
         ----------
         experiment : Experiment
-            Experiment with its measurements.
+            Experiment with its measurements; NaN where a value is missing.
         trajectory : Trajectory
-            Its simulation at the samples.
+            Forward simulation of the experiment at the times of its samples; it becomes
+            `simulated`.
         """
         if experiment.markers.names:
             return _marker_signals(experiment, trajectory)
@@ -104,8 +106,8 @@ class RecordingSignals:
 
 
 def stress_columns(deformation: HomogeneousDeformation) -> tuple[str, ...]:
-    """Return the names of the columns of the nominal stresses [Pa] of a material test, one for each
-    measured direction.
+    """Return the names of the columns of the nominal stresses [Pa] of a material test, such as
+    "stress_zz_pa": one or two, for the first and the second direction, if their stress is measured.
     """
     components = (deformation.first_stress, deformation.second_stress)
     return tuple(f"stress_{each}_pa" for each in components if each)
@@ -114,8 +116,15 @@ def stress_columns(deformation: HomogeneousDeformation) -> tuple[str, ...]:
 def _marker_signals(
     experiment: Experiment, trajectory: Trajectory
 ) -> RecordingSignals:
-    """Return the positions of the markers [m], three columns each, at the times of the experiment;
-    measured ones are NaN where missing.
+    """Return the positions of the markers [m], three columns each, at the times of the experiment:
+    measured (NaN where missing), simulated, and moved rigidly with the grasp.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment with markers.
+    trajectory : Trajectory
+        Its simulation, with `markers_m` (T, M, 3) at the same times.
     """
     markers = experiment.markers
     count = len(experiment.t_s)
@@ -146,7 +155,14 @@ def _stress_signals(
     experiment: Experiment, trajectory: Trajectory
 ) -> RecordingSignals:
     """Return the nominal stresses [Pa] of a material test without a mesh by the number of the
-    sample; the undeformed body has none.
+    sample, from 1: measured, simulated, and zero for the undeformed body.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Test of a specimen, whose first custom sensors measure the stresses.
+    trajectory : Trajectory
+        Its simulation, with the predicted values (T, 1) of each custom sensor in the same order.
     """
     assert experiment.specimen is not None
     names = stress_columns(experiment.specimen)
@@ -175,8 +191,18 @@ def _stress_signals(
 def _force_signals(
     experiment: Experiment, trajectory: Trajectory
 ) -> RecordingSignals:
-    """Return the measured components of the forces [N] of the grasps on the complete specimen, at
-    the times of the first sensor, which all sensors must have; the undeformed body has none.
+    """Return the measured components of the forces [N] of the grasps on the complete specimen:
+    measured, simulated, and zero for the undeformed body.
+
+    The columns are named after the number of the grasp, from 1, such as "grasp_1_fz_n". Values are
+    multiplied by the symmetry of the sensor, torques are left out.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment with at least one sensor; all sensors must have the times of the first one.
+    trajectory : Trajectory
+        Its simulation, with the predicted wrenches (T, 6) of the sensors in the same order.
     """
     columns: list[str] = []
     measured: list[Array] = []

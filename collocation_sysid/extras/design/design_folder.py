@@ -84,24 +84,25 @@ def write_design(
 ) -> Path:
     """Write the folder of a design atomically, and return its path.
 
-    It contains the poses, the predicted markers and, with a sensor, the predicted wrench, pictures,
-    design.json, and, if the problem was read from a file, a problem file for the recording.
+    It contains the poses (poses.csv), the predicted markers and, with a sensor, the predicted
+    wrench, pictures, design.json, with `with_film` motion.gif, and, if the problem was read from a
+    file, problem.toml for the recording.
 
     Parameters
     ----------
     design : Design
-        Design to write.
+        Design to write; its experiment has one grasp, with at most one sensor.
     folder : str or Path
         Folder, which may contain an earlier design; that is replaced.
     with_film : bool
         Whether to render the motion as a film.
     say : callable
-        Function that is called with the present activity.
+        Function that is called with the present activity, a text.
 
     Raises
     ------
     InputError
-        If the folder contains anything but an earlier design.
+        If the folder contains anything but an earlier design, or cannot be written.
     """
     target = Path(folder)
     with replaced_folder(
@@ -187,8 +188,8 @@ def design_json(design: Design) -> dict[str, Any]:
 
 
 def _error_bars_json(bars: ErrorBars) -> dict[str, Any]:
-    """Return value, standard error (in the unit of the value), relative error, and its range
-    (lowest, highest) over the draws, by parameter, for JSON.
+    """Return the error bars by parameter or modulus, for JSON: "value", "std_error" (in the unit of
+    the value), "relative_error", and "over_draws", its lowest and highest value over the draws.
     """
     return {
         name: {
@@ -205,8 +206,8 @@ def _error_bars_json(bars: ErrorBars) -> dict[str, Any]:
 
 
 def _gripper_poses(design: Design) -> PoseSequence:
-    """Return the designed poses: of the gripper if the problem states `gripper_to_body`, else of
-    the body.
+    """Return the designed poses over time, in the world: of the gripper if the problem states
+    `gripper_to_body` for the first grasp, else of the body in the grasp.
     """
     recording = design.recording
     (body_in_gripper,) = gripper_transforms(
@@ -219,11 +220,18 @@ def _gripper_poses(design: Design) -> PoseSequence:
 
 
 def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
-    """Return the content of a problem file in `folder` for the designed recording.
+    """Return the content of a problem file in `folder` for the designed recording, as nested
+    dictionaries and lists for TOML; nothing is written.
 
-    Estimated parameters get guesses at the middle draw, coefficients of fields none. Existing
-    recordings are kept only if they are used (`Design.added`); the new one is named "designed", or
-    "designed_2" and so on if that name is used. The problem must have been read from a file.
+    It is the content of the problem's own file with its overrides (`Origin.text`), and with the
+    defaults of experiments in the table of each experiment. Estimated parameters get guesses at the
+    middle draw, coefficients of fields none. Existing recordings are kept only if they are used
+    (`Design.added`).
+
+    The table of the new recording, the last one, is a copy of the template's that reads poses,
+    markers and wrench from the files of the design in `folder`, see `_designed_table`. Its name is
+    "designed", or "designed_2" and so on if that name is used. Other file names become relative to
+    `folder`, an absolute path. The problem must have been read from a file.
     """
     origin = design.recording.problem.origin
     recording = design.recording
@@ -259,8 +267,17 @@ def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
 
 
 def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
-    """Return an experiment's table, modified in place, that reads poses, markers and wrench from
-    the files of the design.
+    """Return the table of an experiment, modified in place, so that it reads poses, markers and
+    wrench from the files of the design beside the problem file.
+
+    Keys that select samples are removed (`OF_TIME`), and so are keys that describe the files of the
+    original, in the table of the first grasp (`OF_POSES`) and of the markers (`OF_MARKERS`).
+    Markers and wrench are changed only if the table has them.
+
+    Parameters
+    ----------
+    table : dict
+        Table ``[[experiment]]`` of the problem, with "grasp", a table or a list with at least one.
     """
     for key in OF_TIME:
         table.pop(key, None)

@@ -28,7 +28,8 @@ from .motion_design import Design
 
 def design_summary(design: Design, folder: Path) -> list[Shown]:
     """Return a design on one screen, as lines and tables: whether the search was interrupted, the
-    error bars, the limits that are reached, and the `folder` to which it was written.
+    error bars, which recordings they refer to, the limits that are reached, and the `folder` to
+    which it was written. Nothing is written here.
     """
     tried = len(design.best.history)
     interrupted = Line(
@@ -44,7 +45,11 @@ def design_summary(design: Design, folder: Path) -> list[Shown]:
 
 
 def _error_table(design: Design) -> Table:
-    """Return the table of error bars before and after."""
+    """Return the table of error bars before and after the design, a line for each parameter or
+    modulus: value, relative errors in percent, their range over the draws of θ, and the factor by
+    which the error is reduced. Without error bars before the design, "error before" and the factor
+    are empty.
+    """
     heads = (
         "",
         "value",
@@ -83,8 +88,11 @@ def _percent(share: float) -> str:
 
 
 def _column_note(design: Design) -> str:
-    """Return a sentence that says which recordings the columns "before" and "after" refer to;
-    without error bars before the design it is on "after" alone.
+    """Return a sentence that says what the columns "before" and "after" of the error bars refer to.
+
+    If existing recordings are used (`Design.added`) they are these alone, and with the designed
+    motion in addition. Otherwise they are the motion in the problem, with its duration, and the
+    designed motion alone; if `Design.before` is None, the sentence is on "after" alone.
     """
     duration = f"{design.experiment.duration_s:.4g} s"
     after = f"after: the designed motion of {duration}"
@@ -97,7 +105,7 @@ def _column_note(design: Design) -> str:
 
 
 def design_figures(design: Design) -> dict[str, Figure]:
-    """Return the figures of a design by file name without suffix."""
+    """Return the figures of a design by file name without suffix: "motion" and "error_bars"."""
     return {
         "motion": motion_picture(design),
         "error_bars": error_bars_picture(design),
@@ -105,8 +113,8 @@ def design_figures(design: Design) -> dict[str, Figure]:
 
 
 def motion_picture(design: Design) -> Figure:
-    """Return a figure of translation and rotation vector over time, and of speeds and
-    accelerations as shares of their limits.
+    """Return a figure of four panels over time: translation [mm] and rotation vector [°] of the
+    hand, and its speeds and accelerations in percent of their limits.
     """
     figure = new_figure(PAGE_MM, 100)
     shift, turn, speed, growth = figure.subplots(2, 2, sharex=True).ravel()
@@ -154,8 +162,8 @@ def motion_picture(design: Design) -> Figure:
 
 
 def error_bars_picture(design: Design) -> Figure:
-    """Return a figure of the relative error bars before, if known, and after; lines show their
-    range over the draws of θ.
+    """Return a figure of the relative error bars [%] before the design, if known, and after, a row
+    for each parameter or modulus; lines show their range over the draws of θ.
     """
     names = list(design.after.relative)
     figure = new_figure(PAGE_MM / 2, 14 + 9 * len(names))

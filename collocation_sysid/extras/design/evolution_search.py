@@ -58,7 +58,8 @@ def minimise(
     watch: Watch | None = None,
     start: Array | None = None,
 ) -> SearchResult:
-    """Minimise a function of coefficients whose expected magnitude is one.
+    """Return the best point of a search for the minimum of a function of coefficients whose
+    expected magnitude is one.
 
     Ctrl-C ends the search; the result is the best point so far.
 
@@ -174,7 +175,7 @@ class EvolutionStrategy:
 
     def point(self, step: Array) -> Array:
         """Return the coefficients (d,) for a sample `step` (d,) of the standard normal
-        distribution.
+        distribution, at the present mean and deviations; the strategy is not changed.
         """
         return self.mean + self.deviation * np.sqrt(self.variances) * step
 

@@ -88,7 +88,9 @@ class Limits(Section):
 
     @model_validator(mode="after")
     def _require_consistent(self) -> Limits:
-        """Raise `ValueError` for corners in the wrong order, or too few cameras."""
+        """Return the limits, unchanged; raise `ValueError` for corners in the wrong order, or fewer
+        cameras than `cameras_per_marker`.
+        """
         for key in ("workspace_m", "markers_box_m"):
             corners = getattr(self, key)
             if (
@@ -207,8 +209,8 @@ class HandBounds:
 
     @property
     def reach(self) -> TimeDerivatives:
-        """Largest translation [m] and rotation [rad], (2,), along the farthest axis of the
-        workspace, and the limits of their first and second derivatives.
+        """Largest translation [m] along the farthest axis of the workspace and largest rotation
+        [rad], as an array (2,), with the limits of their first and second derivatives, (2,) each.
         """
         limits = self.limits
         farthest = np.maximum(-self.low_m, self.high_m).max()
@@ -223,13 +225,17 @@ class HandBounds:
     def shares(self, motion: HandMotion) -> dict[str, float]:
         """Return the largest values of a motion on its grid as shares of the limits, by name of the
         limit; the limit is exceeded above 1.
+
+        The names are "workspace_m", "speed_m_s", "acceleration_m_s2", "rotation_deg",
+        "angular_speed_deg_s" and "angular_acceleration_deg_s2". The motion is relative to the
+        initial pose.
         """
         course = motion.derivatives(motion.grid_s)
         return self._translation_shares(course) | self._rotation_shares(course)
 
     def _translation_shares(self, course: TimeDerivatives) -> dict[str, float]:
         """Return the largest translation, speed and acceleration as shares of their limits, by name
-        of the limit.
+        of the limit: "workspace_m", "speed_m_s" and "acceleration_m_s2".
 
         The share of the translation is the largest along any axis, relative to the distance of the
         initial position from that side of the workspace; the others are norms.
@@ -237,8 +243,8 @@ class HandBounds:
         Parameters
         ----------
         course : TimeDerivatives of (T, 6) arrays
-            Coordinates of a motion and their derivatives, in SI units; the first three columns are
-            the translation.
+            Coordinates of a motion relative to its start and their derivatives, in SI units; the
+            first three columns are the translation.
         """
         shift, rate, curvature = (each[:, :3] for each in course)
         limits = self.limits
@@ -253,13 +259,14 @@ class HandBounds:
 
     def _rotation_shares(self, course: TimeDerivatives) -> dict[str, float]:
         """Return the largest rotation, angular speed and angular acceleration as shares of their
-        limits, by name of the limit.
+        limits, by name of the limit: "rotation_deg", "angular_speed_deg_s" and
+        "angular_acceleration_deg_s2".
 
         Parameters
         ----------
         course : TimeDerivatives of (T, 6) arrays
-            Coordinates of a motion and their derivatives, in SI units; the last three columns are
-            the rotation vector.
+            Coordinates of a motion and their derivatives, in SI units (radians); the last three
+            columns are the rotation vector.
         """
         turn, rate, curvature = (each[:, 3:] for each in course)
         velocity, acceleration = angular_motion(turn, rate, curvature=curvature)
@@ -276,10 +283,11 @@ class HandBounds:
 
     def scale_to_limits(self, motion: HandMotion) -> HandMotion:
         """Return the motion with translations and rotations reduced so that every limit is
-        satisfied.
+        satisfied on its grid; the motion itself is not changed.
 
-        A motion whose shares of the limits are at most `WITHIN` keeps its amplitudes. Peaks of
-        translations are proportional to their scale, those of rotations nearly.
+        All translations get one factor, all rotations another, both at most 1. A motion whose
+        shares of the limits are at most `WITHIN` keeps its amplitudes. Peaks of translations are
+        proportional to their scale, those of rotations nearly.
         """
         course = motion.derivatives(motion.grid_s)
         shift = WITHIN / max(WITHIN, *self._translation_shares(course).values())
@@ -287,7 +295,12 @@ class HandBounds:
 
     def _rotation_scale(self, course: TimeDerivatives) -> float:
         """Return the factor, at most 1, of the rotation vectors with which all limits of the
-        rotation are satisfied; `course` has the coordinates (T, 6) of the motion.
+        rotation are satisfied, by repeated reduction.
+
+        Parameters
+        ----------
+        course : TimeDerivatives of (T, 6) arrays
+            Coordinates of the motion and their derivatives, as in `_rotation_shares`.
         """
         scale = 1.0
         while (
@@ -298,5 +311,5 @@ class HandBounds:
 
 
 def _largest_norm(vectors: Array) -> float:
-    """Return the largest norm of vectors (T, 3)."""
+    """Return the largest norm of vectors (T, 3), at least one, in their unit."""
     return float(np.linalg.norm(vectors, axis=1).max())

@@ -58,7 +58,7 @@ class TimeDerivatives(NamedTuple):
     second: Array
 
     def scaled(self, factor: float) -> TimeDerivatives:
-        """Return value and derivatives multiplied by a factor."""
+        """Return a copy with value and both derivatives multiplied by `factor`."""
         return TimeDerivatives(
             factor * self.value,
             factor * self.first,
@@ -174,8 +174,8 @@ class HandMotion:
     def scaled(
         self, translation: float = 1.0, rotation: float = 1.0
     ) -> HandMotion:
-        """Return the motion with all translations multiplied by `translation` and all rotation
-        vectors by `rotation`.
+        """Return a copy of the motion with all translations multiplied by `translation` and all
+        rotation vectors by `rotation`, at all times.
         """
         factors = np.repeat([translation, rotation], 3)[:, None]
         return replace(self, amplitude=factors * self.amplitude)
@@ -297,5 +297,7 @@ def _jacobian_factors(angle: Array) -> JacobianFactors:
 
 
 def _to_unit_interval(u: Array | float) -> Array:
-    """Return numbers between 0 and 1 from any numbers; nearly uniform for normal ones."""
+    """Return numbers between 0 and 1, of the same shape, from any numbers: 0.5 from 0, increasing,
+    and nearly uniform for standard normal ones.
+    """
     return 0.5 * (1 + np.tanh(0.8 * np.asarray(u)))

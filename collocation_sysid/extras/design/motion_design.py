@@ -99,8 +99,8 @@ class ErrorBars:
 
     @classmethod
     def from_draws(cls, errors: list[PredictedErrors]) -> ErrorBars:
-        """Return the error bars at the first of at least one draw, the middle, with the lowest and
-        the highest over all draws.
+        """Return the error bars at the first of at least one draw of θ, the middle, with the lowest
+        and the highest over all draws. `errors` are those at each draw, all with the same names.
         """
         each = [error.relative for error in errors]
         lowest, highest = (
@@ -158,17 +158,21 @@ class Design:
 
     @property
     def poses(self) -> PoseSequence:
-        """Poses of the hand along the designed motion."""
+        """Poses of the designed motion over time, as grasps have them: a grasped node at X of the
+        undeformed body is at R X + p.
+        """
         return self.experiment.grasps[0].poses
 
     @property
     def active_limits(self) -> list[str]:
-        """Names of the limits of which the motion uses more than the share `REACHED`."""
+        """Names of the robot's limits of which the motion uses more than the share `REACHED`."""
         return [name for name, share in self.shares.items() if share > REACHED]
 
     @property
     def minimised_error(self) -> float:
-        """Relative error bar that was minimised."""
+        """Relative error bar that was minimised, 0.01 for 1 %, combined over parameters and draws
+        by the criterion.
+        """
         return float(np.exp(self.best.value))
 
 
@@ -198,17 +202,22 @@ class MotionObjective:
 
     @cached_property
     def bounds(self) -> HandBounds:
-        """Limits relative to the initial position."""
+        """Limits of the hand relative to its initial position; `InputError` if that is outside the
+        workspace.
+        """
         return self.recording.bounds(self.limits)
 
     @cached_property
     def constants(self) -> ThetaMap:
-        """Map from q to the constants of the body."""
+        """Map from the parameters q, in the solver's coordinates, to the constants of the body."""
         recording = self.recording
         return ThetaMap(recording.problem.parameters, recording.template.body)
 
     def motion(self, coefficients: Array) -> HandMotion:
-        """Return the motion for coefficients (d,), scaled so that it satisfies all limits."""
+        """Return the motion of the hand for unbounded coefficients (d,), see
+        `HandMotion.from_coefficients`, scaled so that it satisfies all limits of the robot; views
+        of cameras are not considered.
+        """
         recording = self.recording
         free = HandMotion.from_coefficients(
             coefficients,
@@ -219,8 +228,16 @@ class MotionObjective:
         return self.bounds.scale_to_limits(free)
 
     def errors(self, information: Array | float, q: Array) -> PredictedErrors:
-        """Return the error bars at the parameters q (nq,) from existing recordings, priors, and
-        additional information (nq, nq), or 0 for none.
+        """Return the error bars at the parameters q from existing recordings, priors, and a new
+        recording. A parameter about which nothing is known has the error bar `UNDETERMINED` times
+        its value, see `PredictedErrors.from_information`.
+
+        Parameters
+        ----------
+        information : (nq, nq) array or 0
+            Information of the new recording about q, without priors; 0 for none.
+        q : (nq,) array
+            Parameters in the solver's coordinates.
         """
         parameters = self.recording.problem.parameters
         return PredictedErrors.from_information(
@@ -234,9 +251,16 @@ class MotionObjective:
         """Return the motion with the smallest error bars at the first draw, to first order in the
         motion, as a start of the search.
 
-        Views of cameras are not considered. The result has no coefficients if a wrench is measured
-        too, the memory would be too large, or the simulation fails. `say` is called with the
-        progress.
+        Views of cameras are not considered. The result has no coefficients, and an empty history,
+        if a wrench is measured too, the memory would be too large, or the simulation fails. Ctrl-C
+        ends the search with the best so far.
+
+        Parameters
+        ----------
+        options : DesignOptions
+            `TO_FIRST_ORDER` times its `evaluations` are made, with its waves and seed.
+        say : callable
+            Function that is called with the progress, a text.
         """
         sensed = self.recording.template.grasps[0].wrench is not None
         if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:
@@ -270,9 +294,9 @@ class MotionObjective:
         )
 
     def value(self, coefficients: Array, bound: float) -> float:
-        """Return the logarithm of the error bar of a motion, combined over the draws; between one
-        and two times `FORBIDDEN` if a marker leaves the views, between two and three times if a
-        simulation fails.
+        """Return the logarithm of the relative error bar of a motion, combined over the draws;
+        between one and two times `FORBIDDEN` if a marker leaves the views, between two and three
+        times if a simulation fails.
 
         If the value at the middle of the prior exceeds `bound`, it is returned, and the other draws
         are not simulated.
@@ -280,9 +304,9 @@ class MotionObjective:
         Parameters
         ----------
         coefficients : (d,) array
-            Coefficients of the motion.
+            Unbounded coefficients of the motion, which is scaled to the limits of the robot.
         bound : float
-            Bound beyond which the value need not be exact.
+            Bound beyond which the value need not be exact; infinite for none.
         """
         experiment = self.recording.experiment(
             self.recording.poses(self.motion(coefficients))
@@ -327,7 +351,7 @@ def design_motion(
     ----------
     problem : Problem
         Problem with an experiment that defines body, grasp, markers, noise, nuisance parameters and
-        the initial pose of the hand.
+        the initial pose of the hand; not modified.
     limits : Limits
         Limits of the robot.
     duration_s : float
@@ -346,14 +370,17 @@ def design_motion(
         Function that is called with the number of motions and the logarithm of the smallest error
         bar.
     say : callable, optional
-        Function that is called with the present activity.
+        Function that is called with the present activity, a text.
 
     Raises
     ------
     InputError
-        For a problem without guesses, an experiment that cannot be designed, limits that exclude
-        the start, unknown names, recordings that cannot be fitted, and if no motion keeps the body
-        simulable and the markers in view.
+        For a duration that is not positive, a problem without guesses or without estimated
+        parameters, an experiment that cannot be designed, limits that exclude the start, unknown
+        names, recordings that cannot be fitted, and if no motion keeps the body simulable and the
+        markers in view.
+    SimulationError
+        If the best motion cannot be simulated at some draw of θ.
     """
     if not 0 < duration_s < np.inf:
         raise InputError(
@@ -382,19 +409,19 @@ def design_motion(
             seed=options.seed,
         )
         known = np.zeros((len(draws[0]),) * 2)
-    judge = MotionObjective(
+    objective = MotionObjective(
         recording,
         limits,
         criterion=criterion,
         draws=draws,
         known_information=known,
     )
-    criterion.require_known(judge.errors(0.0, draws[0]))
-    first = judge.first_guess(options, say)
+    criterion.require_known(objective.errors(0.0, draws[0]))
+    first = objective.first_guess(options, say)
     say("searching for a motion")
     evaluations = 1 if first.is_interrupted else options.evaluations
     best = minimise(
-        judge.value,
+        objective.value,
         HandMotion.coefficient_count(options.waves),
         evaluations=evaluations,
         seed=options.seed,
@@ -405,17 +432,17 @@ def design_motion(
     if best.coefficients is None or best.value >= FORBIDDEN:
         raise InputError(_no_motion_message(best), problem.path)
     say("simulating the best motion")
-    return _evaluate_design(judge, best, add=add)
+    return _evaluate_design(objective, best, add=add)
 
 
 def _evaluate_design(
-    judge: MotionObjective, best: SearchResult, add: bool
+    objective: MotionObjective, best: SearchResult, add: bool
 ) -> Design:
     """Return the design with the best motion, its error bars and its simulation.
 
     Parameters
     ----------
-    judge : MotionObjective
+    objective : MotionObjective
         Objective that was minimised.
     best : SearchResult
         Result of the search, which must have coefficients.
@@ -428,13 +455,15 @@ def _evaluate_design(
         If the motion cannot be simulated at some draw.
     """
     assert best.coefficients is not None
-    recording = judge.recording
-    motion = judge.motion(best.coefficients)
+    recording = objective.recording
+    motion = objective.motion(best.coefficients)
     experiment = recording.experiment(recording.poses(motion))
-    results = [recording.simulate_motion(experiment, q) for q in judge.draws]
-    after = _error_bars(judge, results)
+    results = [
+        recording.simulate_motion(experiment, q) for q in objective.draws
+    ]
+    after = _error_bars(objective, results)
     problem = recording.problem
-    values = problem.parameters.values(judge.draws[0])
+    values = problem.parameters.values(objective.draws[0])
     predicted = simulate(
         experiment,
         values,
@@ -446,48 +475,57 @@ def _evaluate_design(
         motion,
         experiment=with_markers(experiment, predicted.markers_m),
         predicted=predicted,
-        criterion=judge.criterion,
-        before=_before(judge, add),
+        criterion=objective.criterion,
+        before=_before(objective, add),
         after=after,
         added=add,
-        limits=judge.limits,
-        shares=judge.bounds.shares(motion),
+        limits=objective.limits,
+        shares=objective.bounds.shares(motion),
         best=best,
-        draws=len(judge.draws),
+        draws=len(objective.draws),
     )
 
 
-def _before(judge: MotionObjective, add: bool) -> ErrorBars | None:
-    """Return the error bars to compare with, from the draws of `judge`.
+def _before(objective: MotionObjective, add: bool) -> ErrorBars | None:
+    """Return the error bars to compare with, over all draws of `objective`.
 
     If the new recording is added (`add`) they are those of the existing recordings, else those of
-    the motion in the problem; None if that has no motion or cannot be simulated.
+    the motion of the template in the problem; None if that has a single pose or cannot be simulated
+    at some draw.
     """
     if add:
-        return ErrorBars.from_draws([judge.errors(0.0, q) for q in judge.draws])
-    recording = judge.recording
+        return ErrorBars.from_draws(
+            [objective.errors(0.0, q) for q in objective.draws]
+        )
+    recording = objective.recording
     template = recording.template
     if len(template.grasps[0].poses.t_s) < 2:
         return None
     shipped = replace(recording, duration_s=template.duration_s)
     try:
         simulations = [
-            shipped.simulate_motion(template, q) for q in judge.draws
+            shipped.simulate_motion(template, q) for q in objective.draws
         ]
     except SimulationError:
         return None
-    return _error_bars(judge, simulations)
+    return _error_bars(objective, simulations)
 
 
 def _error_bars(
-    judge: MotionObjective, results: list[SimulatedMotion]
+    objective: MotionObjective, results: list[SimulatedMotion]
 ) -> ErrorBars:
-    """Return the error bars of a motion, together with existing recordings and priors, from its
-    information at all draws of q.
+    """Return the error bars of a motion, together with existing recordings and priors.
+
+    Parameters
+    ----------
+    objective : MotionObjective
+        Objective with the existing recordings and the draws of q.
+    results : list of SimulatedMotion
+        The motion simulated at each draw, in the order of `objective.draws`, the middle first.
     """
-    pairs = zip(results, judge.draws, strict=True)
+    pairs = zip(results, objective.draws, strict=True)
     return ErrorBars.from_draws(
-        [judge.errors(each.information, q) for each, q in pairs]
+        [objective.errors(each.information, q) for each, q in pairs]
     )
 
 
@@ -568,8 +606,9 @@ def _require_guesses(problem: Problem) -> None:
 
 
 def _no_motion_message(best: SearchResult) -> str:
-    """Return a message that says why no motion was found: no simulation reached its end, or
-    markers left the views.
+    """Return a message that says why no motion was found, with a remedy: no simulation reached its
+    end, or markers left the views. `best` is the result of the search, whose value is at least
+    `FORBIDDEN`.
     """
     tried = f"none of the {len(best.history)} motions that were tried"
     if best.value >= 2 * FORBIDDEN:

@@ -82,9 +82,9 @@ class DesignCriterion:
         require_among(self.over, get_args(Over), where="--over")
 
     def log_size(self, errors: PredictedErrors) -> float:
-        """Return the logarithm of the error bar of the named parameters that is minimised: the
-        largest, for "A" the root mean square, for "D" the geometric mean over the axes of the
-        confidence ellipsoid.
+        """Return the logarithm of the relative error bar of the named parameters that is minimised:
+        the largest, for "A" the root mean square, for "D" the geometric mean over the axes of the
+        confidence ellipsoid. The names must be known, see `require_known`.
         """
         slopes = errors.slopes_of(self.names)
         covariance = slopes @ errors.covariance @ slopes.T
@@ -106,8 +106,18 @@ class DesignCriterion:
         return float(np.max(sizes) if self.over == "worst" else np.mean(sizes))
 
     def require_known(self, errors: PredictedErrors) -> None:
-        """Raise `InputError` for names that are not estimated, and for "D" those that
-        depend on each other.
+        """Check that the error bars of all `names` of the criterion are predicted.
+
+        Parameters
+        ----------
+        errors : PredictedErrors
+            Errors at any parameters, with the names of all parameters and moduli.
+
+        Raises
+        ------
+        InputError
+            For a name that is neither an estimated parameter nor a derived modulus that depends on
+            one, and for "D" if one of the names follows from the others.
         """
         for name in self.names:
             require_among(name, errors.slopes, where="--for", count="some")
@@ -209,7 +219,7 @@ class PredictedErrors:
 
     @property
     def relative(self) -> dict[str, float]:
-        """Standard errors relative to the values, by name."""
+        """Standard errors of parameters and derived moduli relative to their values, by name."""
         return {
             name: float(np.sqrt(slope @ self.covariance @ slope))
             for name, slope in self.slopes.items()
@@ -219,11 +229,13 @@ class PredictedErrors:
 def prior_draws(
     parameters: Parameters, spread: float, pairs: int, seed: int
 ) -> list[Array]:
-    """Return draws (nq,) of q: the middle, followed by pairs on either side of it.
+    """Return draws (nq,) of the parameters q, in the solver's coordinates: the middle, followed by
+    `pairs` pairs on either side of it, inside the bounds, see `symmetric_draws`.
 
-    A parameter with a prior is drawn from it. Others are drawn around their guess, which they must
-    have: logarithms with a standard deviation of ln `spread`, linear ones with `spread` − 1 times
-    their typical size. See `symmetric_draws` for `pairs` and `seed`.
+    A parameter with a prior is drawn from it; the middle is then that of the prior. Others are
+    drawn around their guess, which they must have: logarithms with a standard deviation of ln
+    `spread`, linear ones with `spread` − 1 times their typical size. `seed` decides the random
+    numbers.
     """
     middle = parameters.guess_q.copy()
     deviation = np.array(
@@ -283,7 +295,8 @@ MOST_SAMPLES = 100_000
 
 
 def shared_information(fit: LinearisedFit) -> Array:
-    """Return the information (nq, nq) of the measurements about the shared parameters.
+    """Return the information (nq, nq) of the measurements of a linearised fit about the shared
+    parameters q, in the solver's coordinates.
 
     Nuisance parameters are eliminated with their priors; priors of the shared parameters are not
     included.
@@ -378,7 +391,7 @@ class FutureRecording:
 
     @property
     def samples(self) -> int:
-        """Number of samples of the markers."""
+        """Number of samples of the designed recording, the first and the last included."""
         return round(self.duration_s / self.template.timestep_s) + 1
 
     @cached_property
@@ -390,7 +403,9 @@ class FutureRecording:
 
     @cached_property
     def start_pose(self) -> tuple[Array, Array]:
-        """Rotation (3, 3) and translation (3,) [m] of the first pose."""
+        """Rotation R (3, 3) and translation p (3,) [m] of the rigidly grasped body at the first
+        sample of the template: a grasped node at X is at R X + p.
+        """
         rotations, translations = self.template.rigid_motion(
             self.template.t_s[:1]
         )
@@ -442,7 +457,9 @@ class FutureRecording:
         return np.linspace(0.0, self.since_start_s[-1], count)
 
     def poses(self, motion: HandMotion) -> PoseSequence:
-        """Return the poses of a motion at `pose_times_s`."""
+        """Return the poses at `pose_times_s` of a motion of the hand relative to its initial pose,
+        as grasps have them: a grasped node at X of the undeformed body is at R X + p.
+        """
         return self.poses_from_coordinates(
             motion.derivatives(self.pose_times_s).value
         )
@@ -464,8 +481,12 @@ class FutureRecording:
         )
 
     def experiment(self, poses: PoseSequence) -> Experiment:
-        """Return the future experiment with given poses; all markers are at the origin, and sensors
-        of the grasp have zeros, as placeholders for measurements.
+        """Return the future experiment: the template with the given poses of its grasp, and the
+        times of the new samples.
+
+        All markers are at the origin, and a sensor of the grasp has zeros, as placeholders for
+        measurements. The poses must cover the duration of the recording; times start at the
+        template's first sample.
         """
         template = self.template
         (grasp,) = self.template.grasps
@@ -499,8 +520,9 @@ class FutureRecording:
         )
 
     def program(self, experiment: Experiment) -> Collocation:
-        """Return the nonlinear program of one experiment, which is fitted even if it is declared as
-        held out.
+        """Return the nonlinear program of one experiment with all parameters of the problem, its
+        scheme and its first number of substeps. An experiment that is declared as held out is
+        fitted, too.
         """
         problem = self.problem
         fitted = (
@@ -518,10 +540,19 @@ class FutureRecording:
     def linearise(
         self, experiment: Experiment, q: Array
     ) -> tuple[LinearisedFit, Array]:
-        """Return the linearised fit of an experiment simulated at the parameters q (nq,), with
-        nuisance parameters at their guesses, and its positions (N, 3n) [m] at the time steps.
+        """Return the linearised fit of a simulated experiment, and its node positions (N, 3n) [m]
+        at the N time steps, substeps included.
 
-        The initial equilibrium at q is stored for later calls, since every motion starts from it.
+        The nuisance parameters are at their guesses. The initial equilibrium at q is stored for
+        later calls, since every motion starts from it.
+
+        Parameters
+        ----------
+        experiment : Experiment
+            Experiment of `experiment`, or the template; its measurements do not matter for the
+            slopes.
+        q : (nq,) array
+            Parameters in the solver's coordinates.
 
         Raises
         ------
@@ -595,8 +626,8 @@ class LinearRecording:
     def from_simulations(
         cls, recording: FutureRecording, q: Array
     ) -> LinearRecording:
-        """Return the response at q (nq,), from seven simulations: one at rest, and one for each
-        coordinate.
+        """Return the response of a recording at the parameters q (nq,), in the solver's
+        coordinates, from seven simulations: one at rest, and one for each coordinate.
 
         Raises
         ------

@@ -58,26 +58,28 @@ MAIN_FILES = {
 def write_export(
     body: IdentifiedBody, target_name: str, folder: str | Path
 ) -> ExportedFiles:
-    """Write a body for a target: its files, ``identified.json``, and the poses of its grasps and
-    obstacles.
+    """Write a body for a target: its files, ``identified.json`` with all numbers and what the
+    target cannot express, and ``poses_1.csv``, … with the poses of its grasps, followed by those of
+    its obstacles.
 
     Parameters
     ----------
     body : IdentifiedBody
     target_name : str
-        Name of a target in `TARGETS`.
+        Name of a target in `TARGETS`, such as "mujoco".
     folder : str or Path
         Written completely or not at all; an earlier export there is replaced.
 
     Returns
     -------
     ExportedFiles
-        The files, and what the target cannot express.
+        The target's files (their text by name), and what the target cannot express.
 
     Raises
     ------
     InputError
-        For an unknown target, a body that the target cannot express, or a folder with other files.
+        For an unknown target, a body that the target cannot express, a package that the target
+        needs and that is not installed, or a folder with other files.
     """
     exported = target_named(target_name).export(body)
     with replaced_folder(
@@ -121,6 +123,8 @@ def verify_export(
     ------
     InputError
         For an unknown target, or if the target cannot be run from here, is not installed or fails.
+    SimulationError
+        If an equilibrium of this package cannot be computed.
     """
     target = target_named(target_name)
     if target.verify is None:
@@ -139,8 +143,9 @@ def verify_export(
 def comparison_table(
     name: str, comparisons: Sequence[PredictionComparison]
 ) -> Table:
-    """Return the table of predictions of the simulator `name` and of this package, a row for each
-    quantity, with the relative difference ("+nan%" if this package predicts zero) and a remark.
+    """Return the table of predictions of a simulator and of this package, a row for each quantity:
+    name, both values with their unit, relative difference in percent ("+nan%" if this package
+    predicts zero), and remark. `name` is the simulator's, for the heading.
     """
     rows = []
     for each in comparisons:

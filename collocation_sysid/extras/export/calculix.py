@@ -108,18 +108,27 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
 
 def _step_times_s(body: IdentifiedBody) -> Array:
-    """Return the time of each step: all samples of a static recording, else the first one."""
+    """Return the time [s] of each step of the deck: all samples of a static recording (T,), else
+    the first one alone (1,).
+    """
     return body.experiment.t_s[: None if body.experiment.is_static else 1]
 
 
 def _obstacle_cards(
     body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]
 ) -> str:
-    """Return the obstacles as cards: a tetrahedron under each facet, a common material, and a
-    contact pair for each obstacle; empty without obstacles.
+    """Return the obstacles as cards, which precede the steps: a tetrahedron under each facet, a
+    common material, and a contact pair for each obstacle; empty without obstacles.
 
     The pressure is linear in the penetration, with friction if the obstacle has some. The step
     prescribes all nodes of the tetrahedra.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+        Body whose sides may touch the obstacles.
+    obstacles : sequence of FacetedObstacle
+        Its obstacles.
     """
     deck = ""
     tetrahedra = body.body.mesh.tetrahedra
@@ -225,10 +234,18 @@ def _format_values(*values: float) -> str:
 def _material_card(
     region: IdentifiedRegion, is_linear: bool
 ) -> tuple[str, str]:
-    """Return the card of a material, and a sentence on what the card does not express ("" if
-    nothing).
+    """Return the card of a material, without its density, and a sentence on what the card does not
+    express ("" if nothing).
 
-    `is_linear` says whether the analysis is geometrically linear.
+    A material that CalculiX does not have becomes the neo-Hookean one of the same λ and μ at small
+    strain.
+
+    Parameters
+    ----------
+    region : IdentifiedRegion
+        Region with the material and its constants.
+    is_linear : bool
+        Whether the analysis is geometrically linear.
     """
     c: Mapping[str, float] = region.constants
     volume = 2 / region.kappa_pa
@@ -318,11 +335,12 @@ def _power_law_card(region: IdentifiedRegion, volume: float) -> str:
 
 def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     """Run CalculiX (the program ``ccx``), and compare the largest displacement at rest and the
-    forces of obstacles.
+    force of each obstacle, all in the last step of the deck.
 
     Parameters
     ----------
     body : IdentifiedBody
+        Body that was exported.
     folder : Path
         Folder with the deck, into which CalculiX writes its files.
 
@@ -330,6 +348,8 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     ------
     InputError
         If it is not installed, fails, or takes longer than `TIME_LIMIT_S`.
+    SimulationError
+        If an equilibrium of this package cannot be computed.
     """
     program = shutil.which("ccx")
     if program is None:

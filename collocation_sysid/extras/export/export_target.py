@@ -200,7 +200,8 @@ class TargetCapabilities:
         return sentences if self.is_tested else [*sentences, UNTESTED]
 
     def _obstacle_limitations(self, body: IdentifiedBody) -> Iterator[str]:
-        """Yield sentences on what the simulator cannot express of the obstacles.
+        """Yield sentences on what the simulator cannot express of the obstacles of a body; none
+        without obstacles.
 
         Of an obstacle whose shape is not exported nothing else is said.
         """
@@ -227,8 +228,10 @@ class TargetCapabilities:
 
 
 def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
-    """Yield sentences on what none of the targets can express of a body: actuators, air, custom
-    forces, and loads or grasps that change in time.
+    """Yield a sentence for each property of a body that no target can express; none for others.
+
+    These are actuators, air, custom forces, forces or point masses on nodes that change between
+    samples, and grasps that begin or end within the recording. Moving grasps are not among them.
     """
     e = body.experiment
     times = body.experiment.t_s
@@ -263,9 +266,9 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
     Returns
     -------
     moved_m : (T, n, 3)
-        Displacements of the nodes from `IdentifiedBody.nodes_m`.
+        Displacements [m] of the n nodes of the body from `IdentifiedBody.nodes_m` at the T samples.
     forces_n : (T, o, 3)
-        Forces of each obstacle on the body.
+        Force [N] of each of the o obstacles on the body.
 
     Raises
     ------
@@ -303,13 +306,17 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
 
 
 def longest_displacement_m(displacements_m: Array) -> float:
-    """Return the largest length of displacements (n, 3) [m]; NaN if one is NaN."""
+    """Return the largest length of displacements (n, 3) [m], at least one; NaN if one is NaN."""
     return float(np.linalg.norm(displacements_m, axis=1).max())
 
 
 def linear_tetrahedra(body: IdentifiedBody) -> list[Index]:
     """Return the node indices of the linear tetrahedra (k, 4) of each region, in the order of
-    `IdentifiedBody.regions`; each quadratic one is split into eight on the same nodes.
+    `IdentifiedBody.regions`.
+
+    Linear elements are returned as they are, in the order of the region's cells; each quadratic one
+    is split into eight, which follow each other. Indices count from 0 and refer to
+    `IdentifiedBody.nodes_m`, to which no nodes are added.
     """
     if not body.is_quadratic:
         return [body.body.cells[region.cells] for region in body.regions]
@@ -358,5 +365,7 @@ def comment_lines(
 
 
 def xml_attribute(text: str) -> str:
-    """Return a name as a quoted attribute of XML, with marks in place of control characters."""
+    """Return a name as the value of an XML attribute, escaped and in quotation marks, with marks in
+    place of control characters.
+    """
     return quoteattr(printable(text))

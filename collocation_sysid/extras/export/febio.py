@@ -63,8 +63,8 @@ class ElasticLaw(NamedTuple):
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the model of a static step with growing loads at the first sample, and what FEBio
-    cannot express.
+    """Return the model file of a static step with growing loads, at the first sample, and what
+    FEBio cannot express; damping and motion are not exported.
     """
     limits = CAPABILITIES.limitations(body)
     materials = "".join(
@@ -270,7 +270,9 @@ def _obstacle_mesh_xml(
 
 
 def _numbered_elements(tag: str, rows: Index, offset: int = 0) -> str:
-    """Return XML elements called `tag`, one for each row, numbered from `offset` + 1."""
+    """Return XML elements called `tag`, one line for each row, with the numbers of the row (k, m)
+    as text, separated by commas; their attribute "id" counts from `offset` + 1.
+    """
     return "".join(
         f'<{tag} id="{k}">{",".join(map(str, row))}</{tag}>\n'
         for k, row in enumerate(rows.tolist(), offset + 1)

@@ -212,7 +212,10 @@ class IdentifiedBody:
         experiment: str | None = None,
         allow_code: bool = False,
     ) -> IdentifiedBody:
-        """Read the body from a run folder.
+        """Read the body from a run folder, as a run identified it; nothing is written.
+
+        Grasps and gravity of the recording are those that the run corrected with its nuisance
+        parameters.
 
         Parameters
         ----------
@@ -226,7 +229,8 @@ class IdentifiedBody:
         Raises
         ------
         InputError
-            If it is no run of a problem file, is damaged, or has no such recording.
+            If it is no run of a problem file, is damaged, has no such fitted recording, or has a
+            mesh made under gravity; or if only obstacles support the body.
         """
         folder = Path(run)
         result = Result.read(folder)
@@ -324,7 +328,7 @@ class IdentifiedBody:
 
     @property
     def start_s(self) -> float:
-        """Time of the first sample."""
+        """Time of the first sample of the recording [s]."""
         return float(self.experiment.t_s[0])
 
     @cached_property
@@ -336,17 +340,21 @@ class IdentifiedBody:
 
     @cached_property
     def is_prescribed(self) -> NDArray[np.bool_]:
-        """Whether a node's coordinate has a prescribed displacement at the first sample (n, 3)."""
+        """Whether each coordinate of each node (n, 3) has a prescribed displacement at the first
+        sample.
+        """
         return self.experiment.is_prescribed([self.start_s])[0]
 
     @cached_property
     def prescribed_m(self) -> Array:
-        """Prescribed coordinates (n, 3) at the first sample, NaN where a coordinate is free."""
+        """Prescribed coordinates of the nodes (n, 3) [m] in the world at the first sample; NaN
+        where a coordinate is free.
+        """
         return self.experiment.prescribed_displacements([self.start_s])[1][0]
 
     @property
     def is_node_prescribed(self) -> NDArray[np.bool_]:
-        """Whether a node is prescribed along all axes at the first sample (n,)."""
+        """Whether each node (n,) is prescribed along all axes at the first sample."""
         return np.asarray(self.is_prescribed.all(axis=1))
 
     @cached_property
@@ -365,23 +373,23 @@ class IdentifiedBody:
 
     @cached_property
     def point_masses_kg(self) -> Array:
-        """Point masses attached to the nodes (n,) at the first sample."""
+        """Point masses attached to the nodes (n,) at the first sample [kg]; zero without any."""
         return self.experiment.point_mass_at_nodes_kg([self.start_s])[0]
 
     @cached_property
     def node_mass_kg(self) -> Array:
-        """Lumped mass of the body at each node (n,), without point masses."""
+        """Lumped mass of the body at each node (n,) [kg], without point masses."""
         return self.body.mass_of_dofs(self.theta)[::3]
 
     @cached_property
     def total_node_mass_kg(self) -> Array:
-        """Lumped mass at each node (n,), with point masses."""
+        """Lumped mass at each node (n,) [kg], with point masses."""
         return self.node_mass_kg + self.point_masses_kg
 
     @cached_property
     def node_loads_n(self) -> Array:
-        """Forces on the nodes (n, 3) at the first sample, with the weight of point masses but not
-        of the body.
+        """Forces on the nodes (n, 3) [N] at the first sample: the declared ones, and the weight of
+        point masses, but not that of the body.
         """
         weight = self.point_masses_kg[:, None] * self.experiment.gravity_m_s2
         return (
@@ -431,10 +439,12 @@ class IdentifiedBody:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of identified.json as a dictionary, with arrays and dataclasses that
-        `as_json` converts: estimates, mesh, masses, regions, loads, grasps and obstacles of the
-        recording.
+        `as_json` converts.
 
-        Positions are those at the first sample; element and node indices count from 0.
+        The keys are "title", "verdict", "warnings", "parameters" (estimates by name), "element",
+        "nodes_m", "cells", "node_mass_kg", "tied_mass_kg" (point masses), "regions", "experiment",
+        "kind", "start", "gravity_m_s2", "t_s", "grasps", "obstacles" and "node_loads_n". Positions
+        are those at the first sample; element and node indices count from 0.
         """
         e = self.experiment
         body = self.body
@@ -495,7 +505,10 @@ class IdentifiedBody:
 
 
 def _warnings(result: Result) -> tuple[str, ...]:
-    """Return reasons not to use the numbers without care: verdict, bounds, averaged fields."""
+    """Return reasons not to use the numbers of a result without care, as sentences without a
+    period: it did not converge, its verdict is not good, fields are averaged, parameters are at a
+    bound. Empty if there are none.
+    """
     warnings = []
     if not result.converged:
         warnings.append("the run did not converge")

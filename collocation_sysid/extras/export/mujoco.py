@@ -60,7 +60,8 @@ CAPABILITIES = TargetCapabilities(
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the model, whose key "start" is the state at the first sample.
+    """Return the model file, whose key frame "start" is the state at the first sample, and what
+    MuJoCo cannot express.
 
     Raises
     ------
@@ -97,8 +98,9 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
 
 def _grasp_xml(body: IdentifiedBody) -> str:
-    """Return the XML of each grasp: a mocap body, and the free body welded to it that carries the
-    nodes.
+    """Return the XML of each grasp, numbered from 0: a mocap body "hand0", and the free body
+    "grasp0", welded to it by `_weld_xml`, that carries the nodes, both at the pose of the first
+    sample; empty without grasps.
 
     The second body is needed because nodes of an elastic flex cannot be attached to a mocap body.
     """
@@ -118,11 +120,11 @@ def _grasp_xml(body: IdentifiedBody) -> str:
 
 
 def _obstacle_xml(body: IdentifiedBody, step_s: float) -> str:
-    """Return the XML of each obstacle: a mocap body, as stiff as the step `step_s` allows, with
-    friction.
+    """Return the XML of each obstacle, a mocap body "obstacle0", … with friction at the pose of the
+    first sample; empty without obstacles.
 
-    Each solid is smaller by the thickness of the flex's skin, so that contact begins at the true
-    surface.
+    Contact is as stiff as the timestep `step_s` [s] allows. Each solid is smaller by the thickness
+    of the flex's skin, so that contact begins at the true surface.
     """
     lines = ""
     skin = RELATIVE_SKIN_RADIUS * _mean_edge_m(body)
@@ -140,7 +142,9 @@ def _obstacle_xml(body: IdentifiedBody, step_s: float) -> str:
 
 
 def _geom_attributes(solid: Solid) -> str:
-    """Return the XML attributes of a solid in MuJoCo: type, size, position and rotation."""
+    """Return the XML attributes of a solid in MuJoCo: type, size, position [m] and rotation in the
+    frame of its obstacle; rounded edges are left out.
+    """
     shape = Primitive.from_solid(solid)
     turn = values_as_text(shape.rotation.as_quat(scalar_first=True))
     size = values_as_text(shape.size_m) if len(shape.size_m) else "0 0 1"
@@ -161,13 +165,13 @@ def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
 
 def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
     """Return position (3,) [m] and unit quaternion (w, x, y, z) of a grasp or obstacle at a time
-    `t_s` [s].
+    `t_s` [s], interpolated between its poses, or up to half a sample beyond them continued or held,
+    see `PoseSequence.at`. A single pose holds at all times.
 
     Raises
     ------
     InputError
-        If the time is more than half a sample before or after its poses, except a single pose,
-        which holds at all times.
+        If the time is more than half a sample before or after several poses.
     """
     rotations, positions = grasp.poses.at([t_s])
     return positions[0], np.roll(
@@ -234,8 +238,11 @@ def _mean_edge_m(body: IdentifiedBody) -> float:
 
 
 def _keyframe_xml(body: IdentifiedBody) -> str:
-    """Return the XML of the state at the first sample: simulated displacements, or zero if the run
-    has no forward simulation, and the declared initial velocities, or zero.
+    """Return the XML of the key frame "start", the state at the first sample: poses of the grasps,
+    then displacements of the free nodes, and their velocities.
+
+    Displacements from `IdentifiedBody.nodes_m` are the simulated ones, or zero if the run has no
+    forward simulation; velocities are the declared initial ones, or zero.
     """
     free = ~body.is_node_prescribed
     shape = body.nodes_m if body.simulated_m is None else body.simulated_m[0]
@@ -278,6 +285,13 @@ def _stable_step_s(body: IdentifiedBody) -> float:
 def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     """Run MuJoCo on the exported model, and compare the first natural frequency and, if the
     recording is a motion with a forward simulation, the deformation.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+        Body that was exported.
+    folder : Path
+        Folder with the model; nothing is written to it.
 
     Raises
     ------
@@ -379,6 +393,15 @@ def _compare_motion(
 
     Deformation is the distance of free nodes from the rigidly moved body. The equality constraints
     of `model` are switched off, in place, and grasped bodies are moved directly.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+        Body with a forward simulation.
+    mujoco : module
+        Module of MuJoCo.
+    model : MjModel
+        Exported model.
 
     Raises
     ------

@@ -96,7 +96,8 @@ def model(device=None):
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the module ``body.py`` and its numbers ``body.json``, with what Newton cannot express.
+    """Return the module ``body.py`` and its numbers ``body.json``, as text, with what Newton cannot
+    express.
 
     The module reads the JSON file with its own name, so that both can be renamed together. Grasped
     nodes have no mass and are fixed at their positions of the first sample.

@@ -92,8 +92,20 @@ class Primitive:
         )
 
     def pose_at(self, obstacle: Obstacle, t_s: float) -> tuple[Array, Rotation]:
-        """Return position (3,) [m] and rotation of the shape in the world at a time [s]; `obstacle`
-        is the one that has the shape.
+        """Return position (3,) [m] and rotation of the shape in the world at a time.
+
+        Parameters
+        ----------
+        obstacle : Obstacle
+            Obstacle that has the shape, with its poses.
+        t_s : float
+            Time [s].
+
+        Raises
+        ------
+        InputError
+            If several poses end more than half a sample before the time, or begin that much after
+            it.
         """
         (rotation,), (place,) = obstacle.poses.at([t_s])
         return place + rotation @ self.centre_m, Rotation.from_matrix(
@@ -109,7 +121,8 @@ def _rotation_of_z_to(axis: Array) -> Rotation:
 
 
 def offset_solid(solid: Solid, distance_m: float) -> Solid:
-    """Return a solid whose surface is further out by `distance_m`; negative inwards.
+    """Return a copy of a solid whose surface is further out by `distance_m`, of a box or cylinder
+    on all sides; negative inwards.
 
     Inwards the surface moves at most by half of the solid's smallest half width (a plane by any
     distance). The radius of rounded edges stays.
@@ -215,7 +228,10 @@ class Facets:
         )
 
     def _oriented_outwards(self) -> Facets:
-        """Return the facets with triangles ordered counter-clockwise as seen from outside."""
+        """Return a copy of the facets with the corners of each triangle ordered counter-clockwise
+        as seen from outside: from the side of its plane on which the last point, behind all facets,
+        is not.
+        """
         corners = self.points_m[self.triangles]
         inwards = (
             np.einsum(
@@ -338,12 +354,16 @@ class FacetedObstacle:
 
     @property
     def triangles(self) -> Index:
-        """Node indices of the facets (f, 3)."""
+        """Node indices of the facets (f, 3) in the file of a simulator, which count on after those
+        of the body and of earlier obstacles.
+        """
         return self.facets.triangles + self.first_node
 
     @property
     def tetrahedra(self) -> Index:
-        """Node indices (f, 4) of a tetrahedron under each facet."""
+        """Node indices (f, 4), counted like those of `triangles`, of a tetrahedron under each
+        facet, whose last node is the point behind all facets.
+        """
         inner = np.full(
             (len(self.triangles), 1),
             self.first_node + len(self.start_points_m) - 1,
@@ -356,8 +376,9 @@ def faceted_obstacles(body: IdentifiedBody) -> tuple[FacetedObstacle, ...]:
     without obstacles.
 
     Facets that face the body at no sample are left out. Nodes and cells are numbered after those of
-    the body. The stiffness and the width of the pressure law are means over the area of the surface
-    that may touch.
+    the body. Stiffness and width are means of the pressure law over the area of the surface that
+    may touch, the stiffness twice that (see `FacetedObstacle`). The points at the start are
+    retracted so far that no node touches.
     """
     if body.experiment_with_obstacles is None:
         return ()
@@ -450,8 +471,10 @@ class SharedContact:
     def from_obstacles(
         cls, obstacles: Sequence[FacetedObstacle]
     ) -> SharedContact:
-        """Return the friction of the first obstacle, and the largest stiffness and width of all;
-        zeros without obstacles.
+        """Return the contact constants that represent all obstacles: the friction of the first one,
+        the largest stiffness of a node, and half of the largest width as the particle radius; zeros
+        without obstacles. If obstacles differ in a constant, `limitations` has one sentence on
+        that, otherwise none.
         """
         constants = {
             "friction": [float(wall.obstacle.friction) for wall in obstacles],

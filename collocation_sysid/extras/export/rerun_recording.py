@@ -51,7 +51,7 @@ GREY = (150, 160, 170)
 def write_rerun(
     run: str | Path, folder: str | Path, experiment: str | None = None
 ) -> list[str]:
-    """Write the recording of a run folder for the Rerun viewer.
+    """Write the recording of a run folder for the Rerun viewer, ``recording.rrd``.
 
     Parameters
     ----------
@@ -65,12 +65,13 @@ def write_rerun(
     Returns
     -------
     list of str
-        What is missing in the recording.
+        What is missing in the recording, a sentence for each experiment without stresses.
 
     Raises
     ------
     InputError
-        Without rerun-sdk, or if `run` is not a run folder or has no such experiment.
+        Without rerun-sdk, if `run` is not a run folder, has no such experiment or none with a
+        trajectory, or if `folder` has other files.
     """
     if find_spec("rerun") is None:
         raise InputError(MISSING)
@@ -97,8 +98,8 @@ def write_rerun(
 
 
 def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
-    """Return the von Mises stress (T, F) on the surface [Pa]; None if the run has no frames of it,
-    or the experiment was not fitted.
+    """Return the von Mises stress (T, F) [Pa] on the F triangles of the surface of an experiment of
+    a run folder; None if the run has no frames of it, or the experiment was not fitted.
     """
     if replay.positions_m is None:  # only fitted experiments have frames
         return None
@@ -201,7 +202,9 @@ class _Recording:
         self.stream.disconnect()
 
     def _layout(self, replays: Sequence[MotionRecord]) -> Any:
-        """Return the layout of the viewer: the bodies beside curves and the summary."""
+        """Return the layout of the viewer, a blueprint: the bodies of the experiments beside curves
+        of residuals and parameters and the summary.
+        """
         views: Any = import_module("rerun.blueprint")
         bodies = [
             views.Spatial3DView(origin=self._path(e.name), name=e.name)
@@ -222,7 +225,9 @@ class _Recording:
         return views.Blueprint(views.Horizontal(views.Tabs(*bodies), right))
 
     def _path(self, *parts: str) -> str:
-        """Return the path of an entity, in which names of users may have any characters."""
+        """Return the path of an entity from its parts, escaped, because names of users may have any
+        characters.
+        """
         return self.rr.new_entity_path(list(parts))
 
     def _write_parameters(self, result: Result, span_s: Array) -> None:
@@ -325,17 +330,18 @@ class _Recording:
         stress: Array | None,
         limits: tuple[float, float],
     ) -> None:
-        """Write the deforming surface and the largest stress at each sample; samples that are not
-        finite are left out.
+        """Write the deforming surface, and, if the stress is known, the curve of the largest stress
+        on it; samples with a position that is not finite have no surface.
 
         Parameters
         ----------
         replay : MotionRecord
-            It has shapes.
+            Experiment with a fitted or simulated trajectory.
         stress : (T, F) array or None
-            Von Mises stress on the surface [Pa], which colours it; None for grey.
+            Von Mises stress on the F triangles of the surface [Pa], which colours it; None for a
+            grey surface.
         limits : (low, high)
-            Ends of the colour scale [Pa].
+            Ends of the colour scale [Pa]; not used without stress.
         """
         rr = self.rr
         shapes_m = replay.shapes_m

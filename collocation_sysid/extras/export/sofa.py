@@ -54,7 +54,8 @@ CAPABILITIES = TargetCapabilities(
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the scene with its limitations, one file.
+    """Return the scene as one text file, and what SOFA cannot express; obstacles and grasps are
+    fixed at their positions of the first sample.
 
     Raises
     ------

@@ -72,7 +72,8 @@ SINGLE_AXES = "nodes that are held along single axes only are free"
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the USD stage.
+    """Return the USD stage as a text file, with bodies, grippers, obstacles and the simulated
+    motion, and what the stage cannot express.
 
     Raises
     ------
@@ -134,8 +135,8 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
 
 def _rate_hz(t_s: Array) -> float:
-    """Return the time codes per second: one for each sample (T,), on average where samples are
-    uneven.
+    """Return the time codes per second, so that each sample at `t_s` (T,) [s] has one, on average
+    where samples are uneven; `SINGLE_RATE_HZ` for fewer than two samples.
     """
     return (
         (len(t_s) - 1) / float(np.ptp(t_s)) if len(t_s) > 1 else SINGLE_RATE_HZ
@@ -458,7 +459,10 @@ def _add_obstacle(
 
 
 def _unique_prim_names(names: Sequence[str]) -> list[str]:
-    """Return names that USD accepts, a different one for each of `names`."""
+    """Return names that USD accepts, a different one for each of `names`, in the same order: other
+    characters than letters, digits and "_" are replaced by "_", and "_" is added where two would
+    agree.
+    """
     unique: list[str] = []
     for name in names:
         text = re.sub(r"[^A-Za-z0-9_]", "_", name)
@@ -476,10 +480,19 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     Grasped nodes and obstacles stay at their positions of the first sample; the number of steps is
     fixed, and convergence is not checked.
 
+    Parameters
+    ----------
+    body : IdentifiedBody
+        Body that was exported.
+    folder : Path
+        Folder with the stage; nothing is written to it.
+
     Raises
     ------
     InputError
         If Newton is not installed.
+    SimulationError
+        If the equilibrium of this package cannot be computed.
     """
     try:
         newton: Any = import_module("newton")

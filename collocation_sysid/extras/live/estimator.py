@@ -167,8 +167,8 @@ class LiveUpdate:
 
 
 def _require_phases(problem: Problem) -> None:
-    """Raise an `InputError` for a two-phase field without phases, which live estimation cannot
-    find.
+    """Raise an `InputError` for a problem with a two-phase field without known phases, which live
+    estimation cannot find.
     """
     for name, modes in problem.two_phase_fields.items():
         if not modes.has_phases:
@@ -290,21 +290,24 @@ class LiveEstimator:
         wrench: Any = None,
         readings: Mapping[str, Any] | None = None,
     ) -> LiveUpdate:
-        """Process a frame and return the result.
+        """Process a frame and return the result, which is also stored in `last`.
+
+        Frames should be in order of time; late, doubled and missing ones are allowed, see
+        `process_frame`.
 
         Parameters
         ----------
         t_s : float
-            Time of the frame.
+            Time of the frame [s].
         pose : 4×4 matrix, (position, quaternion x y z w), or None
             Pose of the moving grasp, None if it is missing; for several grasps a mapping by their
-            number from "1" on, or a list in the order of the problem.
+            number, as text from "1" on, or a list in the order of the problem.
         markers : (M, 3) array, or mapping of name to (3,)
-            Marker positions; NaN, or omitted, where missing.
+            Marker positions [m]; NaN, or omitted, where missing.
         wrench : (6,) or (3,) array, optional
             Wrench of the grasp on the body: fx, fy, fz [N], tx, ty, tz [N m], at the time of the
             frame; or a mapping with ``t_s`` and ``values``, or a list of such mappings; for several
-            sensors a mapping by the number of their grasp. NaN, or None, where missing.
+            sensors a mapping by the number of their grasp, as text. NaN, or None, where missing.
         readings : mapping of name to numbers, optional
             Values of custom sensors at the time of the frame; or mappings with ``t_s`` and
             ``values``, or lists of such mappings. NaN, or None, where missing.
@@ -340,12 +343,16 @@ class LiveEstimator:
     def process_frame(self, frame: Frame) -> LiveUpdate:
         """Process a validated frame and return the result, which is also stored in `last`.
 
-        Frames that are ignored, and those before the first pose, give a result as well, with a
-        note where there is a reason. After a gap in the poses the estimator restarts from rest with
-        the information of the samples so far as a prior. When the motion begins after a long rest,
-        it starts as if the stream had begun with the last frames at rest, see `InitialRest`. Rows
-        that cannot be simulated raise no
-        error: the verdict of the result says so.
+        Frames that are ignored, and those before the first pose, give a result as well, with a note
+        where there is a reason. After a gap in the poses the estimator restarts from rest with the
+        information of the samples so far as a prior. When the motion begins after a long rest, it
+        starts as if the stream had begun with the last frames at rest, see `InitialRest`. Rows that
+        cannot be simulated raise no error: the verdict of the result says so.
+
+        Parameters
+        ----------
+        frame : Frame
+            Frame with the moving grasps, markers and instruments of the problem, in its order.
         """
         began = self.clock()
         frame, notes = self._checked_frame(frame)
@@ -412,8 +419,8 @@ class LiveEstimator:
 
     @property
     def node_positions_m(self) -> Array | None:
-        """Node positions (n, 3) of the latest row at the estimate [m], to first order around the
-        linearisation point; None before the first row.
+        """Node positions (n, 3) [m] of the body at the latest row, at the estimate, to first order
+        around the linearisation point; None before the first row.
         """
         if self.first_pass is None:
             return None
@@ -427,7 +434,8 @@ class LiveEstimator:
     def finish(self) -> LiveUpdate | None:
         """Return the final result of all frames, however long that takes.
 
-        Call it after the last frame.
+        Call it once, after the last frame: the state of the estimator may change, but `last` does
+        not.
 
         If the window holds the whole recording, this is the run of the batch. Otherwise, and if
         markers were measured between samples, the rows in the window are computed again until the
@@ -439,7 +447,7 @@ class LiveEstimator:
             The update of the last frame with new estimates, and after a batch run the root mean
             square distance of all markers; its notes are those of this function. The last update
             itself if no row could be computed since the start or a restart, and None if there was
-            no frame. `last` is not changed.
+            no frame.
         """
         began = self.clock()
         notes = ["final estimate after the last frame"]
@@ -471,15 +479,25 @@ class LiveEstimator:
             relinearised=rows,
         )
 
-    def _solve_batch(self, track: WindowPass, notes: list[str]) -> Run | None:
+    def _solve_batch(
+        self, first_pass: WindowPass, notes: list[str]
+    ) -> Run | None:
         """Return the run of the batch solve of the complete recording.
 
-        None if the window does not hold the whole recording, or if the solve is refused, which adds
-        to `notes`.
+        None if the window does not hold the whole recording, if that cannot be solved as a batch
+        (see `recording_from_log`), or if the solve is refused, which adds a sentence to `notes`, in
+        place. The estimator is not changed.
+
+        Parameters
+        ----------
+        first_pass : WindowPass
+            Its prior is empty if the window holds the whole recording.
+        notes : list of str
+            Extended in place.
         """
         recording = (
             None
-            if track.prior.row_count
+            if first_pass.prior.row_count
             else recording_from_log(self.model, self.intake, log=self.log)
         )
         try:
@@ -496,11 +514,22 @@ class LiveEstimator:
 
     def _repeat_until_settled(self, began: float, notes: list[str]) -> int:
         """Compute the rows in the window again, without a time limit, until no further pass is
-        needed or `FINAL_PASSES` passes are done.
+        needed or `FINAL_PASSES` times as many rows as the window has are computed.
 
-        The number of rows that were computed is returned; rows computed in several passes count
-        in each. The state of the estimator is changed as by `_repeat_rows`, its option `rows` is
-        not. `began` is the time at which the work began, by `clock`; `notes` are extended in place.
+        The state of the estimator is changed as by `_repeat_rows`: passes are accepted or rejected
+        and the estimate moves. The attribute `rows` is the same afterwards.
+
+        Parameters
+        ----------
+        began : float
+            Time at which the work began, by `clock` [s].
+        notes : list of str
+            Events of the passes; extended in place.
+
+        Returns
+        -------
+        int
+            Number of rows that were computed; rows computed in several passes count in each.
         """
         rows_per_frame, self.rows = self.rows, FINAL_PASSES * len(self.log)
         try:
@@ -509,11 +538,12 @@ class LiveEstimator:
             self.rows = rows_per_frame
 
     def _checked_frame(self, frame: Frame) -> tuple[Frame, list[str]]:
-        """Return the frame with NaN for markers that are farther than `REACH_BODY_SIZES` allows
-        from the last known position of every moving grasp, and notes; counts are updated.
+        """Return the frame with NaN for markers that are implausibly far from the last known
+        position of every moving grasp, and notes on them; the frame itself is not changed.
 
-        Before the first pose no marker is excluded. A wrench without a sensor in the problem is
-        noted once.
+        Markers are excluded beyond a distance that follows from `REACH_BODY_SIZES`; before the
+        first pose none is. A wrench without a sensor in the problem is noted once. `counts`,
+        `samples` and the last known positions are updated.
         """
         notes = []
         if frame.has_wrench and not self.model.wrenches:
@@ -539,29 +569,31 @@ class LiveEstimator:
             )
         return frame, notes
 
-    def _note_outliers(self, wild: NDArray[np.bool_]) -> str:
-        """Add the outliers, given by a mask (M,) of the markers with at least one true value, to
-        the counts; return a note with their names.
+    def _note_outliers(self, is_outlier: NDArray[np.bool_]) -> str:
+        """Add the number of outliers to the counts, and return a note with their names;
+        `is_outlier` (M,) says which markers are, at least one.
         """
-        self.counts["wild"] += int(wild.sum())
-        names = ", ".join(self.names[m] for m in np.flatnonzero(wild))
+        self.counts["wild"] += int(is_outlier.sum())
+        names = ", ".join(self.names[m] for m in np.flatnonzero(is_outlier))
         return f"markers ignored as outliers: {names}"
 
     def _compute_rows(
         self, rows: Sequence[LoggedRow], squares: list[Array]
     ) -> tuple[int, list[str]]:
-        """Compute and log new rows with the first pass, as many as possible at once.
+        """Compute and log new rows with the first pass, as many as possible at once, with their
+        samples.
 
-        The first row starts the pass. If the initial state cannot be computed, the frames are
-        discarded; if a later row cannot be simulated, the pass is marked as failed, and rows are
-        only logged.
+        The first row starts the pass. If the initial state cannot be computed, all frames in the
+        buffer are discarded; if a later row cannot be simulated, the pass is marked as failed, and
+        rows are only logged.
 
         Parameters
         ----------
         rows : sequence of LoggedRow
-            At least one row.
-        squares : list
-            Squared marker residuals [m²] of the frame; extended in place.
+            New rows, at least one; not modified. The caller passes those that are not done again.
+        squares : list of (M,) array
+            Squared distances [m²] of the markers of the frame's samples from the estimate's; an
+            array is appended for each sample, in place.
 
         Returns
         -------
@@ -570,21 +602,24 @@ class LiveEstimator:
         """
         done = 1
         notes = []
-        track = self.first_pass
+        first_pass = self.first_pass
         try:
-            if track is None:
+            if first_pass is None:
                 self._start_pass(rows[0])
-            elif not track.has_failed:
-                done = track.add_rows(
-                    [row.poses for row in rows[: track.remaining_rows_of_block]]
+            elif not first_pass.has_failed:
+                done = first_pass.add_rows(
+                    [
+                        row.poses
+                        for row in rows[: first_pass.remaining_rows_of_block]
+                    ]
                 )
         except SimulationError as error:
-            if track is None:
+            if first_pass is None:
                 self.intake.reset()
                 return 1, [
                     f"the initial state of the motion cannot be computed: {error}"
                 ]
-            track.has_failed = True
+            first_pass.has_failed = True
             notes = [
                 f"the body cannot be simulated with these parameters: {error}"
             ]
@@ -611,15 +646,15 @@ class LiveEstimator:
         rows : int
             Number of rows computed since the row after which the samples are evaluated.
         """
-        track = self.first_pass
-        if track is None:
+        first_pass = self.first_pass
+        if first_pass is None:
             return []
         notes = []
         sigma_m = self.model.segment.experiment.markers.sigma_m[:, None]
-        if track.has_failed:
+        if first_pass.has_failed:
             self.log[-1].samples.extend(readings)
             return notes
-        all_linearised = track.sweep.linearise_samples(
+        all_linearised = first_pass.sweep.linearise_samples(
             [(reading, rows) for reading in readings]
         )
         for reading, linearised in zip(readings, all_linearised, strict=True):
@@ -638,13 +673,20 @@ class LiveEstimator:
                 squared = np.sum((residual * sigma_m) ** 2, axis=1)
                 squares.append(squared)
             self.log[-1].samples.append(reading)
-        track.add_residuals(all_linearised)
+        first_pass.add_residuals(all_linearised)
         return notes
 
     def _outliers(self, residual: Array) -> NDArray[np.bool_]:
-        """Return a mask (M,) of markers whose residuals (M, 3), in standard deviations, are far
-        larger than usual; all false while the estimate has not settled, or if most markers would be
-        outliers.
+        """Return a mask (M,) of markers whose residuals are far larger than usual
+        (`OUTLIER_RATIO`).
+
+        It is false for all markers while the estimate has not settled or residuals are gross, if
+        most markers would be outliers, and for missing ones. Nothing is changed.
+
+        Parameters
+        ----------
+        residual : (M, 3) array
+            Residuals of one sample, in standard deviations of the markers; NaN where missing.
         """
         if (
             self.linearisation_distance > LARGEST_SETTLED_DISTANCE
@@ -660,19 +702,27 @@ class LiveEstimator:
     # Beginnings -------------------------------------------------------------------------------
 
     def _set_bounds(self) -> None:
-        """Set the bounds of p, `lower` and `upper`, from the model."""
+        """Set the attributes `lower` and `upper`, bounds (P,) of the parameters p in the solver's
+        coordinates, from the model.
+        """
         self.lower, self.upper = self.model.collocation.parameter_bounds
 
     def _new_search(self) -> StiffnessSearch:
-        """Return a new search for initial values."""
+        """Return a new search for initial values over a range of stiffness, with the present
+        nuisance parameters; it has not begun, and the estimator is not changed.
+        """
         return StiffnessSearch(self.model, self.p[self.model.collocation.nq :])
 
     def _warm_up(self) -> tuple[Poses, Array] | None:
-        """Compile the kernels before the first frame, and measure computing times for `budget`.
+        """Compile the kernels before the first frame with rows at the first pose of the problem's
+        recording, and set `budget` to their measured computing times.
 
-        Return the poses of all grasps and the positions (3n,) at the start of the problem's
-        recording. None if it cannot be computed at the initial parameters; `budget` then stays
-        without times.
+        Returns
+        -------
+        tuple or None
+            The first poses of all grasps of the problem's recording, each a rotation (3, 3) and a
+            position (3,) [m], and the node positions (3n,) [m] in equilibrium there. None if these
+            cannot be computed at the initial parameters; `budget` then stays without times.
         """
         poses = self.model.first_poses
         moving_poses = tuple(poses[k] for k in self.model.moving_grasps)
@@ -710,32 +760,36 @@ class LiveEstimator:
             trial.rows - 1, self.model.rows_per_chunk, self._block_rows - 1
         )
         for count in (1, most) * TIMING_REPETITIONS:
-            again = WindowPass(
+            second_pass = WindowPass(
                 self.model,
                 self.p,
                 prior=self.prior,
                 block_rows=self._block_rows,
                 base=trial,
             )
-            again.repeat_rows([row])
+            second_pass.repeat_rows([row])
             began = self.clock()
-            again.repeat_rows([row] * count)
+            second_pass.repeat_rows([row] * count)
             took_s[count] = min(took_s.get(count, np.inf), self.clock() - began)
         return TimeBudget.from_times(took_s[1], took_s[most], many=most)
 
     def _start_pass(self, row: LoggedRow) -> None:
-        """Start the first pass with the first row, and set unknown marker places from its
-        markers.
+        """Start the first pass with the first row, and set unknown marker places from its markers.
 
         The initial guess of the positions is that of the start of the problem's recording, moved
         rigidly with the pose, if there is a single grasp. If marker places are set, `model`, the
         bounds, the nuisance parameters in `p` and `prior` are replaced, and the row is computed
-        again.
+        again. `first_pass` is set; the samples of the row are not added to it.
+
+        Parameters
+        ----------
+        row : LoggedRow
+            First row, with the samples of its markers, if there are any.
 
         Raises
         ------
         SimulationError
-            If the initial state cannot be computed.
+            If the initial state cannot be computed; there is then no first pass.
         """
         model = self.model
         guesses = []
@@ -752,10 +806,10 @@ class LiveEstimator:
                     + position
                 ).ravel()
             ]
-        track = WindowPass(
+        first_pass = WindowPass(
             model, self.p, prior=self.prior, block_rows=self._block_rows
         )
-        track.add_rows([row.poses], guesses)
+        first_pass.add_rows([row.poses], guesses)
         marker_samples = [
             reading.values for reading in row.samples if not reading.instrument
         ]
@@ -765,26 +819,27 @@ class LiveEstimator:
             else np.full((len(self.names), 3), np.nan)
         )
         self.model = model.with_marker_places(
-            first, track.blocks[0].stored_rows[0].x
+            first, first_pass.blocks[0].stored_rows[0].x
         )
         if self.model is not model:
             self._set_bounds()
             places = self.model.collocation.guess_p[model.collocation.nq :]
             self.p = np.concatenate([self.p[: model.collocation.nq], places])
             self.prior = SquareRootInformation.empty(self.model.parameter_count)
-            track = WindowPass(
+            first_pass = WindowPass(
                 self.model,
                 self.p,
                 prior=self.prior,
                 block_rows=self._block_rows,
             )
-            track.add_rows([row.poses], guesses)
-        self.first_pass = track
-        self._combined = CombinedPasses.from_passes(track, None)
+            first_pass.add_rows([row.poses], guesses)
+        self.first_pass = first_pass
+        self._combined = CombinedPasses.from_passes(first_pass, None)
 
     def _restart(self) -> None:
         """Keep the information of all samples so far as a prior, discard passes, log and frames,
-        and wait for a new start; estimate and counts stay.
+        and wait for a new start; the estimate stays. The restart is counted in `counts`, as "begun
+        anew".
         """
         if self.first_pass is not None:
             self.prior = self.first_pass.measured_information
@@ -797,7 +852,18 @@ class LiveEstimator:
         self, frame: Frame, notes: list[str]
     ) -> list[LoggedRow]:
         """Start anew if the motion begins with this frame after a long rest, and return the rows of
-        the last frames at rest; otherwise an empty list. `notes` are extended in place.
+        the last frames at rest, with their samples.
+
+        Otherwise, and while there is no first pass, the list is empty. Starting anew discards
+        estimate and information, see `_start_anew`, and the frames at rest are added to the buffer
+        again; this frame is not.
+
+        Parameters
+        ----------
+        frame : Frame
+            Next frame, whose pose may be None.
+        notes : list of str
+            Extended in place if the motion begins.
         """
         frames = self._initial_rest.frames_before_motion(frame)
         if not frames or self.first_pass is None:
@@ -815,7 +881,9 @@ class LiveEstimator:
         return rows
 
     def _buffered(self, frame: Frame) -> BufferedFrame:
-        """Add a frame to the buffer and return the rows that it completes."""
+        """Add a frame to the buffer, which is changed, and return the rows that it completes, late
+        samples and notes; no row is computed.
+        """
         return self.intake.add_frame(
             frame.t_s,
             frame.pose,
@@ -824,8 +892,11 @@ class LiveEstimator:
         )
 
     def _start_anew(self) -> None:
-        """Discard passes, log, frames and information, and return to the initial guess or to a
-        new search for it; counts and positions of markers stay.
+        """Discard passes, log, frames and information, the prior included, and return to the
+        initial guess or to a new search for it.
+
+        Trust region and scatter are as at the beginning, and a further search is allowed; other
+        counts, the samples so far and places of markers on the body stay.
         """
         model = self.model
         self.first_pass = self.second_pass = None
@@ -847,7 +918,8 @@ class LiveEstimator:
 
     @property
     def linearisation_distance(self) -> float:
-        """Largest distance of the estimate from the linearisation points, in standard errors.
+        """Largest distance of the estimate from the linearisation points of the rows in the window,
+        in standard errors of single material parameters.
 
         Infinite if there is no pass, or if it failed.
         """
@@ -858,7 +930,7 @@ class LiveEstimator:
         )
 
     def _largest_distance(
-        self, track: WindowPass, p: Array, points: Sequence[Array]
+        self, first_pass: WindowPass, p: Array, points: Sequence[Array]
     ) -> float:
         """Return the largest distance of p from some points, in the standard errors of a pass; 0
         without points.
@@ -868,10 +940,10 @@ class LiveEstimator:
 
         Parameters
         ----------
-        track : WindowPass
+        first_pass : WindowPass
             Pass whose standard errors are used.
         p : (P,)
-            Parameters, not transformed.
+            Parameters in the solver's coordinates, not transformed.
         points : sequence of (P,)
             Points in transformed parameters, see `StreamingModel.transformed`.
         """
@@ -879,14 +951,15 @@ class LiveEstimator:
         distances = np.abs(np.array(points) - self.model.transformed(p))[:, :nq]
         return float(
             np.max(
-                distances / track.information.standard_errors[:nq], initial=0.0
+                distances / first_pass.information.standard_errors[:nq],
+                initial=0.0,
             )
         )
 
     def _update_estimate(self) -> None:
-        """Set the estimate `p` to the minimum of the joint quadratic loss of the first and the
-        second pass, within bounds and trust region; without effect before the first pass, or if it
-        failed.
+        """Set the estimate `p` (P,) to the minimum of the joint quadratic loss of the first and the
+        second pass, within bounds and trust region; without effect before the first pass, or if
+        that failed.
         """
         if self.first_pass is not None and not self.first_pass.has_failed:
             self._combined = CombinedPasses.from_passes(
@@ -897,36 +970,55 @@ class LiveEstimator:
             )
 
     def _constrained_minimum(
-        self, track: WindowPass, known: SquareRootInformation
+        self, first_pass: WindowPass, known: SquareRootInformation
     ) -> Array:
-        """Return the p (P,) that minimises the quadratic loss of `known`, within the bounds and the
-        trust region about the linearisation point of a pass.
+        """Return the parameters p (P,), in the solver's coordinates, that minimise a quadratic loss
+        within the bounds and the trust region about the linearisation point of a pass.
+
+        Parameters
+        ----------
+        first_pass : WindowPass
+            Pass whose linearisation point is the centre of the trust region.
+        known : SquareRootInformation
+            Quadratic loss, in transformed parameters.
         """
         reach = self._trust * self.model.collocation.reach_p
-        low = np.maximum(self.lower, track.linearisation_point - reach)
-        high = np.minimum(self.upper, track.linearisation_point + reach)
+        low = np.maximum(self.lower, first_pass.linearisation_point - reach)
+        high = np.minimum(self.upper, first_pass.linearisation_point + reach)
         best = known.minimiser(
             self.model.transformed(low), self.model.transformed(high)
         )
         return np.clip(self.model.physical(best), low, high)
 
-    def _next_linearisation_point(self, track: WindowPass) -> Array:
-        """Return the next linearisation point p (P,) of a pass.
+    def _next_linearisation_point(self, first_pass: WindowPass) -> Array:
+        """Return the next linearisation point p (P,) of a pass, in the solver's coordinates
+        (logarithms, or values of linear parameters; not transformed).
 
-        It minimises the joint quadratic loss of both passes, with a weak prior at the last
-        linearisation point, which keeps poorly determined parameters there, within bounds and trust
-        region.
+        It minimises the joint quadratic loss of the first and the second pass, plus a prior about
+        the linearisation point of the first one, within the bounds and the trust region about that
+        point. The prior keeps poorly determined parameters there, and is weaker the more rows are
+        in the window. Nothing is changed.
+
+        Parameters
+        ----------
+        first_pass : WindowPass
+            The first pass.
         """
         size = self.model.parameter_count
         samples = len(self.log) / self.model.substeps
         deviation = POINT_PRIOR_DEVIATION * max(1.0, samples / TRIAL_SAMPLES)
         slopes = np.diag(
-            1 / (deviation * self.model.collocation.reach_p * track.sweep.rates)
+            1
+            / (
+                deviation
+                * self.model.collocation.reach_p
+                * first_pass.sweep.rates
+            )
         )
         information = self._combined.information.with_rows(
-            np.zeros(size), slopes, parameters=track.sweep.transformed
+            np.zeros(size), slopes, parameters=first_pass.sweep.transformed
         )
-        return self._constrained_minimum(track, information)
+        return self._constrained_minimum(first_pass, information)
 
     def _estimates_and_trust(
         self, t_s: float
@@ -970,7 +1062,8 @@ class LiveEstimator:
     def _estimates_at(
         self, known: SquareRootInformation, p: Array
     ) -> dict[str, Estimate]:
-        """Return estimates with intervals by name, without the coefficients of fields.
+        """Return estimates with standard errors and 95 % intervals by name, in the units of the
+        problem, without the coefficients of fields.
 
         Their variances are scaled by `variance_factor` with the present scatter of the residuals.
 
@@ -979,7 +1072,8 @@ class LiveEstimator:
         known : SquareRootInformation
             Information in transformed parameters, including the priors.
         p : (P,)
-            Parameters, not transformed; those within `AT_BOUND` of a bound count as at it.
+            Parameters in the solver's coordinates, not transformed; those within `AT_BOUND` of a
+            bound count as at it.
         """
         collocation = self.model.collocation
         nq = self.model.collocation.nq
@@ -1010,15 +1104,16 @@ class LiveEstimator:
     def _repeat_rows(
         self, began: float, notes: list[str], done: int = 0
     ) -> int:
-        """Continue or start a second pass within the rest of the budget.
+        """Continue the second pass, or start one, within the rest of the frame's budget.
 
         Passes follow one another, the trials of a search included, until none is needed or no
-        further row is affordable. Without effect before the first pass.
+        further row is affordable. Passes, estimate and budget are changed. Without effect before
+        the first pass.
 
         Parameters
         ----------
         began : float
-            Time at which the frame began.
+            Time at which the frame began, by `clock` [s].
         notes : list of str
             Extended in place.
         done : int
@@ -1027,7 +1122,7 @@ class LiveEstimator:
         Returns
         -------
         int
-            Number of rows computed again in this frame.
+            Number of rows computed again in this frame, `done` included.
         """
         while self.first_pass is not None:
             pass_began = self.clock()
@@ -1038,32 +1133,35 @@ class LiveEstimator:
                     self.first_pass, notes
                 )
                 self.budget.record_relinearisation(self.clock() - pass_began)
-            again = self.second_pass
-            if again is None:
+            second_pass = self.second_pass
+            if second_pass is None:
                 break
-            if not done and again.base is not None:
+            if not done and second_pass.base is not None:
                 self._relinearise_if_moved(
                     self.first_pass,
-                    again,
+                    second_pass,
                     began=began,
                     distance=RELINEARISE_DISTANCE,
                 )
             affordable = min(
                 self._affordable_rows(done, self.clock() - began),
-                again.repeatable_rows,
+                second_pass.repeatable_rows,
             )
             if not affordable:
                 break
-            done += self._advance_second_pass(again, affordable, notes=notes)
+            done += self._advance_second_pass(
+                second_pass, affordable, notes=notes
+            )
         return done
 
     def _catch_up(self, began: float, notes: list[str]) -> int:
-        """Complete a second pass that lags by few rows, if there is time, before new rows come.
+        """Complete a second pass that lags by few rows, if there is time, before new rows come; it
+        is then accepted or rejected.
 
         Parameters
         ----------
         began : float
-            Time at which the frame began, by `clock`.
+            Time at which the frame began, by `clock` [s].
         notes : list of str
             Extended in place.
 
@@ -1073,50 +1171,65 @@ class LiveEstimator:
             Number of rows that were computed again; 0 without a second pass, if it is a trial of a
             search, or if the remaining rows do not fit into the budget beside a usual frame.
         """
-        again = self.second_pass
-        if again is None or again.base is None:
+        second_pass = self.second_pass
+        if second_pass is None or second_pass.base is None:
             return 0
-        lag = len(self.log) - again.rows
+        lag = len(self.log) - second_pass.rows
         elapsed_s = self.clock() - began
         if lag > min(
-            again.repeatable_rows,
+            second_pass.repeatable_rows,
             self._affordable_rows(0, elapsed_s + self.budget.frame_s),
         ):
             return 0
-        return self._advance_second_pass(again, lag, notes=notes)
+        return self._advance_second_pass(second_pass, lag, notes=notes)
 
     def _advance_second_pass(
-        self, again: WindowPass, count: int, notes: list[str]
+        self, second_pass: WindowPass, count: int, notes: list[str]
     ) -> int:
-        """Compute up to `count` rows of the second pass; if it has caught up or failed, accept or
-        reject it, or record it as a trial of the search.
+        """Compute further rows of the second pass; if it has caught up or failed, accept or reject
+        it, or record it as a trial of the search.
 
         While trials of a search are left, the pass is such a trial, which ends after
-        `StiffnessSearch.rows` rows. A row that cannot be solved marks the pass as failed. Return
-        the number of rows that were computed. `notes` are extended in place.
+        `StiffnessSearch.rows` rows. A row that cannot be solved marks the pass as failed. The
+        computing time is recorded in `budget`.
+
+        Parameters
+        ----------
+        second_pass : WindowPass
+            The second pass, changed in place.
+        count : int
+            Largest number of rows, at least 1; those of the log that follow the rows of the pass.
+        notes : list of str
+            Extended in place.
+
+        Returns
+        -------
+        int
+            Number of rows that were computed.
         """
         before = self.clock()
-        first_row = again.rows
+        first_row = second_pass.rows
         try:
-            again.repeat_rows(self.log[first_row : first_row + count])
+            second_pass.repeat_rows(self.log[first_row : first_row + count])
         except SimulationError:
-            again.has_failed = True
+            second_pass.has_failed = True
         self.budget.record_steps(count, self.clock() - before)
         if self.search is not None and not self.search.is_done:
-            if again.has_failed or again.rows >= min(
+            if second_pass.has_failed or second_pass.rows >= min(
                 self.search.rows, len(self.log)
             ):
-                self.search.record_trial(again)
+                self.search.record_trial(second_pass)
                 self.second_pass = None
         elif (
-            again.has_failed or again.rows == len(self.log)
+            second_pass.has_failed or second_pass.rows == len(self.log)
         ) and self.first_pass is not None:
-            self._accept_or_reject(self.first_pass, again, notes=notes)
-        return again.rows - first_row
+            self._accept_or_reject(self.first_pass, second_pass, notes=notes)
+        return second_pass.rows - first_row
 
     def _affordable_rows(self, done: int, elapsed_s: float) -> int:
         """Return how many rows may be computed again: as many as fit into the rest of the time
-        budget of the frame, or, if `rows` per frame is fixed, these minus `done`.
+        budget of the frame, or, if the attribute `rows`, the number per frame, is fixed, these
+        minus `done`.
 
         Parameters
         ----------
@@ -1130,26 +1243,34 @@ class LiveEstimator:
         return self.budget.affordable_steps(self.budget_s - elapsed_s)
 
     def _start_second_pass(
-        self, track: WindowPass, notes: list[str]
+        self, first_pass: WindowPass, notes: list[str]
     ) -> WindowPass | None:
-        """Return a new second pass, without rows yet, if one is needed, otherwise None.
+        """Return a new second pass, without rows yet, if one is needed, otherwise None; the caller
+        sets `second_pass`.
 
         During a search for initial values it is needed for the next trial, once there are enough
-        rows, and for the best values at the end; a search begins here if the first pass `track`
-        failed before rows left the window. If no trial succeeded, the search ends with a note.
-        Without a search a pass is needed if the estimate has moved farther than `REPEAT_DISTANCE`
-        from a linearisation point of `track`, or if the sweep needs another pass, but not after a
-        failure. `notes` are extended in place.
+        rows, and for the best values at the end; a search begins here, and sets `search`, if the
+        first pass failed before rows left the window. If no trial succeeded, the search ends with a
+        note. Without a search a pass is needed if the estimate has moved farther than
+        `REPEAT_DISTANCE` from a linearisation point of the first pass, or if its sweep needs
+        another pass, but not after a failure.
+
+        Parameters
+        ----------
+        first_pass : WindowPass
+            The first pass, not changed; a new pass repeats it, but for a trial.
+        notes : list of str
+            Beginning and failure of a search; extended in place.
         """
         search = self.search
-        at_start = track.start[0] is None
-        if search is None and track.has_failed and at_start:
+        at_start = first_pass.start[0] is None
+        if search is None and first_pass.has_failed and at_start:
             search = self.search = self._new_search()
             notes.append(
                 "searching for initial values over a range of stiffnesses"
             )
         p = self.p
-        base = track
+        base = first_pass
         if search is not None:
             if not search.is_done and (
                 len(self.log) < search.rows or not at_start
@@ -1163,29 +1284,29 @@ class LiveEstimator:
                     "found no initial values over a range of stiffnesses"
                 )
                 return None
-        elif track.has_failed:
+        elif first_pass.has_failed:
             return None
         else:
-            p = self._next_linearisation_point(track)
+            p = self._next_linearisation_point(first_pass)
             if (
                 self._largest_distance(
-                    track, p, points=track.linearisation_points
+                    first_pass, p, points=first_pass.linearisation_points
                 )
                 <= REPEAT_DISTANCE
-                and not track.sweep.needs_another_pass
+                and not first_pass.sweep.needs_another_pass
             ):
                 return None
         return WindowPass(
             self.model,
             p,
-            prior=track.prior,
+            prior=first_pass.prior,
             block_rows=self._block_rows,
             base=base,
         )
 
     def _relinearise_if_moved(
         self,
-        track: WindowPass,
+        first_pass: WindowPass,
         pass_to_move: WindowPass,
         began: float,
         distance: float,
@@ -1197,20 +1318,20 @@ class LiveEstimator:
 
         Parameters
         ----------
-        track : WindowPass
+        first_pass : WindowPass
             First pass, which gives the standard errors.
         pass_to_move : WindowPass
-            Pass to change.
+            Pass to change, in place; may be the first one.
         began : float
-            Time at which the frame began.
+            Time at which the frame began, by `clock` [s].
         distance : float
-            Distance in standard errors.
+            Smallest distance between point and estimate, in standard errors.
         """
         current_point = [pass_to_move.sweep.transformed]
         if (
             pass_to_move.rows
             < pass_to_move.last_relinearised_row + self.model.rows_per_chunk
-            or self._largest_distance(track, self.p, points=current_point)
+            or self._largest_distance(first_pass, self.p, points=current_point)
             <= distance
         ):
             return
@@ -1219,45 +1340,59 @@ class LiveEstimator:
             0, before - began + self.budget.turn_s
         ):
             return
-        p = self._next_linearisation_point(track)
-        if self._largest_distance(track, p, points=current_point) > distance:
+        p = self._next_linearisation_point(first_pass)
+        if (
+            self._largest_distance(first_pass, p, points=current_point)
+            > distance
+        ):
             pass_to_move.relinearise_at(p)
             self.budget.record_relinearisation(self.clock() - before)
 
     def _accept_or_reject(
-        self, track: WindowPass, again: WindowPass, notes: list[str]
+        self, first_pass: WindowPass, second_pass: WindowPass, notes: list[str]
     ) -> None:
-        """Replace the first pass `track` by the second one, `again`, if that fits about as well as
-        expected, and enlarge the trust region; otherwise discard it and shrink the region.
+        """Replace the first pass by the second one if that fits about as well as expected, and
+        enlarge the trust region; otherwise discard the second one and shrink the region.
 
         A pass that has not failed always replaces one that has. A search for initial values ends
         either way. After `LARGEST_REJECTIONS` rejections in a row with grossly large residuals, a
-        search begins, once in the life of the estimator. The estimate is updated, and `notes` are
-        extended in place.
+        search begins, once in the life of the estimator. The estimate is updated.
+
+        Parameters
+        ----------
+        first_pass : WindowPass
+            The present first pass.
+        second_pass : WindowPass
+            Pass over all rows of the log, or one that has failed.
+        notes : list of str
+            Extended in place.
         """
         self.second_pass = None
         was_search = self.search is not None
         self.search = None
-        points = [*track.linearisation_points, again.linearisation_points[0]]
-        expected = max(track.information.loss(point) for point in points)
+        points = [
+            *first_pass.linearisation_points,
+            second_pass.linearisation_points[0],
+        ]
+        expected = max(first_pass.information.loss(point) for point in points)
         # The loss of a pass whose linearisation point was changed is not that of a simulation.
         is_within_trust_region = (
-            track.last_relinearised_row
+            first_pass.last_relinearised_row
             and self._largest_distance(
-                track,
-                track.linearisation_point,
-                points=again.linearisation_points,
+                first_pass,
+                first_pass.linearisation_point,
+                points=second_pass.linearisation_points,
             )
             <= REPEAT_DISTANCE
         )
         fits = (
-            track.has_failed
+            first_pass.has_failed
             or is_within_trust_region
-            or again.loss <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
+            or second_pass.loss <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
         )
-        if not again.has_failed and fits:
-            again.base = None
-            self.first_pass = again
+        if not second_pass.has_failed and fits:
+            second_pass.base = None
+            self.first_pass = second_pass
             self._trust = (
                 INITIAL_RADIUS
                 if was_search
@@ -1266,14 +1401,17 @@ class LiveEstimator:
             self._rejected = 0
             if was_search:
                 notes.append("restarted with another stiffness")
-            self.scatter = CombinedPasses.from_passes(again, None).scatter(
-                again.sweep.transformed
-            )
+            self.scatter = CombinedPasses.from_passes(
+                second_pass, None
+            ).scatter(second_pass.sweep.transformed)
         else:
             reach = self.model.collocation.reach_p
             length = float(
                 np.abs(
-                    (again.linearisation_point - track.linearisation_point)
+                    (
+                        second_pass.linearisation_point
+                        - first_pass.linearisation_point
+                    )
                     / reach
                 ).max()
             )
@@ -1287,7 +1425,7 @@ class LiveEstimator:
                 is_stuck
                 and not was_search
                 and not self.counts["searched"]
-                and track.start[0] is None
+                and first_pass.start[0] is None
             ):
                 self.counts["searched"] += 1
                 self.search = self._new_search()
@@ -1298,10 +1436,11 @@ class LiveEstimator:
         self._update_estimate()
 
     def _drop_old_rows(self) -> None:
-        """Remove the oldest blocks of rows from the first pass and the log if the window is full.
+        """Remove the oldest blocks of rows from the first pass and the log if the window is full;
+        their information becomes part of the prior of the pass.
 
         While a second pass needs them, they stay, up to twice the window; beyond that the second
-        pass is discarded. A failed first pass with that many rows is restarted.
+        pass is discarded. A failed first pass with that many rows is restarted, see `_restart`.
         """
         if self.first_pass is None:
             return

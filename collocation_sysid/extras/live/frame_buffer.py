@@ -105,14 +105,15 @@ class FrameBuffer:
 
     @property
     def last_pose_s(self) -> float | None:
-        """Time of the last pose; None if there is none."""
+        """Time of the last pose [s]; None if there is none since the start or a reset."""
         return self._poses[-1][0] if self._poses else None
 
     def marker_samples(
         self, log: Sequence[LoggedRow]
     ) -> Iterator[tuple[float, Array]]:
-        """Yield time and positions (M, 3) of all marker samples of `all_samples`; times are in
-        samples from the first row on.
+        """Yield time and positions (M, 3) [m] of all marker samples of `all_samples`, NaN where
+        missing; times are in samples from the first row on, 1.5 for half way between the second and
+        the third.
         """
         for of, when, tracks_m in self.all_samples(log):
             if not of:
@@ -121,14 +122,16 @@ class FrameBuffer:
     def all_samples(
         self, log: Sequence[LoggedRow]
     ) -> Iterator[InstrumentSample]:
-        """Yield instrument number, time and values of all samples; markers have the number 0.
+        """Yield instrument number, time and values of all samples; markers have the number 0, their
+        values are (M, 3).
 
-        Times are in samples from the first row on. Samples that still wait for rows come last.
+        Times are in samples from the first row on. Samples that still wait for rows come last. The
+        buffer is not changed.
 
         Parameters
         ----------
         log : sequence of LoggedRow
-            Rows so far, with their samples.
+            All rows since the start, with their samples.
         """
         for number, row in enumerate(log):
             for back, values, of in row.samples:
@@ -300,13 +303,19 @@ class FrameBuffer:
         self._poses.append((t_s, positions_m, quaternions))
 
     def _time_s(self, row: int) -> float:
-        """Return the time of a row, given by index."""
+        """Return the time [s] of a time step, given by its index from the start of the grid, which
+        must be known.
+        """
         assert self.start_s is not None
         return self.start_s + row * self.interval_s / self.substeps
 
     def _completed_rows(self) -> list[LoggedRow]:
-        """Return the rows for which poses are available now, each with the samples that can be
-        evaluated after it, and increase `rows`; none before the first pose.
+        """Return the new rows, up to the last pose, and increase `rows` by their number; none
+        before the first pose.
+
+        Each row has the rotations and positions of the moving grasps, interpolated by `_pose_at`,
+        and the samples of markers and instruments that can be evaluated after it, which are removed
+        from the buffer (`_available_samples`).
         """
         rows: list[tuple[Array, Array, list[Sample]]] = []
         if self.start_s is None:
@@ -328,11 +337,13 @@ class FrameBuffer:
         return logged
 
     def _pose_at(self, t_s: float) -> tuple[Array, Array]:
-        """Return positions (G, 3) and quaternions (G, 4), not normalised, interpolated through the
-        last poses, at most four: cubic, or linear between the last two if there is a gap of more
-        than `LARGEST_CUBIC_GAP` samples among them.
+        """Return positions (G, 3) [m] and quaternions (G, 4) x y z w, not normalised, of the moving
+        grasps at the time t_s [s], interpolated through the last poses, at most four.
 
-        A pose at t_s itself is returned as it is. There must be at least one pose.
+        The interpolation is a polynomial through all of them (cubic for four), or linear between
+        the last two if there is a gap of more than `LARGEST_CUBIC_GAP` samples among them. A pose
+        at t_s itself is returned as it is. There must be at least one pose; with one it holds at
+        all times.
         """
         for at_s, positions_m, quaternions in self._poses:
             if abs(at_s - t_s) <= TIME_TOLERANCE_S:

@@ -84,7 +84,8 @@ def parse_pose(
     Raises
     ------
     InputError
-        If a value is not a pose, or for an unknown grasp or a wrong number of poses.
+        If a value is not a pose (see `_parse_single_pose`; quaternions must have the norm 1), or
+        for an unknown grasp or a wrong number of poses.
     """
     if pose is None:
         return None
@@ -122,8 +123,9 @@ def _parse_single_pose(pose: Pose) -> tuple[Array, Array]:
     Raises
     ------
     InputError
-        If the mapping lacks a key, or if position, quaternion or matrix are not those of a pose
-        (NaN or None included).
+        If the mapping lacks a key, a number is None, NaN or beyond `LARGEST_NUMBER`, the norm of
+        the quaternion differs from 1 by more than `QUATERNION_NORM_TOLERANCE`, or the matrix is not
+        a rigid motion (`first_matrix_fault`).
     """
     if isinstance(pose, Mapping):
         if missing := [key for key in _POSE_KEYS if key not in pose]:
@@ -165,7 +167,8 @@ def parse_markers(
     Raises
     ------
     InputError
-        For unknown markers, or values that are not three numbers.
+        For unknown markers, another shape, text, or coordinates beyond `LARGEST_NUMBER` in
+        magnitude, such as infinity.
     """
     tracks = np.full((len(names), 3), np.nan)
     if markers is None:
@@ -188,13 +191,14 @@ def parse_markers(
 def parse_custom_readings(
     readings: Mapping[str, Any] | None, gauges: Sequence[Gauge], t_s: float
 ) -> tuple[InstrumentSample, ...]:
-    """Return samples of custom sensors, each as number of the instrument (from 1), time and values;
-    a sample without a time has the time of the frame.
+    """Return samples of custom sensors, each as number of the instrument (from 1), time [s] and
+    values; a sample without a time has the time of the frame.
 
     Parameters
     ----------
     readings : mapping of name to samples, or None
-        Samples in the forms of `_parse_samples`; None for no samples.
+        Samples of each sensor: its values (a number, if there is one), a mapping with the keys
+        "t_s" and "values", or a list of such mappings. None, also as values, for no samples.
     gauges : sequence of Gauge
         Custom sensors of the problem; instrument k is the k-th of them, from 1.
     t_s : float
@@ -235,17 +239,18 @@ def parse_wrenches(
     instruments_before: int,
     t_s: float,
 ) -> tuple[InstrumentSample, ...]:
-    """Return samples of the sensors of grasps, each as number of the instrument, time and values
-    (6,); a sample without a time has the time of the frame.
+    """Return samples of the sensors of grasps, each as number of the instrument, time [s] and
+    values (6,); a sample without a time has the time of the frame.
 
-    Components that the sensor does not measure are NaN, and so are all torques if only three
-    values are given. Empty if `wrench_data` is None or the problem has no sensor.
+    Components that the sensor does not measure are NaN, and so are all torques if only three values
+    are given. Empty if `wrench_data` is None or the problem has no sensor.
 
     Parameters
     ----------
     wrench_data : wrench, mapping of grasp number to wrench, or None
-        Force [N] and torque [N m], 6 values or the first 3 of them, in the forms of
-        `_parse_samples`. The number of the grasp, as text, may be omitted if there is one sensor.
+        Force [N] and torque [N m], 6 values or the first 3 of them; or a mapping with the keys
+        "t_s" and "values", or a list of such mappings. With several sensors a mapping of these by
+        the number of the grasp, as text such as "1".
     wrenches : mapping of grasp number to Wrench
         Sensors of the problem, by the number of the grasp from 1 on.
     instruments_before : int
@@ -438,10 +443,10 @@ class FrameReader:
             raise InputError(f"{where}: {error.message}") from error
 
     def _parse_object(self, json_object: Mapping[str, Any]) -> Frame:
-        """Return the frame of a JSON object.
+        """Return the frame of a JSON object, with poses of the body.
 
-        The keys are those in `_KEYS`; all but "t_s" may be omitted or null, which means that
-        nothing was measured.
+        The keys are "t_s", "pose", "markers", "wrench" and "readings"; all but "t_s" may be omitted
+        or null, which means that nothing was measured.
 
         Raises
         ------
@@ -477,8 +482,20 @@ class FrameReader:
     def _pose_of_body(
         self, pose: tuple[Array, Array] | None
     ) -> tuple[Array, Array] | None:
-        """Return positions (G, 3) [m] and quaternions (G, 4) of the body in the moving grasps from
-        those in a line; None for None.
+        """Return the pose of the undeformed body in each moving grasp from the pose in a line,
+        which is that of the gripper if the grasp has a transform in `gripper_transforms`: both are
+        multiplied. Grasps without a transform keep their pose.
+
+        Parameters
+        ----------
+        pose : (positions, quaternions) or None
+            Positions (G, 3) [m] and unit quaternions (G, 4), x y z w, of the moving grasps; not
+            modified. None if missing.
+
+        Returns
+        -------
+        (positions, quaternions) or None
+            New arrays of the same shapes, or `pose` itself without any transform; None for None.
         """
         if pose is None or not any(
             each is not None for each in self.gripper_transforms
@@ -495,11 +512,16 @@ class FrameReader:
         return positions, quaternions
 
     def _parse_row(self, cells: list[str]) -> Frame | None:
-        """Return the frame of a row of a table; None for the first row, the header, whose columns
-        are stored.
+        """Return the frame of a row of a table, with poses of the body; None for the first row, the
+        header, whose columns are stored.
 
         The pose is missing if any cell of any moving grasp is NaN or empty. Columns of markers and
         instruments may be absent. An instrument without any number in the row has no sample.
+
+        Parameters
+        ----------
+        cells : list of str
+            Cells of the row, stripped.
 
         Raises
         ------
@@ -547,18 +569,19 @@ class FrameReader:
         )
 
     def _pose_columns(self, number: int) -> list[str]:
-        """Return the seven column names of the pose of a grasp, by its number.
+        """Return the seven column names of the pose of a grasp, by its number from 1.
 
-        They are those in `POSE`; if several grasps move, each begins with the number and a dot,
-        such as "2.x_m".
+        They are "x_m", "y_m", "z_m", "qx", "qy", "qz" and "qw"; if several grasps move, each begins
+        with the number and a dot, such as "2.x_m".
         """
         before = "" if len(self.grasps) == 1 else f"{number}."
         return [before + name for name in POSE]
 
     @property
     def _instrument_columns(self) -> list[Sequence[str]]:
-        """Column names of each instrument: custom sensors, then sensors of grasps; the latter with
-        the number of the grasp and a dot in front if there are several.
+        """Column names of each instrument: custom sensors, then the six of each sensor of a grasp,
+        "fx_n" to "tz_nm"; the latter with the number of the grasp and a dot in front if there are
+        several.
         """
         before = [
             "" if len(self.wrenches) == 1 else f"{number}."
@@ -570,7 +593,16 @@ class FrameReader:
         return [*(gauge.columns for gauge in self.gauges), *of_wrenches]
 
     def _checked_header(self, columns: list[str]) -> list[str]:
-        """Return the columns of a header, or raise an `InputError` if one is missing or unknown."""
+        """Return the columns of a header, as they are.
+
+        Needed are "t_s" and the pose of each moving grasp; three columns of each marker, such as
+        "m1_x", and those of instruments are allowed.
+
+        Raises
+        ------
+        InputError
+            If a needed column is missing, or for an unknown one.
+        """
         needed = [
             "t_s",
             *(name for k in self.grasps for name in self._pose_columns(k)),

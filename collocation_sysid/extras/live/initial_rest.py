@@ -56,8 +56,12 @@ class InitialRest:
     )
 
     def frames_before_motion(self, frame: Frame) -> list[Frame]:
-        """Add a frame and return the last frames at rest if the motion begins with this one after
-        a long rest of grasps and body; otherwise an empty list. Frames without a pose are ignored.
+        """Add a frame and return the last frames at rest, at most `REPLAYED_FRAMES`, if the motion
+        begins with this one after a long rest of grasps and body; otherwise an empty list.
+
+        A rest is long from `LONG_REST_FRAMES` frames with a pose on. Frames without a pose are
+        ignored, and so are all frames after the first motion, so that the list is not empty at most
+        once.
         """
         if self.is_over or frame.pose is None:
             return []
@@ -75,8 +79,8 @@ class InitialRest:
         return list(self._recent) if self._is_body_still() else []
 
     def _is_at_rest(self, frames: list[Frame]) -> bool:
-        """Return whether no grasp of these frames is displaced from the first frame by more than
-        noise; the first frames must be complete.
+        """Return whether no grasp of these frames, which have poses, is displaced from the first
+        frame by more than noise; the first `LONG_REST_FRAMES` frames must have been added.
         """
         first = self._first[0]
         return all(
@@ -85,8 +89,11 @@ class InitialRest:
         )
 
     def _largest_displacement_at_rest_m(self) -> float:
-        """Return the largest displacement that is noise [m], from the differences between
-        consecutive poses of the first frames.
+        """Return the displacement [m] up to which a grasp is at rest: a share of the body's size,
+        or a multiple of the noise of the poses if that is larger.
+
+        The noise follows from the differences between consecutive poses of the first frames, at
+        least two.
         """
         steps_m = [
             self._displacement_m(after, reference=before)
@@ -99,8 +106,8 @@ class InitialRest:
         )
 
     def _displacement_m(self, frame: Frame, reference: Frame) -> float:
-        """Return the largest displacement of a grasp from the reference [m]; a rotation counts as
-        that of a point at the distance of the body's size.
+        """Return the largest displacement of a grasp between two frames with poses [m]: its
+        translation, and its rotation as that of a point at the distance of the body's size.
         """
         assert frame.pose is not None
         assert reference.pose is not None
@@ -112,8 +119,8 @@ class InitialRest:
         return float(np.max(shifts_m + angles * self.body_size_m, initial=0.0))
 
     def _is_body_still(self) -> bool:
-        """Return whether the markers of the recent frames scatter by no more than noise; true if
-        none is visible twice.
+        """Return whether each coordinate of the markers of the recent frames scatters by no more
+        than noise (`LARGEST_MARKER_DEVIATIONS`); true if no marker is visible twice.
         """
         tracks_m = np.array([frame.tracks_m for frame in self._recent])
         visible = np.isfinite(tracks_m).sum(axis=0) > 1

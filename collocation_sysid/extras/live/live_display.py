@@ -66,10 +66,16 @@ def sparkline(values: Sequence[float], columns: int = COLUMNS) -> str:
 
 
 def display_of(updates: Sequence[LiveUpdate]) -> list[Shown]:
-    """Return the display of the last of at least one update: a line of text, a table of the
-    estimates with their history as bars, and the verdict.
+    """Return the display of the last of some updates: a line of text, a table of the estimates with
+    their history as bars, and the verdict with up to `SHOWN_REASONS` reasons.
 
-    All updates must have the same parameters. Unknown standard errors are empty.
+    Unknown standard errors are empty.
+
+    Parameters
+    ----------
+    updates : sequence of LiveUpdate
+        At least one update, in order of time, all with the same parameters; the last `COLUMNS` are
+        the history.
     """
     last = updates[-1]
     rows = []
@@ -101,8 +107,15 @@ def display_of(updates: Sequence[LiveUpdate]) -> list[Shown]:
 def final_display(
     updates: Sequence[LiveUpdate], settled: LiveUpdate
 ) -> list[Shown]:
-    """Return the display of the final estimate `settled`, as by `display_of`, and a line with the
-    median and 99 % quantile of the latency of the frames in `updates`, at least one.
+    """Return the display of the final estimate, as by `display_of`, and a line with the median and
+    99 % quantile of the latency of the frames.
+
+    Parameters
+    ----------
+    updates : sequence of LiveUpdate
+        Updates of the frames, at least one, in order of time.
+    settled : LiveUpdate
+        Result of `LiveEstimator.finish`, with the same parameters.
     """
     took_ms = 1e3 * np.array([update.latency_s for update in updates])
     median, late = np.percentile(took_ms, [50, 99])

@@ -22,10 +22,11 @@ MIDDLE_PA = 1e4
 
 
 def model_from_problem(problem: Problem) -> StreamingModel:
-    """Return the model of a problem with one fitted experiment; held-out experiments are ignored.
+    """Return the model for live estimation of a problem with one fitted experiment; held-out
+    experiments are ignored, and the problem is not modified.
 
-    Parameters without a guess take typical values for the stiffness `MIDDLE_PA`; those with a
-    guess keep it.
+    Parameters without a guess take typical values for the stiffness `MIDDLE_PA`; those with a guess
+    keep it.
 
     Raises
     ------
@@ -73,8 +74,9 @@ def _only_experiment(problem: Problem) -> Experiment:
 def _unsupported_features(
     experiment: Experiment,
 ) -> Iterator[tuple[str, object, str]]:
-    """Yield each feature that live estimation lacks: its description, a value that is true if the
-    experiment has the feature, and the supported alternative.
+    """Yield for each feature that live estimation lacks, whether the experiment has it or not: its
+    description, a value that is true if the experiment has the feature, and the supported
+    alternative.
     """
     body = experiment.body
     grasps = experiment.grasps

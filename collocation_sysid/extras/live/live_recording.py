@@ -91,12 +91,12 @@ class LiveRecording:
     def write(
         self, frame: Frame, update: LiveUpdate, positions_m: Array | None
     ) -> None:
-        """Write a frame and what was estimated after it, at the time of the update.
+        """Write a frame and what was estimated after it into the file, at the time of the update.
 
         Parameters
         ----------
         frame : Frame
-            Frame with the measured markers.
+            Frame with the measured markers; missing ones are left out.
         update : LiveUpdate
             Its result.
         positions_m : (n, 3) array or None
@@ -130,7 +130,10 @@ class LiveRecording:
         self._stream.disconnect()
 
     def _write_estimates(self, update: LiveUpdate) -> None:
-        """Write parameters and intervals, the verdict if it changed, and notes."""
+        """Write parameters and statistical intervals, the verdict with its reasons if it changed
+        since the last call, and notes, at the present time of the recording; intervals that are
+        None are left out.
+        """
         rr = self._rr
         for name, each in update.estimates.items():
             self._write_number(each.value, "parameters", name, "value")
@@ -147,8 +150,8 @@ class LiveRecording:
             self._stream.log("notes", rr.TextLog(note))
 
     def _write_number(self, value: float, *path: str) -> None:
-        """Write a number at the present time under the entity whose path has these parts; nothing
-        if it is not finite.
+        """Write a number at the present time of the recording under the entity whose path has the
+        parts `path`; nothing if it is not finite.
         """
         if np.isfinite(value):
             entity = self._rr.new_entity_path(list(path))

@@ -28,9 +28,10 @@ LOCALHOST = "127.0.0.1"
 
 
 def decode_lines(lines: Iterable[bytes]) -> Iterator[str]:
-    """Decode lines of UTF-8.
+    """Return an iterator of lines as text, decoded from UTF-8.
 
-    Invalid bytes are replaced by a character that no number or name contains.
+    Invalid bytes are replaced by a character that no number or name contains, without an error.
+    Line breaks are kept.
     """
     return (line.decode("utf-8", errors="replace") for line in lines)
 
@@ -38,10 +39,13 @@ def decode_lines(lines: Iterable[bytes]) -> Iterator[str]:
 def receive_datagrams(
     port: int, opened: Callable[[int], None] | None = None
 ) -> Iterator[str]:
-    """Yield lines that arrive as UDP datagrams at a port of this machine, until an empty datagram.
+    """Yield lines of text that arrive as UDP datagrams at a port of this machine, until an empty
+    datagram.
 
     A datagram may contain several lines; a line does not continue in the next datagram. Datagrams
-    longer than `DATAGRAM_BYTES` are cut.
+    longer than `DATAGRAM_BYTES` are cut. Lines have no line break; see `decode_lines` for invalid
+    bytes. The port is opened when the first line is asked for, and closed at the end; waiting has
+    no time limit.
 
     Parameters
     ----------
@@ -180,7 +184,8 @@ def paced_frames(
 
 @contextmanager
 def without_garbage_of_startup() -> Iterator[None]:
-    """Exclude all existing objects from garbage collection within this context.
+    """Context within which all objects that exist at its beginning are excluded from garbage
+    collection, after one collection.
 
     A collection of all objects takes longer than some frames.
     """

@@ -59,8 +59,9 @@ class StiffnessSearch:
         return not self._waiting
 
     def next_trial(self) -> Array | None:
-        """Return the parameters p of the next trial; None if no trial is left. `record_trial`
-        advances to the one after it.
+        """Return the parameters p (P,) of the next trial, material parameters followed by nuisance
+        parameters in the solver's coordinates; None if no trial is left. Repeated calls return the
+        same, until `record_trial` advances to the trial after it.
         """
         return (
             np.concatenate([self._waiting[0], self._phi])
@@ -68,9 +69,9 @@ class StiffnessSearch:
             else None
         )
 
-    def record_trial(self, track: WindowPass) -> None:
-        """Record the loss of a pass as the result of the next trial; a failed pass has an infinite
-        loss.
+    def record_trial(self, trial: WindowPass) -> None:
+        """Record the loss of the pass `trial` as the result of the next trial; a failed pass has an
+        infinite loss.
 
         After at least one success and at least three trials, the search ends if each of the last
         two losses exceeds `FAILURE_RATIO` times the smallest one.
@@ -83,8 +84,8 @@ class StiffnessSearch:
         self._waiting.pop(0)
         self._tried.append(
             (
-                np.inf if track.has_failed else track.loss,
-                track.linearisation_point,
+                np.inf if trial.has_failed else trial.loss,
+                trial.linearisation_point,
             )
         )
         least = min(loss for loss, _ in self._tried)
@@ -94,8 +95,9 @@ class StiffnessSearch:
 
     @property
     def best(self) -> Array | None:
-        """Linearisation point p, at its end, of the pass with the smallest loss; None if every
-        trial failed. At least one trial must be recorded (otherwise `ValueError`).
+        """Parameters p (P,) of the pass with the smallest loss, in the solver's coordinates: its
+        linearisation point at its end. None if every trial failed. At least one trial must be
+        recorded (otherwise `ValueError`).
         """
         loss, p = min(self._tried, key=lambda each: each[0])
         return p if np.isfinite(loss) else None

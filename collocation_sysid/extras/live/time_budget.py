@@ -81,7 +81,9 @@ class TimeBudget:
             self.delay = max(self.delay, took_s / expected_s)
 
     def record_relinearisation(self, took_s: float) -> None:
-        """Record the time of a change of the linearisation point [s], if it is the longest."""
+        """Record the time of a change of the linearisation point [s] in `turn_s`, if it is longer
+        than that.
+        """
         self.turn_s = max(self.turn_s, took_s)
 
     def record_remainder(self, took_s: float) -> None:

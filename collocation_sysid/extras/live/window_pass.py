@@ -122,34 +122,42 @@ class WindowPass:
 
     @property
     def linearisation_point(self) -> Array:
-        """Parameters of the current linearisation point (P,), not transformed."""
+        """Parameters p (P,) of the current linearisation point in the solver's coordinates, not
+        transformed.
+        """
         return self.sweep.p
 
     @property
     def information(self) -> SquareRootInformation:
-        """Information at p in the transformed parameters, including the prior."""
+        """Information of measurements and prior at the current linearisation point, in the
+        transformed parameters (`StreamingModel.transformed`).
+        """
         return self.sweep.information
 
     @property
     def loss(self) -> float:
-        """Loss of measurements and prior at p."""
+        """Loss of measurements and priors, a sum of squared residuals, at the current linearisation
+        point.
+        """
         return self.information.loss(self.sweep.transformed)
 
     def add_rows(
         self, poses: Sequence[Poses], guesses: Sequence[Array] = ()
     ) -> int:
-        """Compute further rows of one block and return how many; `add_residuals` adds their
-        samples.
+        """Compute further rows of one block and return how many, at least one; `add_residuals` adds
+        their samples.
 
-        A new block begins if the last one is full. Without guesses, neither given nor from `base`,
-        `StreamingSweep.advance` decides where to start.
+        Fewer rows than given are computed if an initial guess turns out to be far off; the caller
+        passes the remaining poses again. A new block begins if the last one is full. Without
+        guesses, neither given nor from `base`, they are extrapolated.
 
         Parameters
         ----------
         poses : sequence of Poses
-            Poses of the moving grasps at the rows, at most `remaining_rows_of_block`.
+            Poses of the moving grasps at the rows, at least one, at most `remaining_rows_of_block`.
         guesses : sequence of (3n,), optional
-            Initial guesses of the positions; by default from the rows of `base`, if it has them.
+            Initial guesses of the positions [m]; by default from the rows of `base`, if it has
+            them.
 
         Raises
         ------
@@ -178,11 +186,11 @@ class WindowPass:
         return len(computed)
 
     def relinearise_at(self, p: Array) -> None:
-        """Continue at another linearisation point p (P,), not transformed; previous rows keep
-        theirs.
+        """Continue at another linearisation point p (P,), in the solver's coordinates, not
+        transformed; the pass is changed, but previous rows keep their point.
 
         The information so far is kept, and the state after the last row is moved to p along its
-        columns. Rows from here on are linearised at p.
+        derivatives. Rows from here on are linearised at p.
         """
         self.sweep = StreamingSweep(
             self.model,
@@ -203,8 +211,8 @@ class WindowPass:
 
     @property
     def linearisation_points(self) -> list[Array]:
-        """Transformed parameters (P,) at which the rows of the window are linearised, in order of
-        the rows; one for each change.
+        """Transformed parameters (P,), see `StreamingModel.transformed`, at which the rows of the
+        window are linearised, in order of the rows; one for each change of the linearisation point.
         """
         return self.linearisation_points_from(0)
 
@@ -227,8 +235,8 @@ class WindowPass:
         ]
 
     def add_residuals(self, residuals: Sequence[LinearisedResidual]) -> None:
-        """Add the linearised residuals of samples to the last block and to the information; at
-        least one row must have been computed.
+        """Add the linearised residuals of samples to the last block and to the information, in
+        place; at least one row must have been computed.
         """
         self.blocks[-1].residuals += residuals
         self.sweep.add_residuals(residuals)
@@ -241,10 +249,17 @@ class WindowPass:
         ]
 
     def repeat_rows(self, rows: Sequence[LoggedRow]) -> None:
-        """Compute the first of the logged rows, at most `repeatable_rows`, and add their samples.
+        """Compute the first of the logged rows, at most `repeatable_rows`, and add their samples to
+        the pass.
 
         The rows after them are ignored; the attribute `rows` increases by the number of rows that
         were computed.
+
+        Parameters
+        ----------
+        rows : sequence of LoggedRow
+            Rows that follow those of the pass, with the samples to evaluate after each; at least
+            one.
 
         Raises
         ------
@@ -280,8 +295,8 @@ class WindowPass:
         return max(1, min(rows_of_base, self.remaining_rows_of_block))
 
     def _rows_of_base(self, count: int) -> list[StoredRow]:
-        """Return the next `count` rows of `base`; an empty list without `base`, or if it has
-        fewer.
+        """Return the next `count` rows of the pass `base` that is repeated, those after the rows of
+        this one; an empty list without `base`, or if it has fewer.
         """
         if self.base is None or self.rows + count > self.base.rows:
             return []
@@ -314,27 +329,32 @@ class WindowPass:
         ]
 
     def latest_positions_at(self, transformed: Array) -> Array | None:
-        """Return the positions (3n,) of the latest row at transformed parameters (P,), to first
-        order; None if there is no row in the window.
+        """Return the node positions (3n,) [m] of the latest row at transformed parameters (P,), see
+        `StreamingModel.transformed`, to first order; None if there is no row in the window.
         """
         if not self.blocks or not self.blocks[-1].stored_rows:
             return None
         return self._positions_at(self.blocks[-1].stored_rows[-1], transformed)
 
     def _predicted_positions(self, base: StoredRow) -> Array:
-        """Return the positions of a stored row, moved to p along its columns."""
+        """Return the node positions (3n,) [m] of a stored row at the linearisation point of this
+        pass, to first order with the derivatives of the row.
+        """
         return self._positions_at(base, self.sweep.transformed)
 
     def _positions_at(self, base: StoredRow, transformed: Array) -> Array:
-        """Return the positions (3n,) of a stored row at transformed parameters (P,)."""
+        """Return the node positions (3n,) [m] of a stored row at transformed parameters (P,), to
+        first order with the derivatives of the row.
+        """
         step = (transformed - base.transformed)[self.sweep.moving]
         return base.x + base.columns @ step.astype(np.float32)
 
     def drop_oldest_block(self) -> int:
-        """Add the samples of the oldest block to the prior and remove the block from the window;
+        """Add the samples of the oldest block to the prior, remove the block from the window, and
         return its number of rows.
 
-        `start` becomes the state before the next block; there must be at least two blocks.
+        `start` becomes the state before the next block, and `rows` decreases; there must be at
+        least two blocks. The information does not change.
         """
         block = self.blocks.pop(0)
         self.rows -= len(block.stored_rows)
@@ -382,45 +402,53 @@ class CombinedPasses(NamedTuple):
 
     @classmethod
     def from_passes(
-        cls, track: WindowPass, again: WindowPass | None
+        cls, first_pass: WindowPass, second_pass: WindowPass | None
     ) -> CombinedPasses:
-        """Return the joint information of a pass `track` and of a repetition `again` that has
-        nearly caught up with it: the samples that both have count from the repetition, the rest
-        from the pass.
+        """Return the joint information of a first pass and of a second one that repeats it and has
+        nearly caught up: the samples that both have count from the second, the rest from the first.
 
-        If the repetition is None, has failed, has no base (a trial of other initial values), or
-        lags behind by more than `LARGEST_LAG` samples or than its own samples, the information is
-        that of the pass alone.
+        If the second is None, has failed, has no base (a trial of other initial values), or lags
+        behind by more than `LARGEST_LAG` samples or than its own samples, the information is that
+        of the first alone.
+
+        Parameters
+        ----------
+        first_pass : WindowPass
+            Pass with all rows of the window; not changed.
+        second_pass : WindowPass or None
+            Repetition of its first rows; not changed.
         """
-        residuals = track.residuals
+        residuals = first_pass.residuals
         repeated = (
-            again.residuals
-            if again is not None and again.base is not None
+            second_pass.residuals
+            if second_pass is not None and second_pass.base is not None
             else []
         )
         remaining = residuals[len(repeated) :]
         if (
-            again is None
-            or again.has_failed
+            second_pass is None
+            or second_pass.has_failed
             or not repeated
             or len(remaining) > min(LARGEST_LAG, len(repeated))
         ):
             return cls(
-                track.information, residuals, points=track.linearisation_points
+                first_pass.information,
+                residuals,
+                points=first_pass.linearisation_points,
             )
         points = [
-            *again.linearisation_points,
-            *track.linearisation_points_from(again.rows),
+            *second_pass.linearisation_points,
+            *first_pass.linearisation_points_from(second_pass.rows),
         ]
         return cls(
-            track.sweep.with_residuals(again.information, remaining),
+            first_pass.sweep.with_residuals(second_pass.information, remaining),
             [*repeated, *remaining],
             points=points,
         )
 
     def scatter(self, transformed: Array) -> ResidualScatter:
-        """Return the scatter of the markers' residuals at transformed parameters, to first
-        order.
+        """Return RMS and autocorrelation of the residuals of all marker samples at transformed
+        parameters (P,), to first order; other instruments do not count.
         """
         return ResidualScatter.from_residuals(
             [

@@ -57,8 +57,8 @@ class Disagreement:
 
     @property
     def sentence(self) -> str:
-        """Explanation for the user: the range of the parameter, and how the choice of the law
-        widens its interval if that is known.
+        """One or two sentences for the user: the range of the parameter, and how the choice of the
+        law widens its interval if that is known.
         """
         low = min(self.values.values())
         high = max(self.values.values())
@@ -92,7 +92,8 @@ def find_disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
     Parameters
     ----------
     rows : sequence of Row
-        Models that predict equally well.
+        Rows of `model_rows` of models that predict equally well; "model", "parameters" and "budget"
+        are used.
     chosen : Row
         Chosen model, one of them (the same object).
     """
@@ -163,9 +164,14 @@ def _disagreement(
 
 
 def law_table(differences: Sequence[Disagreement]) -> Table:
-    """Return a table of estimates by law, with their spread (largest over smallest estimate, less
-    one) and the chosen law's intervals without and with the choice of the law; intervals that are
-    unknown are empty.
+    """Return a table with a line for each parameter: its estimate by law, the spread (largest over
+    smallest estimate, less one, in percent), and the chosen law's combined intervals without and
+    with the choice of the law; intervals that are unknown are empty.
+
+    Parameters
+    ----------
+    differences : sequence of Disagreement
+        Parameters, all with estimates of the same models.
     """
     laws = dict.fromkeys(model for each in differences for model in each.values)
     rows = []

@@ -87,11 +87,13 @@ def model_rows(
     list of Row
         By key: "model", "status" ("missing" if the fit to all recordings is not done), "converged",
         "free" (number of parameters), "unit" of the errors, "rms" of the fit to all, "held_out_rms"
-        over all predictions, "predictions" and "blocks" by recording, "failures" (messages by
-        recording), "evidence", "parameters", "at_bound" (the bound of the fit to all by the name of
-        each parameter that ended at it), "budget", "total_s", "independent", "delta_aic" (AIC
-        less the smallest), "log_ratio" and "log_ratio_error" (prediction error relative to the
-        best), "chosen". Values are None if they are not known.
+        over all predictions, "predictions" (RMS) and "blocks" (sums of squares) by held-out
+        recording, "failures" (messages by recording), "evidence" (fields of `Evidence`),
+        "parameters" and "budget" by name, "at_bound" (the bound, "lower" or "upper", by the name of
+        each parameter that ended at it), "total_s", "independent", "delta_aic" (AIC less the
+        smallest), "log_ratio" and "log_ratio_error" (logarithm of the prediction error relative to
+        the best), "chosen" (true for at most one row). Values are None if they are not known;
+        mappings are empty.
     """
     of_model: dict[str, dict[str, Any]] = {}
     for run in planned:
@@ -109,8 +111,9 @@ def model_rows(
 
 
 def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
-    """Return the row of a model from its fits, without the columns that compare models; see
-    `model_rows`.
+    """Return the row of a model from its fits, without the columns that compare models
+    ("independent", "delta_aic", "log_ratio", "log_ratio_error", "chosen"); see `model_rows` for the
+    others.
 
     Parameters
     ----------
@@ -118,7 +121,7 @@ def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
         Name of the model.
     fits : mapping of str to mapping
         Results of `fit_record` by name of the held-out recording, "" for the fit to all; empty
-        mappings for runs without a result.
+        mappings for runs without a result. The unit is that of the first prediction, else "m".
     """
     complete_fit = fits.get("", {})
     predictions = {
@@ -153,8 +156,14 @@ def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
 
 
 def _pooled_rms(predictions: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the RMS over the samples of all predictions; None if there is none, one is missing, or
-    their units differ.
+    """Return the RMS over the samples of all predictions, in their common unit; None if there is no
+    prediction, one of them is missing, or their units differ.
+
+    Parameters
+    ----------
+    predictions : sequence of mapping
+        Results of `_prediction_error`, of which "rms", "samples" and "unit" are used; an empty one,
+        or one whose "rms" is None, is missing.
     """
     if not predictions or any(each.get("rms") is None for each in predictions):
         return None
@@ -168,8 +177,17 @@ def _pooled_rms(predictions: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def _add_criterion(rows: Sequence[Row]) -> None:
-    """Add ΔAIC to the rows, in place, and the equivalent number of independent measurements of the
-    best fit; None where they are unknown.
+    """Add "delta_aic" and "independent" to each row, in place.
+
+    "delta_aic" is Akaike's criterion less the smallest of all models; None for models that did not
+    converge or have no evidence. "independent" is equal for all models: the equivalent number of
+    independent measurements of the converged model with the smallest misfit, with which all
+    criteria are computed; None if no converged model has evidence.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `model_rows`, with "converged" and "evidence" (fields of `Evidence`, or None).
     """
     known = [row for row in rows if row["converged"] and row["evidence"]]
     evidences = [Evidence(**row["evidence"]) for row in known]
@@ -184,8 +202,16 @@ def _add_criterion(rows: Sequence[Row]) -> None:
 
 def _add_ratios(rows: Sequence[Row]) -> None:
     """Add "log_ratio", the logarithm of the ratio of its prediction error to the smallest one, and
-    its standard error "log_ratio_error" to each row, in place; both None without a prediction of
-    all held-out data.
+    its standard error "log_ratio_error" to each row, in place.
+
+    The smallest is that of the converged models. Both are None for rows whose "held_out_rms" is
+    None, and for all rows if no converged model predicts all held-out data. Models that did not
+    converge may have a negative "log_ratio".
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `model_rows`, with "converged", "held_out_rms", "predictions" and "blocks".
     """
     best = _best_prediction(rows)
     for row in rows:
@@ -234,19 +260,25 @@ def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
 
 
 def _best_prediction(rows: Sequence[Row]) -> Row | None:
-    """Return the converged model with the smallest prediction error for held-out data; None if no
-    converged model has predicted all recordings.
+    """Return the converged model with the smallest prediction error "held_out_rms" for held-out
+    data; None if no converged model has predicted all recordings. `rows` are those of `model_rows`.
     """
     predicted = [r for r in rows if r["converged"] and r["held_out_rms"]]
     return min(predicted, key=lambda r: r["held_out_rms"], default=None)
 
 
 def chosen_row(rows: Sequence[Row]) -> Row | None:
-    """Return the model to use: the one with fewest parameters among those that predict as well as
-    the best within `LIKELY` standard errors, of several the one with the smallest error.
+    """Return the model to use: the one with fewest parameters among the converged models that
+    predict as well as the best within `LIKELY` standard errors, of several the one with the
+    smallest error.
 
-    If nothing was predicted it is the one with the least AIC; None if none has an AIC either. The
-    rows must have "delta_aic" and "log_ratio".
+    If no converged model has predicted all held-out data it is the one with the least AIC; None if
+    none has an AIC either.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `model_rows`, which must have "delta_aic" and "log_ratio"; not modified.
     """
     best = _best_prediction(rows)
     if best is None:
@@ -257,8 +289,10 @@ def chosen_row(rows: Sequence[Row]) -> Row | None:
 
 
 def _equally_good(rows: Sequence[Row], errors: float) -> list[Row]:
-    """Return the converged models whose prediction error is equal to the best one within `errors`
-    standard errors, or practically equal.
+    """Return the converged models, in their order, whose prediction error is equal to the best one
+    within `errors` standard errors, or practically equal (`EQUIVALENT_ERROR`).
+
+    Models whose "log_ratio" is None are left out. `rows` are those of `model_rows`.
     """
     return [
         row
@@ -272,12 +306,15 @@ def _equally_good(rows: Sequence[Row], errors: float) -> list[Row]:
 
 def advice(rows: Sequence[Row]) -> str:
     """Return in words which model to use, why, and how certain that is, and in which estimates
-    equally good laws disagree.
+    equally good laws disagree, as one paragraph.
+
+    If no row is chosen, or no other model converged, it says so. If nothing was predicted it
+    compares the AIC alone. Models that cannot predict all held-out data are named.
 
     Parameters
     ----------
     rows : sequence of Row
-        Rows of `model_rows`, which contain "chosen".
+        Rows of `model_rows`, which contain "chosen"; not modified.
     """
     chosen = next((row for row in rows if row["chosen"]), None)
     if chosen is None:
@@ -356,8 +393,11 @@ def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
 
 
 def _failed_prediction(row: Row, chosen: Row) -> str:
-    """Return a sentence on the model `row`, with which some held-out samples cannot be predicted,
-    and on its AIC if that is lower than that of the `chosen` model by more than `NO_SUPPORT`.
+    """Return a sentence with the names of the held-out recordings that the model `row` does not
+    predict, and by how much its AIC is lower than that of the `chosen` model, if that is more than
+    `NO_SUPPORT`.
+
+    Both are rows of `model_rows` of converged models, whose "delta_aic" must not be None.
     """
     without = " and ".join(
         f"'{name}'" for name, rms in row["predictions"].items() if not rms
@@ -372,7 +412,12 @@ def _failed_prediction(row: Row, chosen: Row) -> str:
 
 
 def _comparison(chosen: Row, rival: Row) -> str:
-    """Return the comparison of the chosen model with its closest rival, in words."""
+    """Return the comparison of the chosen model with its closest rival, in words, without a period:
+    their prediction errors, numbers of parameters, and AIC.
+
+    Both are rows of `model_rows` of converged models that predict all held-out data:
+    "held_out_rms", "log_ratio", "log_ratio_error" and "delta_aic" must not be None.
+    """
     prediction = f"its prediction error for held-out samples is {_prediction_text(chosen)}"
     ratio, error = _log_ratio_between(chosen, rival)
     more = chosen["free"] - rival["free"]
@@ -388,8 +433,9 @@ def _comparison(chosen: Row, rival: Row) -> str:
 
 
 def _ratio_text(ratio: float, error: float) -> str:
-    """Return the ratio of two prediction errors as text, with its standard error if it differs from
-    one by more than that, otherwise with the interval of `SURE` standard errors, which contains one.
+    """Return the ratio of two prediction errors as text, with its standard error if its logarithm
+    is positive and exceeds `LIKELY` standard errors, otherwise with the interval of `SURE` standard
+    errors, as a ratio that may be one.
 
     Parameters
     ----------
@@ -406,23 +452,27 @@ def _ratio_text(ratio: float, error: float) -> str:
 
 
 def _prediction_text(row: Row) -> str:
-    """Return the prediction error of a model (a row of `model_rows`), which must be known, as text
-    with its unit for display.
+    """Return the prediction error "held_out_rms" of a model (a row of `model_rows`), which must not
+    be None, as text with three digits and its unit for display, such as "0.52 mm".
     """
     factor, unit = display_unit(row["unit"])
     return f"{factor * row['held_out_rms']:.3g} {unit}"
 
 
 def display_unit(unit: str) -> tuple[float, str]:
-    """Return factor and unit for display: metres as millimetres, pascals as kilopascals, other
-    units unchanged.
+    """Return factor and unit for the display of numbers in `unit`: (1000, "mm") for "m", (0.001,
+    "kPa") for pascals, and (1, `unit`) for others.
     """
     return {"m": (1e3, "mm"), STRESS_UNIT: (1e-3, "kPa")}.get(unit, (1.0, unit))
 
 
 def _log_ratio_between(chosen: Row, rival: Row) -> tuple[float, float]:
-    """Return the logarithm of the ratio of the rival's prediction error to the chosen model's, and
-    its standard error: the larger of those of both relative to the best.
+    """Return the logarithm of the ratio of the rival's prediction error to the chosen model's,
+    positive if the chosen one predicts better, and its standard error: the larger of those of both
+    models relative to the best one.
+
+    Both are rows of `model_rows` that predict all held-out data: their "log_ratio" and
+    "log_ratio_error" must not be None.
     """
     ratio = rival["log_ratio"] - chosen["log_ratio"]
     return ratio, max(rival["log_ratio_error"], chosen["log_ratio_error"])
@@ -430,7 +480,17 @@ def _log_ratio_between(chosen: Row, rival: Row) -> tuple[float, float]:
 
 def _certainty(chosen: Row, rival: Row) -> str:
     """Return a sentence on how certain the choice between the chosen model and its closest rival
-    is, by their predictions and AIC.
+    is.
+
+    It is significant if both the predictions (in standard errors, `SURE`) and AIC (`NO_SUPPORT`)
+    favour the chosen model clearly, likely if both do less clearly (`LIKELY`, `SUPPORT`); otherwise
+    the sentence says which of them does not.
+
+    Parameters
+    ----------
+    chosen, rival : Row
+        Rows of `model_rows` of converged models that predict all held-out data: "log_ratio",
+        "log_ratio_error" and "delta_aic" must not be None.
     """
     ratio, error = _log_ratio_between(chosen, rival)
     support = rival["delta_aic"] - chosen["delta_aic"]
@@ -458,7 +518,12 @@ def _certainty(chosen: Row, rival: Row) -> str:
 def model_notes(rows: Sequence[Row]) -> list[str]:
     """Return notes that explain the table and list failures: what is held out, the equivalent
     number of independent measurements if known, models that did not converge, and failed
-    predictions. There must be at least one row.
+    predictions.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `model_rows`, at least one, with "independent".
     """
     names = rows[0]["predictions"]
     test_data = (
@@ -559,8 +624,15 @@ def evidence_from_fit(fit: LinearisedFit) -> Evidence:
 def _independent_measurements(
     block: ResidualBlock, process: ErrorProcess
 ) -> float:
-    """Return the equivalent number of independent measurements in one block of residuals, at most
-    the number of measurements, from the correlation of its errors in time and between channels.
+    """Return the equivalent number of independent measurements in one block of residuals, above
+    zero and at most the number of measurements.
+
+    Parameters
+    ----------
+    block : ResidualBlock
+        Residuals with at least one measurement.
+    process : ErrorProcess
+        Correlation of the errors of this block in time and between its channels.
     """
     lags = np.arange(1, len(process.autocorrelation))
     in_time = 1 + 2 * float(
@@ -725,8 +797,8 @@ def _budget_record(
 
 
 def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
-    """Return the problem without a recording, or without its end, and the time of the first
-    held-out sample [s].
+    """Return the problem without a recording, or without its end, and the time [s] after which its
+    samples are held out.
 
     If it is the only fitted recording, the measurements after two thirds of its duration are
     removed, see `without_later_measurements`. Otherwise the recording becomes one for validation,

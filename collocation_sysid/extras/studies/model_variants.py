@@ -58,7 +58,8 @@ class ModelVariant:
 
 
 def parse_materials(text: str) -> tuple[str, ...]:
-    """Return names of materials from text separated by commas, each once.
+    """Return names of materials from text separated by commas, such as "neo-hookean,yeoh", each
+    once, in the order of the text.
 
     Raises
     ------
@@ -69,7 +70,8 @@ def parse_materials(text: str) -> tuple[str, ...]:
 
 
 def parse_dampings(text: str) -> tuple[str, ...]:
-    """Return names of damping laws from text separated by commas, each once.
+    """Return names of damping laws from text separated by commas, such as "kelvin-voigt,rayleigh",
+    each once, in the order of the text.
 
     Raises
     ------
@@ -82,12 +84,21 @@ def parse_dampings(text: str) -> tuple[str, ...]:
 def _parse_names(
     text: str, known_names: Iterable[str], option: str
 ) -> tuple[str, ...]:
-    """Return names from text separated by commas, each once.
+    """Return names from text separated by commas, each once, in the order of the text.
+
+    Parameters
+    ----------
+    text : str
+        Names, with or without spaces.
+    known_names : iterable of str
+        Names that are allowed.
+    option : str
+        Command-line option, for the message.
 
     Raises
     ------
     InputError
-        For an unknown name or none; it refers to the command-line option.
+        For an unknown name or none.
     """
     names = unique_items(text)
     for name in names or ("",):
@@ -96,12 +107,13 @@ def _parse_names(
 
 
 def parse_branches(text: str) -> tuple[int, ...]:
-    """Return numbers of Prony branches from text separated by commas, each once.
+    """Return numbers of Prony branches from text separated by commas, such as "0,1,2", each once,
+    in the order of the text.
 
     Raises
     ------
     InputError
-        For anything but whole numbers from 0 to `MOST_BRANCHES`.
+        For anything but whole numbers from 0 to `MOST_BRANCHES`, and without any number.
     """
     items = [item.strip() for item in text.split(",") if item.strip()]
     counts = [
@@ -126,12 +138,13 @@ def models(
     dampings: Sequence[str] = (),
 ) -> list[ModelVariant]:
     """Return a model for every problem file with every material, damping law and number of
-    branches; of several files the labels begin with that of the file.
+    branches, file after file; of several files the labels begin with that of the file.
 
     Parameters
     ----------
     problems : sequence of Problem
-        At least one, of the same recordings, each with its file.
+        At least one, of the same recordings, each with its file; time constants of new branches
+        start between the timestep and the duration of the first one's fitted recordings.
     overrides, materials, branches, region, dampings
         See `variants`. Without materials, branches and dampings the files themselves are the
         models.
@@ -194,6 +207,9 @@ def variants(
     """Return a model for every combination of material, damping law and number of branches, in this
     order; the last changes fastest.
 
+    A label joins the names of what varies, such as "yeoh, 1 branch" ("no memory" for 0 branches),
+    after the region if there is one, such as "tip: yeoh". Nothing is written.
+
     Parameters
     ----------
     path : Path
@@ -215,8 +231,8 @@ def variants(
     Raises
     ------
     InputError
-        For an unknown region, and if branches are compared and the file has branches of another
-        region.
+        If the file cannot be read or is invalid with the overrides, for an unknown region, and if
+        branches are compared and the file has branches of another region.
     """
     file, _ = read_problem_file(path, overrides)
     content = file.model_dump(mode="json", exclude_unset=True, by_alias=True)
@@ -276,15 +292,17 @@ def variants(
 def file_variants(
     problems: Sequence[Problem], overrides: Sequence[str]
 ) -> list[ModelVariant]:
-    """Return problem files of the same recordings as models, named after the files (with their
-    paths if two files have the same name).
+    """Return a model for each problem file of the same recordings, in the order of `problems`.
+
+    Labels are the names of the files without suffix, or the paths of all of them if two have the
+    same name. Files are not read, and overrides are stored in the models, not applied.
 
     Parameters
     ----------
     problems : sequence of Problem
         At least one problem, each with its file.
     overrides : sequence of str
-        Overrides "key=value" of all files.
+        Overrides "key=value", the same for all files.
 
     Raises
     ------
@@ -383,11 +401,11 @@ def _require_region(
 def _law_changes(
     body: Mapping[str, Any], laws: Mapping[str, str], region: str | None
 ) -> dict[str, Any]:
-    """Return changed keys of the problem that give a material or damping law to a region, or for
-    None to all parts.
+    """Return changed values of the problem by dotted key, such as "object.material", that give a
+    material or damping law to a region, or for None to all parts.
 
     For all parts the laws of the body are set, and those of regions are removed, so that they
-    follow the body.
+    follow the body. With regions, "object.region" is the complete list of their tables.
 
     Parameters
     ----------
@@ -418,7 +436,8 @@ def _with_material(
 
     A part with its own constants keeps constants of its own; the others share theirs. Constants
     that the new material does not have are left out. Those that it needs are added with a guess of
-    the same shear modulus, or for a scan if that is unknown.
+    the same shear modulus, or for a scan if that is unknown; see `_with_part_material` for when
+    shared constants are enough.
 
     Parameters
     ----------
@@ -450,7 +469,18 @@ def _with_material(
 def _with_part_material(
     parameters: Mapping[str, Any], prefix: str, material: str, of_any: set[str]
 ) -> dict[str, Any]:
-    """Return the parameters with another material in the part whose constants have this prefix.
+    """Return a copy of the parameters with another material in the part whose constants have this
+    prefix.
+
+    Constants of the part that the material neither has nor accepts in place of its own
+    (`elastic_names`) are left out; other parameters stay. Added under the prefix, each with the
+    table of `_starting_guess`, are
+
+    - the shear modulus, if the material has it, and the part has neither it nor Young's modulus;
+      those that parts share count only if the part has no constants of its own at all,
+    - Poisson's ratio, if the material has a compressibility, for which the part neither has nor
+      shares a constant (`VOLUMETRIC`),
+    - each other constant of the material that the part does not have itself, even if it is shared.
 
     Parameters
     ----------
@@ -623,7 +653,8 @@ def _with_memory(
 
 def as_inline_toml(value: Any) -> str:
     """Return a value in TOML's inline syntax, on one line; mappings, lists, tuples, texts, booleans
-    and numbers are supported, None is not.
+    and numbers are supported. None and other types are not: their text is no TOML, without an
+    error.
     """
     if isinstance(value, Mapping):
         return (

@@ -213,8 +213,9 @@ def _watch(
 
 
 def _crash_message(code: int, stderr: IO[bytes]) -> str:
-    """Return how a process with this exit code ended, with the last line of its error output, if
-    any.
+    """Return how a process with this exit code ended (negative for a signal), with the last line of
+    its error output, if there is any. `stderr` is the file with that output, which is read from its
+    start.
     """
     cause = killed_by(code) or f"its process ended with code {code}"
     stderr.seek(0)
@@ -246,7 +247,16 @@ class RunStore:
     folder: Path
 
     def save(self, record: Record) -> None:
-        """Write the record of a run, atomically, under its "key"; an earlier record is replaced."""
+        """Write the record of a run, atomically, to the file of its "key"; an earlier record is
+        replaced, and missing folders are made.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be written.
+        KeyError
+            If the record has no "key".
+        """
         write_text_file(self._file(record["key"]), as_json(record) + "\n")
 
     def load(self, key: str) -> Record | None:
@@ -351,9 +361,11 @@ def run_all(
         None
     ),
 ) -> None:
-    """Execute the runs of a study and store their records, each as soon as it has ended.
+    """Execute the runs of a study and store their records, each as soon as it has ended; return
+    when all have ended.
 
-    Runs that were stopped are neither stored nor reported. Without runs nothing happens.
+    Runs that fail, crash or exceed the time limit are stored like others. Runs that were stopped
+    are neither stored nor reported. Without runs nothing happens.
 
     Parameters
     ----------
@@ -370,7 +382,7 @@ def run_all(
     Raises
     ------
     InputError
-        If the scheduler cannot be reached.
+        If the scheduler cannot be reached, or a record cannot be written.
     KeyboardInterrupt
         After the running runs have been told to end; finished ones are in the store.
     """

@@ -89,8 +89,14 @@ def _tip_record(finished: Run) -> dict[str, Any] | None:
     body, of the first fitted experiment, for JSON; None without markers.
 
     The distance is that from the mean of the grasped nodes, or of all nodes without a grasp.
-    "max_m" is the largest distance between the tracks [m]; it and the simulated track
-    "rolled_out_m" are None if the forward simulation failed.
+
+    Returns
+    -------
+    dict or None
+        "experiment" and "marker" (names); "t_s" (T); "measured_m" (T, 3), NaN where missing;
+        "rolled_out_m" (T, 3), the simulated track, None if the forward simulation failed; and
+        "max_m", the largest distance between the tracks [m], None also if the marker was never
+        measured.
     """
     experiment = finished.solution.collocation.transcriptions[0].experiment
     markers = experiment.markers

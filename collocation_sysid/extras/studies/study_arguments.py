@@ -22,7 +22,7 @@ RANGE = "such as 50:5000:log:9 or 0:1:5"
 
 def unique_items(text: str) -> tuple[str, ...]:
     """Return the items of text separated by commas, stripped, each once, in their order; empty ones
-    are left out.
+    are left out, so that the result may be empty.
     """
     return tuple(
         dict.fromkeys(item.strip() for item in text.split(",") if item.strip())
@@ -61,8 +61,8 @@ def read_truth(
     Parameters
     ----------
     sources : sequence of str
-        TOML files, with values at the top level or in a table ``parameters``; or "name=value"
-        separated by commas. Later ones override earlier ones.
+        Each a path of a TOML file, with values at the top level or in a table ``parameters``; or,
+        with an equals sign, "name=value" separated by commas. Later ones override earlier ones.
     known_names : sequence of str
         Names of all parameters of the problem.
     needed : sequence of str
@@ -231,14 +231,21 @@ def require_few(count: int, option: str, noun: str) -> None:
 
 
 def _range_values(key: str, text: str) -> Iterable[str]:
-    """Return the values of a range "first:last:count" or "first:last:log:count", ends included, as
-    text with 12 digits.
+    """Return the values of a range "first:last:count" or "first:last:log:count", ends included,
+    evenly spaced, or so in the logarithm, as text with 12 digits.
+
+    Parameters
+    ----------
+    key : str
+        Swept key, for the message.
+    text : str
+        The range.
 
     Raises
     ------
     InputError
         For another form, numbers that are not finite, a count below 1 or above `MOST_RUNS`, an
-        unknown spacing, or a logarithmic range that is not positive; the message names the `key`.
+        unknown spacing, or a logarithmic range that is not positive.
     """
     first, *middle, count = text.split(":")
     try:

@@ -93,7 +93,9 @@ class StudyReport:
 
     @property
     def rows(self) -> list[Row]:
-        """One row for each planned run, or for each model."""
+        """One row for each planned run (`run_row`), or for each model (`model_rows`), computed anew
+        at each access.
+        """
         if self.kind == MODEL_STUDY:
             return model_rows(self.planned, self.records)
         return [
@@ -103,7 +105,11 @@ class StudyReport:
 
     @property
     def views(self) -> list[Table]:
-        """Tables for the terminal, each within 80 columns, with short headings."""
+        """Tables for the terminal, each within 80 columns, with short headings: of a comparison of
+        methods success, quality and cost; of a comparison of models fit, prediction and parameters,
+        and estimates in which equally good laws disagree, if there are any; of a sweep estimates,
+        and quality and cost.
+        """
         if self.kind == METHOD_STUDY:
             return comparison_views(method_rows(self.rows))
         if self.kind == MODEL_STUDY:
@@ -116,7 +122,10 @@ class StudyReport:
 
     @property
     def headline(self) -> list[str]:
-        """Result of the study in a few sentences."""
+        """Result of the study in a few sentences: the advice of a comparison of models, one
+        sentence for each method, or of a sweep the number of converged runs and the ranges of the
+        estimates.
+        """
         if self.kind == MODEL_STUDY:
             return [advice(self.rows)]
         if self.kind == METHOD_STUDY:
@@ -125,7 +134,9 @@ class StudyReport:
 
     @property
     def tables(self) -> list[Table]:
-        """Tables for pages: headings in words, and the runs of a comparison."""
+        """Tables for pages: those of `views` with headings in words, and for a comparison of
+        methods one more table with all its runs.
+        """
         views = [
             replace(view, heads=tuple(map(_in_words, view.heads)))
             for view in self.views
@@ -138,7 +149,9 @@ class StudyReport:
 
     @property
     def failures(self) -> list[str]:
-        """One line for each run that has a record without a result."""
+        """One line for each run that has a record without a result: its label, outcome and message.
+        Runs without a record do not count.
+        """
         return [
             f"{run.label}: {record['outcome']}: {record.get('message', '')}"
             for run in self.planned
@@ -148,7 +161,9 @@ class StudyReport:
 
     @property
     def notes(self) -> list[str]:
-        """Notes that explain the tables, and the number of runs without a record, if there are any."""
+        """Notes that explain the tables, the criterion of success of a comparison of methods, and
+        the number of runs without a record, if there are any.
+        """
         missing = len(self.planned) - len(self.records)
         notes = (
             [f"{missing} of {len(self.planned)} runs remain to be done."]
@@ -206,6 +221,13 @@ def load_report(
 def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
     """Return what the terminal shows of a study within 80 columns: the advice of a comparison of
     models, tables, notes, up to `SHOWN_FAILURES` failures, and the folder.
+
+    Parameters
+    ----------
+    report : StudyReport
+        The study.
+    folder : Path
+        Folder to which it was written, for the last line; nothing is written here.
     """
     # What no line of the tables says.
     parts: list[Shown] = (
@@ -287,7 +309,13 @@ def write_report(report: StudyReport, folder: Path) -> None:
 
 
 def report_json(report: StudyReport) -> dict[str, Any]:
-    """Return the content of summary.json, with tables and dataclasses that `as_json` converts."""
+    """Return the content of summary.json, with tables and dataclasses that `as_json` converts.
+
+    The keys are "schema", "kind", "title", "problem" (path of the first run's file), "runs",
+    "headline", "notes", "tables" and "failures"; for a comparison of methods also "truth" (None if
+    unknown), "within" and "methods", of models "advice" and "laws", and for a sweep
+    "varied_values", the swept keys.
+    """
     rows = report.rows
     first = report.planned[0]
     content: dict[str, Any] = {
@@ -315,8 +343,10 @@ def report_json(report: StudyReport) -> dict[str, Any]:
 
 
 def as_csv(rows: Sequence[Row]) -> str:
-    """Return rows as CSV; the columns are those of all rows, in the order of their first
-    occurrence. Values that a row lacks, and None, are empty.
+    """Return rows as CSV text, a header and one line for each row; the columns are those of all
+    rows, in the order of their first occurrence. Values that a row lacks, and None, are empty;
+    other values are written as text by `str`, also lists and mappings. Without rows the text is an
+    empty line.
     """
     columns = dict.fromkeys(name for row in rows for name in row)
     text = io.StringIO()
@@ -327,7 +357,9 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 
 def report_section(report: StudyReport) -> TitledParts:
-    """Return tables and failures as a section for a paper's appendix or an issue."""
+    """Return sentences, notes, tables (`StudyReport.views`) and failures of a study as a section
+    with its title, for a paper's appendix or an issue; without failures it has no part on them.
+    """
     failures = (Items(tuple(report.failures)),) if report.failures else ()
     without = tuple(
         TitledParts("Runs without a result", (each,)) for each in failures
@@ -337,8 +369,8 @@ def report_section(report: StudyReport) -> TitledParts:
 
 
 def _in_words(head: str) -> str:
-    """Return the heading in words for a short heading `head` of the terminal; unchanged if there is
-    none.
+    """Return the heading in words for a short heading `head` of the terminal, such as "E [Pa]" for
+    "E Pa"; unchanged if there is none.
     """
     if head.startswith("Δ") and head.endswith(" %"):
         return f"error of {head[1:-2]} [%]"
@@ -354,13 +386,13 @@ Cell = Callable[[Row], str]
 
 
 def comparison_views(summaries: Sequence[Row]) -> list[Table]:
-    """Return tables of success, quality and cost of every method, with short headings; the column
-    of evaluations is left out if no method counts them.
+    """Return three tables, "Success", "Quality" and "Cost", with a line for each method and short
+    headings; the column of evaluations is left out if no method counts them.
 
     Parameters
     ----------
     summaries : sequence of Row
-        Rows of `method_rows`, at least one.
+        Rows of `method_rows`, at least one; None is shown as a dash.
     """
     success: dict[str, Cell] = {
         "runs": lambda row: str(row["runs"]),
@@ -410,8 +442,13 @@ def comparison_views(summaries: Sequence[Row]) -> list[Table]:
 
 
 def run_view(rows: Sequence[Row]) -> Table:
-    """Return a table of every run of a comparison, ordered by start, with headings in words; the
-    rows are those of `run_row`, at least one.
+    """Return the table "Runs" of all runs of a comparison of methods, ordered by start, with
+    headings in words.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row`, at least one; None is shown as a dash.
     """
     names = {"start": _text_cell("start"), "method": _text_cell("method")}
     cells: dict[str, Cell] = {
@@ -427,8 +464,13 @@ def run_view(rows: Sequence[Row]) -> Table:
 
 
 def _method_sentence(row: Row) -> str:
-    """Return how often, how accurately and how fast a method found the solution, in words; `row` is
-    a row of `method_rows`.
+    """Return how often, how accurately and how fast a method found the solution, in words.
+
+    Parameters
+    ----------
+    row : Row
+        Row of `method_rows`; if "total_s" is None, no run gave a result, otherwise "rms_m" must not
+        be None.
     """
     low = 100 * row["success_low"]
     high = 100 * row["success_high"]
@@ -511,13 +553,15 @@ def sweep_views(rows: Sequence[Row], varied_keys: Sequence[str]) -> list[Table]:
 
 
 def model_views(rows: Sequence[Row]) -> list[Table]:
-    """Return tables of fit, prediction and parameters of every model, and with several held-out
-    recordings a table of the predictions of each.
+    """Return the tables "Models" (fit and prediction, the chosen model with an arrow) and
+    "Parameters"; with several held-out recordings there is one between them, "Recordings held out",
+    with the prediction error of each.
 
     Parameters
     ----------
     rows : sequence of Row
-        Rows of `model_rows`, at least one; errors are in the unit of the first one, for display.
+        Rows of `model_rows`, at least one; all errors are shown in the unit of the first one, such
+        as mm. None is shown as a dash.
     """
     factor, unit = display_unit(rows[0]["unit"])
     number_columns: dict[str, Cell] = {
@@ -592,7 +636,8 @@ def _transposed_view(
 
 def _ratio_text(row: Row) -> str:
     """Return the ratio of a model's prediction error to the best one as text, with its standard
-    error; "–" if nothing was predicted.
+    error; "–" if "log_ratio" is None, because not all held-out data were predicted. `row` is one of
+    `model_rows`.
     """
     if row["log_ratio"] is None:
         return "–"
@@ -624,17 +669,19 @@ def _table_view(
 
 
 def _text_cell(name: str) -> Cell:
-    """Return the cell of the value that rows have under this name, as text; `KeyError` for rows
-    without it.
+    """Return the cell of the value that rows have under this name: a function of a row that returns
+    the value as text by `str`. The function raises `KeyError` for rows without it.
     """
     return lambda row: str(row[name])
 
 
 def _varied_cell(key: str) -> Cell:
-    """Return the cell of the value of a swept key, a number with five digits, or else its text."""
+    """Return the cell of the value of a swept key: a function of a row that returns the value as a
+    number with five digits, or its text if it is no number. Rows must have the key, with a text.
+    """
 
     def cell(row: Row) -> str:
-        """Return the text of the cell in a row."""
+        """Return the swept value of a row: a number with five digits, other text as it is."""
         try:
             return f"{float(row[key]):.5g}"
         except ValueError:
@@ -681,8 +728,9 @@ def _bounded_cell(name: str) -> Cell:
 
 
 def _error_cells(rows: Sequence[Row]) -> dict[str, Cell]:
-    """Return a cell of the relative error [%] for each parameter whose true value is known, by
-    heading.
+    """Return by heading, such as "ΔE %", the cell of the relative error [%] of each parameter whose
+    true value is known: a function of a row that returns it as text. `rows`, at least one, are
+    those of `run_row` or `method_rows`; the first one decides which parameters these are.
     """
     names = parameters_in(rows, "error_")
     return {
@@ -692,22 +740,29 @@ def _error_cells(rows: Sequence[Row]) -> dict[str, Cell]:
 
 
 def _number_cells(*names: str) -> dict[str, Cell]:
-    """Return the cells of the columns with these names in `COLUMNS`, by short heading."""
+    """Return by short heading the cells of the columns with these names in `COLUMNS`: functions of
+    a row that return the number as text, see `_column_cell`.
+    """
     return {COLUMNS[name].head: _column_cell(name) for name in names}
 
 
 def _column_cell(name: str) -> Cell:
-    """Return the cell of the column with this name in `COLUMNS`, in its format."""
+    """Return the cell of the column with this name in `COLUMNS`: a function of a row that returns
+    the number as text in the column's factor and format, "–" for None.
+    """
     return lambda row: COLUMNS[name].format(row[name])
 
 
 def _estimate_cell(name: str) -> Cell:
-    """Return the cell of the estimate of the parameter `name`, with its combined standard error if
-    that is known; "–" without an estimate.
+    """Return the cell of the estimate of the parameter `name`: a function of a row of `run_row`
+    that returns its value, with the combined standard error if that is known, as text; "–" without
+    an estimate.
     """
 
     def cell(row: Row) -> str:
-        """Return the text of the cell in a row."""
+        """Return the estimate of a row as text, with "± " and its standard error if known; "–" for
+        no estimate.
+        """
         value = row.get(f"value_{name}")
         spread = row.get(f"std_error_{name}")
         if value is None:

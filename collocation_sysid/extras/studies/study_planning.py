@@ -86,7 +86,7 @@ class PlannedRun:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the run as a dictionary for JSON."""
+        """Return the fields of the run as a dictionary, which JSON can represent."""
         return asdict(self)
 
 
@@ -94,8 +94,8 @@ def shortened_keys(
     keys: Sequence[str] | Mapping[str, Any],
 ) -> Iterator[tuple[str, str]]:
     """Yield each dotted key with the shortest ending that distinguishes it from the others, in
-    order; of parameters at least two parts, name and key. If no ending does, it is the complete
-    key.
+    order; of parameters at least two parts, name and key: "parameters.mu_pa.guess" with
+    "mu_pa.guess". If no ending does, it is the complete key. Of a mapping the keys are used.
     """
     for key in keys:
         parts = key.split(".")
@@ -141,8 +141,9 @@ class Starts(Options):
     def overrides(
         self, problem: Problem, truth: Mapping[str, float], start: int
     ) -> Iterator[str]:
-        """Yield the overrides "key=value" of one start: guesses, log-uniform around truth or guess
-        within the factor `spread`, limited to the bounds.
+        """Yield the overrides "parameters.NAME.guess=VALUE" of one start: guesses of the estimated
+        parameters, log-uniform around truth or guess within the factor `spread`, limited to the
+        bounds.
 
         Parameters
         ----------
@@ -319,8 +320,8 @@ def plan_models(
     Raises
     ------
     InputError
-        For a model that its problem file does not accept, and for a recording without markers and
-        wrenches.
+        For a model that its problem file does not accept, and for a fitted recording that has
+        neither markers nor a wrench, and is no test of a specimen.
     """
     for each in problem.experiments:
         is_compared = (
@@ -356,7 +357,9 @@ def plan_models(
 
 
 def fitted_recordings(problem: Problem) -> list[str]:
-    """Return the names of the recordings that are fitted."""
+    """Return the names of the recordings of a problem that are fitted, in its order; those for
+    validation are left out.
+    """
     return [e.name for e in problem.experiments if not e.validation]
 
 
@@ -422,8 +425,16 @@ def _planned_run(
 
 
 def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
-    """Return hashes by name of the files that the content of a problem names, so that changed data
-    give another run; names of missing files are left out.
+    """Return SHA-256 hashes, by the name as it is written, of the files that the content of a
+    problem names, so that changed data give another run. A topic of a log with several files has
+    their hashes, separated by spaces. Names of missing files and of folders are left out.
+
+    Parameters
+    ----------
+    content : Any
+        Nested mappings, lists and texts; every text except keys is tried as the name of a file.
+    folder : Path
+        Folder of the problem file, to which names are relative.
     """
     hashes = {}
     for text in _texts(content):

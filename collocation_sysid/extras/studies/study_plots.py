@@ -64,13 +64,18 @@ def comparison_plots(
     """Return the figures of a comparison of methods by file name without suffix; those without data
     are left out.
 
+    They are "convergence", "tip" (if there are markers), and, if runs have several starts and there
+    is a reference for these, "success" and "basins".
+
     Parameters
     ----------
     rows : sequence of Row
-        One for each run.
+        Rows of `run_row`, one for each run, also for missing ones.
     records : mapping of key of the run to Record
+        Records, at least of the runs with a result.
     yardstick : SuccessCriterion
-        True values, if known, which are the reference of the starts.
+        True values, if known, which are the reference of the starts; otherwise the estimates of the
+        best run are.
     """
     figures: dict[str, Figure] = {}
     completed = [row for row in rows if row["rms_m"] is not None]
@@ -98,7 +103,7 @@ def comparison_plots(
 
 def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
     """Return colour and rows of each method by its name, in the order of their first rows; colours
-    repeat if there are more methods than colours.
+    repeat if there are more methods than colours. `rows` are those of `run_row`.
     """
     methods = dict.fromkeys(row["method"] for row in rows)
     return {
@@ -113,15 +118,15 @@ def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
 def convergence_in_time(
     rows: Sequence[Row], records: Mapping[str, Record]
 ) -> Figure:
-    """Return a figure of loss and violation of the equations of motion against time, a line per
-    run; values that are not positive are left out.
+    """Return a figure of loss and violation of the equations of motion against time [s], a line per
+    run and a colour per method; values that are not positive are left out.
 
     Parameters
     ----------
     rows : sequence of Row
-        Runs with a result.
+        Rows of `run_row` of runs with a result.
     records : mapping of key of the run to Record
-        Records with the history of each result.
+        Records of these runs, with the history of each "result".
     """
     figure = new_figure(PAGE_MM, 70)
     panels = figure.subplots(1, 2)
@@ -172,8 +177,17 @@ def convergence_in_time(
 def success_by_distance(
     rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: bool
 ) -> Figure:
-    """Return a figure of the success rate of each method against the largest ratio of guess to
-    reference `centre`, in logarithmic bins; `is_truth_known` chooses the title.
+    """Return a figure of the success rate of each method, with its 95 % interval, against the
+    largest ratio of guess to reference, in `DISTANCE_BINS` logarithmic bins.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row`, at least one, with a guess of each parameter in `centre`.
+    centre : mapping of str to float
+        Positive reference of each parameter, at least one.
+    is_truth_known : bool
+        Whether the reference is the truth, otherwise the best estimate; for the title.
     """
     figure = new_figure(PAGE_MM / 2, 65)
     axes = figure.subplots()
@@ -228,15 +242,16 @@ def success_by_distance(
 def basins(
     rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: bool
 ) -> Figure:
-    """Return a figure of the start points over each pair of parameters, a row of panels for each
-    method; a single parameter is paired with itself.
+    """Return a figure of the guesses of all runs, relative to a reference, over each pair of
+    parameters, a row of panels for each method; a single parameter is paired with itself. Successes
+    and failures have different marks.
 
     Parameters
     ----------
     rows : sequence of Row
-        Runs with a guess of each parameter.
+        Rows of `run_row`, at least one, with a guess of each parameter.
     centre : mapping of str to float
-        Reference by name, relative to which guesses are drawn.
+        Positive reference by name, relative to which guesses are drawn; at least one.
     is_truth_known : bool
         Whether the reference is the truth, otherwise the best estimate; for the labels.
     """
@@ -288,7 +303,12 @@ def basins(
 
 
 def _ratio_axes(axes: Axes, factor: float) -> None:
-    """Set both axes to a logarithmic scale from about 1/factor to factor, with three ticks each."""
+    """Set both axes, in place, to a logarithmic scale around one, with ticks at 1 and at a round
+    ratio and its inverse.
+
+    The scale ends at 0.8 / `factor` and 1.25 · `factor`; `factor`, the largest ratio that is drawn,
+    is at least 1.
+    """
     digit = 10 ** np.floor(np.log10(factor))
     tick = (
         max(
@@ -314,14 +334,15 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
     """Return a figure of the measured marker farthest from the grasp, and of its forward simulation
     with each method's best solution.
 
-    Measurements are those of the first row, whose record must have a "tip". Methods whose best run
-    has no simulated track are left out.
+    Measurements are those of the first row. Methods whose best run has no simulated track are left
+    out.
 
     Parameters
     ----------
     rows : sequence of Row
-        Runs with a result.
+        Rows of `run_row` of runs with a result, at least one.
     records : mapping of key of the run to Record
+        Records of these runs, each with a "tip" that is not None, see `run_worker`.
     """
     figure = new_figure(PAGE_MM, 65)
     panels = figure.subplots(1, 3, sharex=True)
@@ -368,12 +389,13 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
 def sweep_plots(
     rows: Sequence[Row], varied_keys: Sequence[str]
 ) -> dict[str, Figure]:
-    """Return the figures of a sweep by file name without suffix; empty if no run has a result.
+    """Return the figures of a sweep by file name without suffix: one, "sweep"; empty if no run has
+    a result.
 
     Parameters
     ----------
     rows : sequence of Row
-        One for each run.
+        Rows of `run_row`, one for each run.
     varied_keys : sequence of str
         Swept keys.
     """
@@ -385,15 +407,16 @@ def sweep_plots(
 def estimates_against(
     rows: Sequence[Row], varied_keys: Sequence[str]
 ) -> Figure:
-    """Return a figure of estimates with their 95 % intervals: a row for each parameter, a column
-    for each swept key.
+    """Return a figure of estimates with their combined 95 % intervals: a row for each parameter, a
+    column for each swept key.
 
-    Estimates that did not converge are crosses. Values of the first other key have colours.
+    Estimates that did not converge are crosses, unknown ones are left out. Values of the first
+    other key have colours.
 
     Parameters
     ----------
     rows : sequence of Row
-        One for each run, at least one with a result.
+        Rows of `run_row`, one for each run, at least one with a result.
     varied_keys : sequence of str
         Swept keys.
     """
@@ -455,7 +478,7 @@ def _axis_positions(values: Sequence[str]) -> tuple[Array, dict[float, str]]:
 
 
 def _shortened(value: str) -> str:
-    """Return a value as text; a number is shortened to four digits."""
+    """Return the text of a swept value; if it is a number, with four digits."""
     try:
         return f"{float(value):.4g}"
     except ValueError:

@@ -61,7 +61,8 @@ class StudyProgress(Watched):
         Parameters
         ----------
         record : Record
-            Record of one of the remaining runs, which has not been counted yet.
+            Record of one of the remaining runs, which has not been counted yet, with "key" and
+            "outcome".
         worker_count : int
             Number of runs that are executed at once.
 
@@ -82,8 +83,8 @@ class StudyProgress(Watched):
         self.update(Text(line, style="dim"), line)
 
     def _remaining_text(self, worker_count: int) -> str:
-        """Return "; about … left", from the times of finished runs and the number of runs at once;
-        empty if the remaining time is unknown.
+        """Return "; about … left" with a duration, from the times of finished runs and the number
+        of runs at once; empty if no run waits or none has finished.
         """
         remaining_s = remaining_time_s(
             [run.method for run in self._waiting.values()],
@@ -141,7 +142,9 @@ class DesignProgress(Watched):
         )
 
     def show_activity(self, what: str) -> None:
-        """Show `what` is being computed, such as a stage of the design."""
+        """Show what is being computed, such as a stage of the design, with a hint at Ctrl-C; `what`
+        is a text.
+        """
         self.update(
             Text(f"{what} (Ctrl-C stops and keeps the best)", style="dim"), what
         )

@@ -46,8 +46,9 @@ class NumberColumn:
     has_median: bool = True
 
     def format(self, value: float | None) -> str:
-        """Return `value` times the factor as text in the format of the column; a dash for None.
-        With the default format, magnitudes from 100 on are rounded to whole numbers.
+        """Return `value` times the factor as text in the format of the column; a dash "–" for None.
+
+        With the default format ".2g", magnitudes from 100 on are rounded to whole numbers.
         """
         if value is None:
             return "–"
@@ -181,9 +182,11 @@ def run_row(
 ) -> Row:
     """Return one run as a flat row; values are None if they are not known or NaN.
 
-    Columns ``guess_*``, ``value_*``, ``std_error_*``, ``low_*``, ``high_*`` (combined standard
-    error and interval) and ``error_*`` (relative to the truth, only for parameters whose truth is
-    known) contain the parameters; swept keys have columns of their own.
+    The columns are "key", "method", "start", one for each swept key, "status", "converged",
+    "success", those of the parameters, the names in `COLUMNS` (quality and cost, such as "loss" and
+    "rms_m"), "wall_s", "attempts" and "message". The columns of the parameters are ``guess_NAME``,
+    ``value_NAME``, ``std_error_NAME``, ``low_NAME``, ``high_NAME`` (combined standard error and
+    interval) and ``error_NAME`` (relative to the truth, only for parameters whose truth is known).
 
     Parameters
     ----------
@@ -237,14 +240,18 @@ def run_row(
 def _parameter_columns(
     run: PlannedRun, result: Result | None, truth: Mapping[str, float]
 ) -> Row:
-    """Return the columns of the estimated parameters of a run, see `run_row`.
+    """Return the columns of the estimated parameters of a run: first ``guess_NAME`` of all, then
+    for each ``value_NAME``, ``std_error_NAME``, ``low_NAME`` and ``high_NAME`` (combined standard
+    error and interval), and ``error_NAME`` if its truth is known.
+
+    The error is that of the optimum, relative to the truth, without a sign.
 
     Parameters
     ----------
     run : PlannedRun
         Run with its guesses; one that is None is replaced by that of the result.
     result : Result or None
-        Its result; None leaves all values None.
+        Its result; None leaves all columns None but the guesses that the run states.
     truth : mapping of str to float
         True values by name.
     """
@@ -276,8 +283,15 @@ def _parameter_columns(
 
 
 def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
-    """Return the names of the parameters for which the first of `rows`, at least one, has a column
-    with the prefix `kind`.
+    """Return the names of the parameters for which there is a column with the prefix `kind`,
+    without the prefix.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        At least one row of `run_row` or `method_rows`, the first of which decides.
+    kind : str
+        Prefix of columns, such as "guess_", "value_" or "error_".
     """
     return [
         name.removeprefix(kind) for name in rows[0] if name.startswith(kind)
@@ -288,8 +302,12 @@ def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
 
 
 def method_rows(rows: Sequence[Row]) -> list[Row]:
-    """Return a summary of each method, in the order of their first runs, see `_method_summary`;
-    `rows` are those of `run_row`.
+    """Return a summary of each method, in the order of their first runs, see `_method_summary`.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row`, also of runs that are missing; empty gives an empty list.
     """
     methods = dict.fromkeys(row["method"] for row in rows)
     return [
@@ -310,14 +328,15 @@ def _method_summary(method: str, rows: Sequence[Row]) -> Row:
     method : str
         Name for the summary.
     rows : sequence of dict
-        Rows of this method's runs, at least one.
+        Rows of `run_row` of this method's runs, at least one.
 
     Returns
     -------
     dict
-        Numbers of "runs", "converged" and "successes"; "success_rate", None without runs, with its
-        95 % interval from "success_low" to "success_high"; and the medians of the relative errors
-        and of the columns that have a median, None if no run has a value.
+        "method"; the numbers of "runs", "converged" and "successes"; "success_rate", None without
+        runs, with its 95 % interval from "success_low" to "success_high", 0 and 1 without runs; and
+        under their own names the medians of the relative errors ``error_NAME`` and of the `COLUMNS`
+        that have a median, over the runs that have a value, None if no run has one.
     """
     done = [row for row in rows if row["status"] != "missing"]
     successes = sum(row["success"] for row in done)
@@ -347,7 +366,13 @@ def best_run(rows: Sequence[Row]) -> Row | None:
     """Return the run with the lowest loss among the successes, without any among the converged
     runs, and without these among all runs with a result.
 
-    A loss of None counts as infinite; None if no run has a result.
+    A run has a result if its "rms_m" is not None. A loss of None counts as infinite. None if no run
+    has a result.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row`; not modified.
     """
     completed = [row for row in rows if row["rms_m"] is not None]
 
@@ -366,15 +391,15 @@ def best_run(rows: Sequence[Row]) -> Row | None:
 def reference_parameters(
     rows: Sequence[Row], yardstick: SuccessCriterion
 ) -> dict[str, float]:
-    """Return the parameters relative to which guesses are measured: the truth, or the estimates of
-    the best run.
+    """Return the parameters by name relative to which guesses are measured: the truth, or the
+    estimates of the best run, see `best_run`.
 
-    Empty if there is no truth and the best run did not converge.
+    Empty if there is no truth and the best run did not converge, or no run has a result.
 
     Parameters
     ----------
     rows : sequence of Row
-        At least one run.
+        Rows of `run_row`, at least one.
     yardstick : SuccessCriterion
         True values; if there are any, one for each estimated parameter (otherwise `KeyError`).
     """
@@ -394,7 +419,7 @@ def guess_distance(row: Row, centre: Mapping[str, float]) -> float:
     Parameters
     ----------
     row : Row
-        Run with a guess of each parameter in `centre`.
+        Row of `run_row`; for each parameter in `centre` its guess must be positive, not None.
     centre : mapping of str to float
         Positive reference by name.
     """

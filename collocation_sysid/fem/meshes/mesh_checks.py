@@ -67,7 +67,7 @@ def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
         array = np.array(tetrahedra)
     except ValueError:
         raise InputError(
-            "tetrahedra must be an (E, 4) array of node numbers"
+            "tetrahedra must be an (E, 4) array of node indices from 0"
         ) from None
     if array.ndim != 2 or array.shape[1] != 4 or not len(array):
         raise InputError(
@@ -75,7 +75,7 @@ def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
         )
     if array.dtype.kind not in "iu":
         raise InputError(
-            f"tetrahedra must hold integer node numbers, not {array.dtype}"
+            f"tetrahedra must hold integer node indices from 0, not {array.dtype}"
         )
     require_known_nodes(array, node_count)
     return array.astype(np.int64)
@@ -92,7 +92,8 @@ def checked_faces(faces: ArrayLike, node_count: int) -> np.ndarray:
     array = np.array(faces)
     if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "iu":
         raise InputError(
-            f"a face set must be a (k, 3) array of node numbers, not {array.dtype} {array.shape}"
+            f"a face set must be a (k, 3) array of node indices from 0, "
+            f"not {array.dtype} {array.shape}"
         )
     require_known_nodes(array, node_count)
     return array.astype(np.int64)

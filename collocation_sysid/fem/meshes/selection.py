@@ -268,7 +268,7 @@ class Indices:
             indices.size and indices.dtype.kind not in "iu"
         ):
             raise InputError(
-                f"indices must be a list of whole node numbers, not {self.indices!r}"
+                f"indices must be a list of whole numbers from 0, not {self.indices!r}"
             )
         object.__setattr__(self, "indices", tuple(indices.tolist()))
 

@@ -309,7 +309,7 @@ def _initial_step_after(line: _LineSearch, last: float, change: float) -> float:
     last : float
         Step size of the last one.
     change : float
-        Change of the value by the last one.
+        Magnitude of the change of the value by the last one.
     """
     if change > SMALL_CHANGE * abs(line.value):
         sample_step = SAMPLED * last
@@ -384,7 +384,7 @@ class _AverageValue:
 
     @property
     def error(self) -> float:
-        """Estimated rounding error of the value."""
+        """Estimated rounding error of the value: `rounding` times the average size."""
         return self.options.rounding * self.size
 
 
@@ -479,7 +479,8 @@ class _LineSearch:
             return None
 
     def _try(self, step: float) -> _LineTrial:
-        """Return the trial at a step size, and count it.
+        """Return the trial at a step size, and count it; where the function is not finite its value
+        is infinite and its slope NaN.
 
         Raises
         ------
@@ -526,8 +527,10 @@ class _LineSearch:
         return is_decreased and not self.approximate
 
     def _bracket(self, step: float) -> tuple[_LineTrial, _LineTrial]:
-        """Return an interval at whose ends the slopes have opposite signs, starting with a step
-        size, rules B0 … B3. See `_try` for the exceptions.
+        """Return an interval (a, b) with a descending end a, of a value up to `limit`, and an
+        ascending end b, from a first step size above zero, rules B0 … B3.
+
+        See `_try` for the exceptions.
         """
         low = self.start
         while True:
@@ -543,7 +546,7 @@ class _LineSearch:
         self, a: _LineTrial, b: _LineTrial, step: float
     ) -> tuple[_LineTrial, _LineTrial]:
         """Return an interval within (a, b) with the trial at `step` as one of its ends, rules U0 …
-        U3; (a, b) itself if `step` is outside.
+        U3; (a, b) itself if `step` is outside or NaN.
 
         See `_try` for the exceptions.
         """
@@ -559,8 +562,10 @@ class _LineSearch:
     def _cut(
         self, a: _LineTrial, b: _LineTrial
     ) -> tuple[_LineTrial, _LineTrial]:
-        """Return an interval with an ascending end within (a, b), from a low descending point a and
-        a high one b, rule U3. See `_try` for the exceptions.
+        """Return an interval within (a, b) with an ascending end, from a descending trial a with a
+        value up to `limit` and a trial b above it, by bisection, rule U3.
+
+        See `_try` for the exceptions.
         """
         while True:
             trial = self._try((1 - CUT) * a.step + CUT * b.step)
@@ -574,8 +579,10 @@ class _LineSearch:
     def _double_secant(
         self, a: _LineTrial, b: _LineTrial
     ) -> tuple[_LineTrial, _LineTrial]:
-        """Return an interval within (a, b) after two secant steps, rules S1 … S4. See `_try` for
-        the exceptions.
+        """Return an interval within (a, b) after up to two secant steps, rules S1 … S4; (a, b)
+        itself if the secant step is outside or NaN.
+
+        See `_try` for the exceptions.
         """
         step = _secant(a, b)
         low, high = self._update(a, b, step=step)

@@ -204,11 +204,12 @@ def _quadratic_model(
     merit : MeritFunction
         Merit function.
     point : _MeritPoint
-        Point with its derivatives.
+        Point with its derivatives, evaluated last: its Jacobian is used, not copied.
     exact : bool
         Whether the Hessian is that of the Lagrangian, else that of the loss.
     order : list
-        Order of the band's columns, appended when it is first computed.
+        Order of the band's columns, shared by all models of a minimisation: empty at first; the
+        first step of a model computes and appends it.
     """
     weights = (
         merit.multiplier_estimate(point.rows)
@@ -265,7 +266,9 @@ class _QuadraticModel:
     order: list[Index]
 
     def predicted_decrease(self, step: Array) -> float:
-        """Return the decrease of the model by a step (variables,), without damping."""
+        """Return the decrease of the model, in the unit of the merit, by a step (variables,),
+        without damping; negative if the model increases.
+        """
         constraint_change = self.jacobian @ step
         curvature = float(step @ (self.hessian @ step)) + self.rho * float(
             constraint_change @ constraint_change
@@ -448,8 +451,8 @@ class _QuadraticModel:
 
 
 def _narrow_order(square: sp.coo_array) -> Index:
-    """Return an order (n,) of the positions that makes the band of a symmetric matrix narrower; the
-    identity if none is found.
+    """Return an order (n,) of the rows and columns that makes the band of a symmetric sparse matrix
+    (n, n) narrower, as indices of the columns in the new order; the identity if none is found.
     """
     order = reverse_cuthill_mckee(
         sp.csr_array(square), symmetric_mode=True

@@ -418,8 +418,9 @@ class _PenaltySolve:
             previous_violation = ended_stage.violation
 
     def solution(self, status: Status, reason: str) -> Solution:
-        """Return the last iterate as a solution of the given problem; `reason` is the first
-        sentence of its message.
+        """Return the last iterate as a solution of the given problem with a status, with the
+        multipliers y + ρ g; `reason` is the first sentence of its message. The constraints are
+        evaluated and counted.
         """
         merit = self.stage.merit
         estimate = merit.multiplier_estimate(

@@ -137,7 +137,8 @@ def simulate_variables(
 def adjoint_gradient(
     collocation: Collocation, z: Array, stopwatch: Stopwatch | None = None
 ) -> Array:
-    """Return the total derivative (np,) of the objective by p along the equations of motion.
+    """Return the total derivative (np,) of the objective, in the scaling of the NLP, by p along the
+    equations of motion.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ def all_pictures(
     result : Result
         Content of ``result.json`` of the same run.
     truth : mapping, optional
-        True parameters by name, see `convergence`.
+        True values of all estimated parameters by name, see `convergence`.
     """
     names = [
         n

@@ -175,11 +175,11 @@ def _draw_panel(
     ----------
     axes : Axes
     image_points : (P, 2)
-        u and v of the points.
+        u and v of the points [pixels, or mm for a point cloud], at least one.
     values : (P,)
         Values that colour the points.
     lines : (k, 2)
-        u and v of the outlines, NaN after each face.
+        u and v of the outlines in the same unit, NaN after each face.
     colour : str
         Colour of the outlines.
     style : dict

@@ -63,7 +63,7 @@ def field_picture(replay: MotionRecord, name: str, values: Array) -> Figure:
     name : str
         Name of the constant.
     values : (E, 4)
-        Its values in each element, see `MotionRecord.fields`.
+        Its values in each element, see `MotionRecord.fields`; not all NaN.
     """
     nodes_m = replay.undeformed_m
     cells = np.asarray(replay.tetrahedra, dtype=np.int64)

@@ -126,9 +126,10 @@ def marker_tracks(
     measured_m : (T, M, 3)
         Measured markers, NaN where missing.
     fitted_m, simulated_m : (T, M, 3) or None
-        Fitted markers, and those of a simulation with the estimated parameters.
+        Fitted markers, and those of a simulation with the estimated parameters; None is left out.
     max_markers : int
-        Of more markers, those with the largest residuals are shown.
+        Largest number of markers, at least 1. Of more markers, those with the largest residuals of
+        the fit, or else of the simulation, are shown; without both the first ones.
     """
     drawn = drawn_models(fitted_m, simulated_m)
     shown = _worst_markers(
@@ -213,7 +214,8 @@ def marker_tracks(
 def _axes_boxes(
     row: int, axis: int, height: float, head: float
 ) -> tuple[Box, Box]:
-    """Return the positions of an upper and a lower pair of axes, in shares of the figure.
+    """Return the positions of an upper and a lower pair of axes, each as (left, bottom, width,
+    height) in shares of the figure.
 
     Parameters
     ----------
@@ -303,7 +305,7 @@ def marker_errors(
     measured_m : (T, M, 3)
         Measured markers, NaN where missing; samples without any marker leave a gap.
     fitted_m, simulated_m : (T, M, 3) or None
-        Fitted and simulated markers.
+        Fitted and simulated markers [m]; None is left out, and without both the axes are empty.
     """
     figure = framed_figure(
         COLUMN_MM, 52, left_mm=13, right_mm=2, foot_mm=9.5, top_mm=9

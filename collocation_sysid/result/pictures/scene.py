@@ -101,7 +101,7 @@ class SheetView:
         camera : ParallelCamera
             Viewing direction.
         points_m : (…, 3)
-            Points to show; NaN is ignored.
+            Points to show [m], at least one of them finite; NaN is ignored.
         room_mm, corner_mm : (2,)
             Width and height of the box, and its lower left corner.
         """
@@ -316,9 +316,9 @@ def draw_scale(
     mm_per_m : float
         Scale of the view.
     corner_mm : (2,)
-        Left end of the bar.
+        Left end of the bar on the sheet [mm].
     longest_mm : float
-        Largest length of the bar on the sheet.
+        Largest length of the bar on the sheet [mm].
     """
     x, y = np.asarray(corner_mm, dtype=float)
     length_m = round_length(longest_mm / mm_per_m)
@@ -400,8 +400,8 @@ def part_legend_handle(part: int, name: str) -> Line2D:
 def draw_legend(
     axes: Axes, entries: Sequence[Line2D], corner_mm: ArrayLike
 ) -> None:
-    """Draw one line of legend with these entries into the axes of a sheet; its upper left corner is
-    at `corner_mm` (2,).
+    """Draw a legend with these entries, which have labels, in one line into the axes of a sheet;
+    its upper left corner is at `corner_mm` (2,), and earlier legends stay.
     """
     names = [str(entry.get_label()) for entry in entries]
     place: Any = tuple(np.asarray(corner_mm))

@@ -47,10 +47,15 @@ def convergence(
     history : sequence of Iteration
         Iterations of a search; if empty, the axes are empty.
     names : sequence of str, optional
-        Parameters to draw; all by default.
+        Parameters to draw; those of the first iteration by default.
     truth : mapping, optional
         True values of these parameters by name, relative to which they are drawn; their final
         values by default.
+
+    Raises
+    ------
+    KeyError
+        If one of the parameters is missing in an iteration or in `truth`.
     """
     figure = framed_figure(
         COLUMN_MM, 132, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=4

@@ -79,15 +79,16 @@ def shapes_picture(
 ) -> Figure:
     """Return a figure of the body at evenly spaced samples, side by side in one scale.
 
-    Heights are true; horizontally the shapes are moved together. Samples that are not finite, as in
-    a simulation that diverged, are left out.
+    Drawn are the fitted shapes, or else the simulated ones, with the measured markers. Heights are
+    true; horizontally the shapes are moved together. Samples that are not finite, as in a
+    simulation that diverged, are left out.
 
     Parameters
     ----------
     replay : MotionRecord
         An experiment with shapes, at least one of which is finite, see `MotionRecord.has_shapes`.
     count : int
-        Number of samples; fewer are shown if there are not as many.
+        Number of samples, at least 1; fewer are shown if there are not as many.
     field : SurfaceField, optional
         Colours of the body; those of its parts by default.
     camera : ParallelCamera, optional
@@ -207,7 +208,7 @@ def obstacle_pictures(replay: MotionRecord) -> dict[str, Figure]:
     "pressure" and "gap".
 
     The viewing direction is the one from which most of the pressure is visible. Empty without
-    obstacles or without shapes.
+    obstacles or without shapes; shapes, if there are any, must be finite at one sample at least.
     """
     positions_m = replay.shapes_m
     gaps_m = replay.gaps_m
@@ -230,7 +231,8 @@ def obstacle_pictures(replay: MotionRecord) -> dict[str, Figure]:
 def _camera_facing_weights(
     replay: MotionRecord, positions_m: Array, weights: Array
 ) -> ParallelCamera:
-    """Return the camera, of four directions around the body, that faces most of the weights.
+    """Return the one of four cameras that faces most of the weights: onto the plane of motion from
+    above, the same from below, and both from behind the body.
 
     The weight of a triangle counts in proportion to its projected area, whether or not another
     part of the body hides it. Samples with NaN are ignored.
@@ -282,7 +284,8 @@ def field_shapes(
     field: str | None,
     count: int,
 ) -> Figure:
-    """Return a figure of `count` shapes of an experiment, coloured by a field of its elements.
+    """Return a figure of `count` shapes of an experiment, fitted or else simulated, coloured by a
+    field of its elements.
 
     Parameters
     ----------
@@ -291,7 +294,7 @@ def field_shapes(
     body : Body
         Its body.
     constants : mapping of name to value
-        Constants of the body, for stresses and energies.
+        Values of the body's constants by name, at which stresses and energies are computed.
     field : str or None
         One of `FIELD_TITLES`; None for the colours of the body's parts.
     count : int
@@ -327,7 +330,7 @@ def _surface_field(
     body : Body
         Its body.
     constants : mapping of name to value
-        Constants of the body.
+        Values of the body's constants by name, at which stresses and energies are computed.
     field : str
         Key of `FIELD_TITLES`.
     """

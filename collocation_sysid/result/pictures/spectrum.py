@@ -41,13 +41,15 @@ def spectrum_picture(
     Parameters
     ----------
     t_s : (T,)
-        Evenly spaced times.
+        Evenly spaced times [s], at least two.
     measured_m : (T, M, 3)
-        Measured markers, NaN where missing.
+        Measured markers [m], NaN where missing: gaps are interpolated linearly, and markers that
+        are missing too often are left out, see `spectral_density`.
     fitted_m : (T, M, 3) or None
-        Fitted markers.
+        Fitted markers [m]; None draws no spectrum of the residual.
     natural_hz : (k,) or None
-        Natural frequencies; those above half the sampling rate are left out.
+        Natural frequencies [Hz], ascending; those above half the sampling rate are left out, and
+        None draws none.
     """
     figure = framed_figure(
         COLUMN_MM, 58, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=9
@@ -95,7 +97,8 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
     Returns
     -------
     hertz, density : (k,)
-        The density is NaN where it is zero, or if no marker is present often enough.
+        Frequencies above zero up to half the sampling rate. The density is NaN where it is zero, or
+        if no marker is present often enough.
     """
     present = np.asarray(np.isfinite(tracks_m).all(axis=2))
     markers = np.flatnonzero(present.mean(axis=0) >= MIN_PRESENT_SHARE)

@@ -31,15 +31,17 @@ def strain_picture(
     Parameters
     ----------
     strain : (T,) array
-        Strain at the times of the experiment.
+        Strain at the times of the experiment, a ratio and not percent; drawn as it is.
     t_s : (T,) array
         Times of the experiment [s].
     samples : (S, 4) array
-        Time [s], and the value as measured, fitted and simulated; NaN where there is none.
+        Time [s], and the value as measured, fitted and simulated; NaN where there is none. A
+        fitted or simulated column of NaN alone is left out.
     name : str
         Name of the measurement, for the axis.
     unit : str
-        "Pa" for a stress; other units are written as they are, "1" and "" not at all.
+        "Pa" for a stress, which is drawn in a readable multiple such as kPa; other units are
+        written as they are, "1" and "" not at all.
     """
     at = np.interp(samples[:, 0], t_s, strain)
     shown_unit, factor = _readable_unit(samples[:, 1], unit)

@@ -202,7 +202,12 @@ class CheckResult(QuickCheck):
         return tuple(concern.message for concern in self.concerns)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the findings as plain values for JSON and tables."""
+        """Return the findings as plain values for JSON and tables.
+
+        The keys are the attributes and `warnings`. NaN and infinity become None; None is kept,
+        except in optional attributes of parts, which are left out. Each cause has its message and
+        strength, see `Hypothesis.as_dict`.
+        """
         return content(replace(self, causes=())) | {
             "causes": [c.as_dict() for c in self.causes]
         }
@@ -376,8 +381,9 @@ def check_problem(
 def _fit_to_markers_s(
     collocation: Collocation, total_s: float, samples: int
 ) -> float:
-    """Return the estimated time [s] to fit the first `samples` to the markers alone; `total_s` is
-    the time to simulate the complete recordings.
+    """Return the estimated time [s] to fit the first `samples` samples, each counted as one time
+    step, to the markers alone; `total_s` is the time to simulate the complete recordings [s] of
+    `collocation`.
     """
     share = min(1.0, samples / _grid_rows(collocation))
     return FIT_SIMULATIONS * total_s * share
@@ -418,7 +424,7 @@ def _simulated_fields(
 
 
 def _grid_rows(collocation: Collocation) -> int:
-    """Return the number of time steps of all segments."""
+    """Return the number of times of the grids of all fitted experiments together."""
     return sum(segment.grid_times for segment in collocation.transcriptions)
 
 
@@ -481,7 +487,8 @@ def _natural_modes(
     problem: Problem, collocation: Collocation
 ) -> tuple[ModesCheck, ...]:
     """Return the natural modes at the guess of each fitted experiment that moves, in their order,
-    with the scheme and step of the collocation; static and held out experiments are left out.
+    with the scheme and step of the collocation; static and held out experiments are left out. Every
+    parameter must have a guess.
 
     Raises
     ------

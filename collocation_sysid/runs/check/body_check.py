@@ -81,8 +81,9 @@ class Slenderness:
 
 
 def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
-    """Return the shapes of the `count` elements of lowest quality, worst first; all of them if
-    there are fewer.
+    """Return the shapes of the `count` elements of lowest quality, worst first, with indices from
+    0; all of them if there are fewer. The mesh is undeformed, and of quadratic elements the corners
+    count alone.
     """
     corners = mesh.points_m[mesh.tetrahedra]
     areas = [_areas(corners[:, face]) for face in _FACES]
@@ -101,7 +102,9 @@ def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
 
 
 def slenderness(mesh: TetMesh) -> Slenderness:
-    """Return length and thickness of a body, and the number of elements across its thickness."""
+    """Return length and thickness [m] of an undeformed body, and the number of elements across its
+    thickness.
+    """
     # Edges of the box with the same second moments, however it is turned.
     edges = np.sqrt(12 * np.linalg.eigvalsh(_covariance(mesh)))
     # A bent or hollow body is thinner than its extents: six times volume over surface is a cube's
@@ -172,7 +175,9 @@ def element_concerns(
 
 
 def _covariance(mesh: TetMesh) -> Array:
-    """Return the mean of (x − x̄)(x − x̄)ᵀ over the volume of a mesh, (3, 3) [m²]."""
+    """Return the mean of (x − x̄)(x − x̄)ᵀ over the undeformed volume of a mesh, (3, 3) [m²], with
+    its centroid x̄.
+    """
     shares = mesh.volumes_m3 / mesh.volume_m3
     corners = mesh.points_m[mesh.tetrahedra]
     corners = corners - shares @ corners.mean(axis=1)
@@ -284,6 +289,8 @@ def check_body(
         Names of its experiments.
     is_homogeneous : bool
         Whether it is the cell of specimens, which has no discretisation error.
+    point_masses_kg : mapping of str to float, optional
+        Sum of the point masses by experiment [kg]; none by default.
     """
     mesh = body.mesh
     fields = {
@@ -327,7 +334,9 @@ def check_body(
 
 
 def _rest_shape(body: Body) -> str | None:
-    """Return the kind of the stated rest shape; None if none is stated."""
+    """Return the kind of the stated rest shape, "stress_free" or "under_gravity"; None if none is
+    stated.
+    """
     if body.rest_shape is None:
         return None
     return "stress_free" if body.scan_conditions is None else "under_gravity"
@@ -450,9 +459,9 @@ def _check_grasp(
     points_m : (n, 3) array
         Nodes of the undeformed body.
     grasp : Grasp
-        Grasp with its nodes selected.
+        Grasp with its nodes selected, at least one.
     mean_edge_m : float
-        Mean edge length of the mesh.
+        Mean edge length of the mesh [m].
     """
     nodes = grasp.nodes
     grasped_m = points_m[nodes]
@@ -505,8 +514,8 @@ def grasp_sentence(grasp_check: GraspCheck) -> str:
 
 
 def grasp_concerns(grasp_check: GraspCheck) -> list[Concern]:
-    """Return one concern if some nodes are so near to a face of the box that rounding decides
-    whether they are held; otherwise none.
+    """Return a list with one concern if some nodes are so near to a face of the box that rounding
+    decides whether they are held; otherwise an empty list.
     """
     by_chance = bool(grasp_check.nearly_grasped or grasp_check.nearly_free)
     counts = {

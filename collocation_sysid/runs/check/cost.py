@@ -120,8 +120,10 @@ def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
 
 
 def _count_nonzeros(problem: Problem) -> NDArray[np.int64]:
-    """Return the nonzeros of the Jacobian and of the Hessian's upper triangle of a problem as (2,)
-    int array, by laying them out.
+    """Return the numbers of nonzeros of the Jacobian and of the Hessian's upper triangle of a
+    problem, as int array (2,), by laying out its program without lifted variables.
+
+    That takes memory in proportion to the length of the recordings.
     """
     collocation = problem.collocation()
     structures = (collocation.jacobian_structure, collocation.hessian_structure)
@@ -218,8 +220,8 @@ def method_costs(
 
 
 def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
-    """Return, for each experiment, the number of unknowns per time step in interior point: free
-    dofs and overstresses.
+    """Return, for each fitted experiment in their order, the number of unknowns per time step in
+    interior point: free dofs and overstresses.
     """
     return [
         len(segment.free_dofs)
@@ -233,7 +235,7 @@ def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
 
 def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
     """Return a note if the quickest of the other methods takes at most a tenth of the time of the
-    chosen one, which takes more than a minute; none if a time is unknown.
+    chosen one, which takes more than a minute; none if its time, or that of all others, is unknown.
 
     Parameters
     ----------

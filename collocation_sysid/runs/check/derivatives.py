@@ -33,13 +33,16 @@ MOST_LIFTED_NONZEROS = 5e6
 
 
 def first_sample_count(experiment: Experiment) -> int:
-    """Return the number of first samples that contain all kinds of equations."""
+    """Return the number of first samples that contain all kinds of equations: `STATIC_SAMPLES` or
+    `SAMPLES`, also if the experiment has fewer samples.
+    """
     return STATIC_SAMPLES if experiment.is_static else SAMPLES
 
 
 def shortened_problem(problem: Problem) -> Problem:
-    """Return the problem with a few first samples of every experiment, also of those for
-    validation.
+    """Return the problem with the first samples of every experiment, also of those for validation:
+    at least `first_sample_count` or, if there are fewer, all, see `shortened_experiment`. The
+    problem itself is not modified.
     """
     short = tuple(
         shortened_experiment(e, first_sample_count(e), shortens_sensors=True)
@@ -53,8 +56,9 @@ def derivative_errors(
 ) -> tuple[float, float]:
     """Return the largest relative errors of the first and the second derivatives.
 
-    Exact derivatives along a random direction are compared with fourth-order central differences at
-    a disturbed start; the random numbers are the same in every call.
+    Errors are relative to the largest entry of the exact derivative. Exact derivatives along a
+    random direction are compared with fourth-order central differences at a disturbed start; the
+    random numbers are the same in every call.
 
     Parameters
     ----------
@@ -120,7 +124,9 @@ def derivative_errors(
 
 
 def _difference_step(collocation: Collocation) -> float:
-    """Return the step of the differences: `STEP`, or less where a feature needs smaller ones."""
+    """Return the step of the differences in the scaled variables z: `STEP`, or less where a feature
+    of a fitted experiment needs smaller ones.
+    """
     return min(
         (
             STEP,
@@ -165,7 +171,10 @@ def _deviation(
     function, exact: Array, point: Array, direction: Array, step: float
 ) -> float:
     """Return the largest deviation of an exact derivative from fourth-order central differences,
-    relative to the largest entry of `exact`.
+    relative to the largest magnitude in `exact`.
+
+    If `exact` is zero, the result is 0 for equal differences, else huge; it is NaN if a value is
+    not finite.
 
     Parameters
     ----------

@@ -104,8 +104,9 @@ def check_recording(
     Parameters
     ----------
     experiment : Experiment
-    positions_m : (T, n, 3) or None
-        Its simulation at the guess, at the samples or the first of them.
+    positions_m : (T, n, 3) array or None
+        Its node positions in the simulation at the guess [m], at all samples or the first T; None
+        without a simulation, and then no `start_miss_m` is known.
     """
     markers = experiment.markers
     miss = np.zeros((0, len(markers.names)))
@@ -167,7 +168,7 @@ def recording_concerns(
     if not recording.markers:
         return []
 
-    def of(
+    def marker_data(
         marker: MarkerCheck, distance_m: float | None = 0.0
     ) -> dict[str, Any]:
         """Return the data of a concern about a marker; `distance_m` [m] is None or 0 if it does not
@@ -198,14 +199,21 @@ def recording_concerns(
     off = farthest.distance_m > LARGEST_DISTANCE_EDGES * body.edges_m[1]
     return [
         *concern_if(
-            off, False, code="markers/off", **of(farthest, farthest.distance_m)
+            off,
+            False,
+            code="markers/off",
+            **marker_data(farthest, farthest.distance_m),
         ),
-        *concern_if(unseen, False, code="markers/unseen", **of(most_missing)),
-        *concern_if(missing, False, code="markers/missing", **of(most_missing)),
+        *concern_if(
+            unseen, False, code="markers/unseen", **marker_data(most_missing)
+        ),
+        *concern_if(
+            missing, False, code="markers/missing", **marker_data(most_missing)
+        ),
         *concern_if(
             astray,
             False,
             code="markers/astray",
-            **of(worst, worst.start_miss_m),
+            **marker_data(worst, worst.start_miss_m),
         ),
     ]

@@ -321,7 +321,9 @@ def _grid_concerns(motion: ModesCheck, mode: ModeCheck) -> list[Concern]:
 
 
 def _first_mode_data(motion: ModesCheck, mode: ModeCheck) -> dict[str, Any]:
-    """Return the name of the experiment and the first mode's frequency, as data of a concern."""
+    """Return the name of the experiment of `motion` and the frequency of `mode` [Hz], as data of a
+    concern under the keys "experiment" and "frequency_hz".
+    """
     return {"experiment": motion.experiment, "frequency_hz": mode.frequency_hz}
 
 
@@ -358,8 +360,8 @@ def mode_notes(motion: ModesCheck) -> list[str]:
 
 
 def _step_remedy(motion: ModesCheck) -> str:
-    """Return the remedy for too few steps: a setting of the substeps, or a higher rate if too many
-    would be needed.
+    """Return the remedy for too few steps as a sentence without an end: a setting of the substeps,
+    or a higher rate if too many would be needed.
     """
     if motion.substeps_needed is None:
         return "record at a higher rate"
@@ -367,5 +369,7 @@ def _step_remedy(motion: ModesCheck) -> str:
 
 
 def _substeps_setting(motion: ModesCheck) -> str:
-    """Return the setting of the substeps without its table."""
+    """Return the setting of the substeps that are needed, "substeps = 4" for example, without its
+    table; `motion.substeps_needed` must not be None.
+    """
     return f"substeps = {motion.substeps_needed}"
