@@ -59,6 +59,7 @@ from .statistics.probes.relaxed_assumptions import (
 from .statistics.probes.routine_probes import probed_deviations
 from .statistics.residuals.residual_diagnostics import diagnose_markers
 from .statistics.specimen_notes import one_kind_notes
+from .statistics.specimen_offsets import stress_offset_notes
 from .statistics.uncertainty import Uncertainty, uncertainty_from_fit
 
 if TYPE_CHECKING:
@@ -276,6 +277,7 @@ def run(
                     answer, fit, changes=changes, say=say, deep=probe
                 ),
             )
+            answer = _with_offset_notes(answer, fit)
         if answer.solution.status is Status.INTERRUPTED:
             return timed(answer)
         if seek_causes:
@@ -330,6 +332,17 @@ def _with_problem_notes(answer: Run) -> Run:
     )
     tests = one_kind_notes(problem.experiments, problem.parameters)
     return replace(answer, notes=(*rotations, *tests, *answer.notes))
+
+
+def _with_offset_notes(answer: Run, fit: LinearisedFit) -> Run:
+    """Return the run with notes on constant offsets of the stresses of specimens after its other
+    notes; `fit` is its linearised fit.
+    """
+    fitted = [
+        each.experiment for each in answer.solution.collocation.transcriptions
+    ]
+    offsets = stress_offset_notes(fit, fitted)
+    return replace(answer, notes=(*answer.notes, *offsets))
 
 
 def _checked(

@@ -143,10 +143,10 @@ def add_displacement(
     """Add the translations of a grasp at the times of the table, in place, as `read_displacement`
     reads them.
 
-    They are those of the poses, from the undeformed place, times the sign of the layout. The
-    columns are those that the layout names; if it names none, the strain if `rest_length_m` is
-    given, else the displacement along the layout's axis, or along the axes of the grasp's `zero` if
-    these are others.
+    They are those of the poses, from the undeformed place, times the sign of the layout and over
+    its scale, thus those of the whole specimen. The columns are those that the layout names; if it
+    names none, the strain if `rest_length_m` is given, else the displacement along the layout's
+    axis, or along the axes of the grasp's `zero` if these are others.
 
     Parameters
     ----------
@@ -154,15 +154,15 @@ def add_displacement(
     layout : DisplacementSection
     grasp : Grasp
     rest_length_m : float or None
-        Undeformed length [m] over which the displacement along the axis is the strain; None if the
-        table has no strain.
+        Undeformed length [m] over which the displacement along the axis, before it is scaled, is
+        the strain; None if the table has no strain.
 
     Raises
     ------
     InputError
         If the table already has a column of that name with other values.
     """
-    shifts_m = layout.sign * grasp.poses.at(table.t_s)[1]
+    shifts_m = layout.sign / layout.scale * grasp.poses.at(table.t_s)[1]
     displacement_m = shifts_m[:, "xyz".index(layout.axis)]
     values = {
         "displacement": displacement_m,

@@ -351,7 +351,13 @@ class RecordingReader:
             section.wrench, self._grasp_key(k, word), t_s=t_s
         )
         with located(where=self._grasp_key(k)):
-            grasp = kind(**arguments, poses=poses, zero=zero, wrench=wrench)
+            grasp = kind(
+                **arguments,
+                poses=poses,
+                zero=zero,
+                wrench=wrench,
+                displacement_scale=1.0 if table is None else table.scale,
+            )
         if is_obstacle:
             return grasp
         with located(where=self._grasp_key(k, "nodes")):

@@ -77,10 +77,10 @@ class TableSection(Section):
     @property
     def layout(self) -> dict[str, Any]:
         """Arguments with which the columns are read, by name: `columns`, `axis`, `sign`, and
-        `length_m` or `area_m2` where the section has them.
+        `scale`, `length_m` or `area_m2` where the section has them.
         """
         return self.model_dump(
-            include={"columns", "axis", "sign", "length_m", "area_m2"}
+            include={"columns", "axis", "sign", "scale", "length_m", "area_m2"}
         )
 
 
@@ -95,9 +95,24 @@ class DisplacementSection(TableSection):
     length_m : float or "body", optional
         Undeformed length by which an engineering strain is multiplied [m]; "body" is the length of
         the body along the axis.
+    scale : float
+        Factor, above 0, on the displacements of the file: 0.5 for a model of half the height of the
+        specimen, with a plane of symmetry across the loading axis, of which each half takes half of
+        the displacement.
     """
 
     length_m: Annotated[Literal["body"] | Positive, ByForm(str)] | None = None
+    scale: Positive = 1.0
+
+    @model_validator(mode="after")
+    def _require_one_size(self) -> DisplacementSection:
+        """Return the section itself, or raise `ValueError` for a scale of strains of the body."""
+        if self.length_m == "body" and self.scale != 1.0:
+            raise ValueError(
+                f'found scale = {self.scale:g} with length_m = "body"; expected one of them: the '
+                "strain of the specimen is also that of the modelled part"
+            )
+        return self
 
 
 class WrenchSection(TableSection):

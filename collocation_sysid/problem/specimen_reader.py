@@ -23,6 +23,7 @@ from ..recording.specimen_files import (
     SpecimenTable,
     read_specimen,
 )
+from ..recording.specimen_hysteresis import loading_rows
 from .code_loader import existing_file
 from .specimen_schema import SpecimenSection, deviation
 
@@ -131,7 +132,8 @@ class SpecimenReader:
         """Return the indices (k,) of the rows to use; all rows of a simulation.
 
         Otherwise these are the rows within `window_s`, without the first `skip_cycles` cycles of
-        the strain; of these every `every`-th row, beginning with the first one.
+        the strain and, with branch "loading", only those of the last cycle up to its peak; of these
+        every `every`-th row, beginning with the first one.
 
         Raises
         ------
@@ -153,6 +155,8 @@ class SpecimenReader:
             rows = rows[
                 rows_after_cycles(table.strain[rows], section.skip_cycles)
             ]
+        if section.branch == "loading":
+            rows = rows[loading_rows(table.strain[rows])]
         return rows[:: section.every]
 
     def _sigma_pa(self) -> float:

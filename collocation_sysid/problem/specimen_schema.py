@@ -64,6 +64,9 @@ class SpecimenSection(NamedSection):
         Standard deviation of a constant offset of the stress, which is estimated.
     skip_cycles : int
         Number of first loading cycles to leave out, in which rubber softens (Mullins).
+    branch : {"both", "loading"}
+        Part of the cycles: all samples, or only those of the last cycle in which the strain
+        increases in magnitude, without the unloading, which is softer (hysteresis).
     window_s : list, optional
         First and last time to use [start, end].
     every : int
@@ -88,6 +91,7 @@ class SpecimenSection(NamedSection):
     area_error: Prior = AREA_ERROR
     stress_zero_pa: Prior = "none"
     skip_cycles: Count = 0
+    branch: Literal["both", "loading"] = "both"
     window_s: tuple[Boundless, Boundless] | None = None
     every: AtLeastOne = 1
     validation: Flag = False

@@ -70,6 +70,9 @@ class Grasp:
         with the standard deviation in the experiment's `nuisance`; none by default.
     wrench : Wrench, optional
         Measured force and torque that it exerts on the body.
+    displacement_scale : float
+        Share of the displacement of a test bench that the poses contain, such as 0.5 if half the
+        height of the specimen is modelled; the deformation of the bench counts by this share.
     """
 
     nodes: Index = key(
@@ -88,6 +91,7 @@ class Grasp:
     axes: Axes = key(Axes, default="xyz")
     zero: str = ""
     wrench: Wrench | None = None
+    displacement_scale: float = 1.0
 
     def __post_init__(self) -> None:
         """Check the grasp, see `_check_times_and_axes`."""

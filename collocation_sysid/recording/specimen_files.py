@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -35,14 +37,18 @@ from .formats.columns import (
     VOLUME_RATIO,
     Quantity,
     QuantityTable,
+    column_statement,
+    fitting_column_names,
     name_and_unit,
     read_columns,
 )
-from .formats.text import names_file_in_errors
+from .formats.text import TextTable, names_file_in_errors
 from .formats.units import si_factor
 from .homogeneous_deformation import AXES, CELL_SIZE_M
 from .specimen import LATERAL_NAME, SECOND_STRESS_NAME, STRESS_NAME
 
+# Most statements of columns that a message lists: more are not read.
+MOST_STATEMENTS = 4
 Sign = Literal[1, -1]
 StressMeasure = Literal["engineering", "true"]
 
@@ -104,6 +110,26 @@ class SpecimenLayout:
             quantities += [LATERAL_STRETCH, LATERAL_STRAIN]
         return tuple(quantities)
 
+    @property
+    def deformations(self) -> tuple[Quantity, ...]:
+        """Quantities of which the table must have exactly one, the first deformation."""
+        known = (STRETCH, STRAIN, DISPLACEMENT, VOLUME_RATIO)
+        return tuple(each for each in known if each in self.quantities)
+
+    @property
+    def loads(self) -> tuple[Quantity, ...]:
+        """Quantities of which the table must have exactly one, the first load."""
+        known = (STRESS, TRUE_STRESS, FORCE, PRESSURE)
+        return tuple(each for each in known if each in self.quantities)
+
+    @property
+    def second_deformations(self) -> tuple[Quantity, ...]:
+        """Quantities of which the table of a "biaxial" test must have exactly one; empty for other
+        tests.
+        """
+        known = (SECOND_STRETCH, SECOND_STRAIN)
+        return known if self.test == "biaxial" else ()
+
 
 @dataclass(frozen=True, eq=False)
 class SpecimenTable:
@@ -161,6 +187,7 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         column_names=layout.columns,
         blank_allowed=True,
         requires_times=layout.requires_times,
+        column_advice=partial(column_advice, layout=layout),
     )
     strain = _strain(table, layout)
     second_strain = _second_strain(table, layout)
@@ -193,8 +220,85 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
     )
 
 
+def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
+    """Return the complete statements `columns = { … }` with which a table is unambiguous, joined by
+    "or", at most `MOST_STATEMENTS`.
+
+    Each names one deformation, one load and the optional quantities that one column fits, with the
+    names of the table's own columns; "…" stands for a quantity that no column fits. Columns that
+    the layout states are kept. Sizes of the specimen that a statement needs and the layout lacks
+    are named after it.
+
+    Parameters
+    ----------
+    grid : TextTable
+    layout : SpecimenLayout
+        Meaning of the columns.
+    """
+    groups = [
+        _column_choices(grid, group, stated=layout.columns)
+        for group in (
+            layout.deformations,
+            layout.second_deformations,
+            layout.loads,
+        )
+        if group
+    ]
+    required = {*layout.deformations, *layout.second_deformations}
+    required |= {*layout.loads}
+    other = {
+        quantity.key: choices[0][quantity.key]
+        for quantity in (TIME, *layout.quantities)
+        if quantity not in required
+        and len(choices := _column_choices(grid, (quantity,), layout.columns))
+        == 1
+        and choices[0][quantity.key] != "…"
+        and (quantity != TIME or TIME.key in layout.columns)
+    }
+    statements = []
+    for combination in product(*groups):
+        names = {
+            key: name for each in combination for key, name in each.items()
+        }
+        sizes = [
+            size
+            for quantity, size, value in (
+                (DISPLACEMENT, "length_m", layout.length_m),
+                (FORCE, "area_m2", layout.area_m2),
+            )
+            if quantity.key in names and value is None
+        ]
+        suffix = f" with {' and '.join(sizes)}" if sizes else ""
+        statements.append(column_statement(names | other) + suffix)
+    return ", or ".join(statements[:MOST_STATEMENTS])
+
+
+def _column_choices(
+    grid: TextTable, quantities: tuple[Quantity, ...], stated: Mapping[str, str]
+) -> list[dict[str, str]]:
+    """Return the possible choices of one column for one of several quantities, each as the name by
+    the quantity's key.
+
+    These are the `stated` columns of the quantities, else all columns that fit one of them; without
+    any, the last quantity with the name "…".
+    """
+    choices = [
+        {quantity.key: stated[quantity.key]}
+        for quantity in quantities
+        if quantity.key in stated
+    ] or [
+        {quantity.key: name}
+        for quantity in quantities
+        for name in fitting_column_names(grid, quantity)
+    ]
+    return choices or [{quantities[-1].key: "…"}]
+
+
 def _one_of(
-    table: QuantityTable, quantities: tuple[Quantity, ...], what: str
+    table: QuantityTable,
+    quantities: tuple[Quantity, ...],
+    what: str,
+    layout: SpecimenLayout,
 ) -> Quantity:
     """Return the only one of several quantities that a table has.
 
@@ -205,11 +309,13 @@ def _one_of(
         Alternatives.
     what : str
         Common name of the alternatives, for the message.
+    layout : SpecimenLayout
+        Meaning of the columns, for the remedy.
 
     Raises
     ------
     InputError
-        If the table has none or more than one.
+        If the table has none or more than one; the remedy is that of `column_advice`.
     """
     there = [
         quantity for quantity in quantities if quantity.key in table.values
@@ -220,7 +326,8 @@ def _one_of(
         raise table.grid.error_at(
             f"the columns are {', '.join(table.grid.columns)}; found "
             f"{present or 'no column'} of the {what}, "
-            f"expected exactly one of {expected}, in these or other units"
+            f"expected exactly one of {expected}, in these or other units. State "
+            f"{column_advice(table.grid, layout)}"
         )
     return there[0]
 
@@ -250,11 +357,9 @@ def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
         If not exactly one kind of deformation is there, a cell is blank, a displacement has no
         `length_m`, or a size is not positive (not tested in simple shear).
     """
-    known = (STRETCH, STRAIN, DISPLACEMENT, VOLUME_RATIO)
-    possible = tuple(
-        quantity for quantity in known if quantity in layout.quantities
+    quantity = _one_of(
+        table, layout.deformations, what="deformation", layout=layout
     )
-    quantity = _one_of(table, possible, what="deformation")
     values = _complete(table, quantity)
     if quantity == STRETCH:
         _require_positive(table, quantity, ratio=values)
@@ -316,8 +421,9 @@ def _second_strain(
         return None
     quantity = _one_of(
         table,
-        (SECOND_STRETCH, SECOND_STRAIN),
+        layout.second_deformations,
         what="deformation of the second axis",
+        layout=layout,
     )
     values = _complete(table, quantity)
     strain = (
@@ -354,11 +460,7 @@ def _stress_pa(table: QuantityTable, layout: SpecimenLayout) -> Array:
         If not exactly one kind of load is there, or a force has no area or is stated as true
         stress.
     """
-    known = (STRESS, TRUE_STRESS, FORCE, PRESSURE)
-    possible = tuple(
-        quantity for quantity in known if quantity in layout.quantities
-    )
-    quantity = _one_of(table, possible, what="load")
+    quantity = _one_of(table, layout.loads, what="load", layout=layout)
     values = table.values[quantity.key]
     if quantity == PRESSURE:
         return -values

@@ -182,6 +182,7 @@ def read_displacement(
     sign: int = 1,
     length_m: float | None = None,
     timed: bool = True,
+    scale: float = 1.0,
 ) -> PoseSequence:
     """Read displacements from the undeformed place over time, such as those of a crosshead.
 
@@ -202,6 +203,8 @@ def read_displacement(
         Undeformed length that an engineering strain multiplies; given if the file holds a strain.
     timed : bool
         Whether times are required; otherwise rows are numbered in seconds if there are no times.
+    scale : float
+        Factor on the displacements: share that the modelled part of the specimen has.
 
     Returns
     -------
@@ -217,6 +220,7 @@ def read_displacement(
     table = _read_displacements(path, columns, length_m=length_m, timed=timed)
     shifts_m = (
         sign
+        * scale
         * (length_m or 1.0)
         * np.nan_to_num(_axis_components(table, DISPLACEMENTS, axis=axis))
     )

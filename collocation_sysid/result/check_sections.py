@@ -317,6 +317,11 @@ def _solve_section(findings: CheckResult) -> Table:
         rows[cost.method] = (
             f"about {duration(cost.time_s)} and {memory}{chosen}"
         )
+    if findings.costs:
+        rows["times"] = (
+            f"rough estimates of the search for {findings.timesteps:,} time steps or equilibria, "
+            "obstacles and friction included; the checks of the result come on top"
+        )
     rows["derivatives"] = (
         f"relative errors of Jacobian and Hessian: {findings.jacobian_error:.0e}, "
         f"{findings.hessian_error:.0e}"

@@ -307,14 +307,23 @@ def _parameter_section(result: Result) -> TitledParts:
 
 
 def _undetermined_sentence(result: Result) -> list[str]:
-    """Return a sentence that names the estimates whose interval is wider than their value.
+    """Return a sentence that names the estimates whose interval is wider than their value, without
+    those that a reason of the verdict names.
 
     The largest contribution to each variance is named too; the list is empty if there is no such
     estimate.
     """
+    stated = {
+        name
+        for concern in result.trust.concerns
+        if concern.code in ("information/none", "information/combined")
+        for name in concern.data.get("names", [concern.data.get("name")])
+    }
     sources = []
     for name, shares in result.budget.items():
-        if name in result.values and not result.values[name].is_determined:
+        if name in stated or name not in result.values:
+            continue
+        if not result.values[name].is_determined:
             source, share = next(iter(shares.items()))
             sources.append(
                 f"{symbol_of(name)} (largest contribution: {source_label(source)}, {share:.0%})"

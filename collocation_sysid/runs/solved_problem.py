@@ -285,7 +285,12 @@ class SolvedProblem:
         ]
         if not self.omitted_checks:
             probed = probe_concerns(
-                self.probes, self._discretisation_corrections
+                self.probes,
+                self._discretisation_corrections,
+                [
+                    each.experiment
+                    for each in self.solution.collocation.transcriptions
+                ],
             )
             causes = cause_concerns(self.causes)
             return Assessment.from_concerns(

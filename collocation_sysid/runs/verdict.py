@@ -153,7 +153,8 @@ def combined_concerns(
     """Return a concern for each estimated parameter that has a budget and whose combined interval
     is wider than its value or missing.
 
-    Derived moduli give none: λ of a nearly incompressible material is rarely determined.
+    Derived moduli give none: λ of a nearly incompressible material is rarely determined. Parameters
+    without a statistical standard error give none either, because "information/none" names them.
 
     Parameters
     ----------
@@ -170,7 +171,9 @@ def combined_concerns(
             item.name, estimates[item.name], shares=shares[item.name]
         )
         for item in parameters.free
-        if item.name in shares and not estimates[item.name].is_determined
+        if item.name in shares
+        and estimates[item.name].statistical_std_error is not None
+        and not estimates[item.name].is_determined
     ]
 
 

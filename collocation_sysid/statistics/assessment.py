@@ -20,13 +20,14 @@ from ..fem.laws.constants import symbol_of, unit_of
 from ..program.modes.stability import Instability
 from ..recording.experiment import Experiment
 from ..recording.grasp_rotation import WARNING_ANGLE_RAD, fastest_rotation
+from ..recording.specimen_hysteresis import unloading_difference
 from .budget.discretisation_error import Refinement
 from .budget.uncertainty_budget import source_label
 from .concerns import Concern, concern_if
 from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, display_name
 from .misspecification.misspecification_hypothesis import Hypothesis
-from .probes.relaxed_assumptions import Probe
+from .probes.relaxed_assumptions import DRIFT, Probe
 from .probes.routine_probes import is_alarming
 from .residuals.noise_level import NoiseLevel
 from .residuals.residual_diagnostics import MOST_WILD, MarkerDiagnosis
@@ -350,7 +351,9 @@ RELAXED = {
 
 
 def probe_concerns(
-    probes: Iterable[Probe], corrections: Mapping[str, float]
+    probes: Iterable[Probe],
+    corrections: Mapping[str, float],
+    experiments: Iterable[Experiment] = (),
 ) -> list[Concern]:
     """Return one concern, as a list, about the assumption that the data contradict most, with the
     estimates without it; empty if `is_alarming` is false for every probe.
@@ -365,6 +368,8 @@ def probe_concerns(
     corrections : mapping of str to float
         The estimated parameters in the order in which they are reported, each with the factor that
         corrects its optimum for the known discretisation error.
+    experiments : iterable of Experiment
+        Fitted experiments, whose hysteresis is named as a cause of a drift of the stiffness.
     """
     alarming = sorted(
         filter(is_alarming, probes), key=lambda each: -each.chi_squared
@@ -386,11 +391,35 @@ def probe_concerns(
         "estimates": [
             _relaxed_estimate(worst, *each) for each in corrections.items()
         ],
-        "instead": f"; alternatives that decrease χ² less: {instead}"
-        if others
-        else "",
+        "instead": (
+            f"; alternatives that decrease χ² less: {instead}" if others else ""
+        )
+        + (_hysteresis_text(experiments) if worst.name == DRIFT else ""),
     }
     return [Concern("assumption/contradicted", data=data)]
+
+
+def _hysteresis_text(experiments: Iterable[Experiment]) -> str:
+    """Return the addition to a message on a drift of the stiffness that names the specimens whose
+    branches differ clearly, with the remedy; "" if there are none.
+    """
+    differences = {
+        experiment.name: difference
+        for experiment in experiments
+        if (difference := unloading_difference(experiment)) is not None
+    }
+    if not differences:
+        return ""
+    sizes = listed(
+        [
+            f"{100 * share:+.2g} % in '{name}'"
+            for name, share in differences.items()
+        ]
+    )
+    return (
+        f"; hysteresis resembles such a drift: the stress in unloading differs from that in "
+        f'loading by {sizes}. To fit the loading alone, set branch = "loading"'
+    )
 
 
 def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:

@@ -136,8 +136,9 @@ def _combination_sentence(
     of their correlations.
 
     It states the combination as a product of powers, the largest of them 1, and the factor of its
-    95 % interval; of two parameters also their correlation. If the value of a parameter is not
-    above 0, it only states that one combination is determined.
+    95 % interval; of two parameters also their correlation, unless a note of `uncertainty` states
+    that they are confounded. If the value of a parameter is not above 0, it only states that one
+    combination is determined.
 
     Parameters
     ----------
@@ -160,9 +161,14 @@ def _combination_sentence(
     how = ""
     if len(members) == 2:
         how = f" (correlation {uncertainty.correlation[members[0], members[1]]:.3f})"
-    if any(
-        uncertainty.estimates[name].value <= 0 for name in names
-    ):  # no powers of these
+    has_powers = all(uncertainty.estimates[name].value > 0 for name in names)
+    if has_powers and _is_confounding_noted(uncertainty, names):
+        return (
+            f"of {listed(names)} only the combination "
+            f"{_product_text(names, weights / weights[largest])} is determined, to "
+            f"{_precision_text(float(fixed))} (95 %)"
+        )
+    if not has_powers:
         return (
             f"{listed(names)} are confounded{how}: these data determine only one combination "
             "of them"
@@ -171,6 +177,22 @@ def _combination_sentence(
         f"{listed(names)} are confounded{how}: only their combination "
         f"{_product_text(names, weights / weights[largest])} is determined, to "
         f"{_precision_text(float(fixed))} (95 %)"
+    )
+
+
+def _is_confounding_noted(
+    uncertainty: Uncertainty, names: Sequence[str]
+) -> bool:
+    """Return whether two parameters are those of a note on confounded parameters, which the reason
+    of the estimate of one of them is; false for another number of parameters.
+    """
+    if len(names) != 2:
+        return False
+    return any(
+        (uncertainty.estimates[name].reason or "").startswith(
+            f"confounded with {other} "
+        )
+        for name, other in (names, names[::-1])
     )
 
 

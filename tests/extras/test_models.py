@@ -38,6 +38,7 @@ from collocation_sysid.extras.studies.model_variants import (
     parse_materials,
     variants,
 )
+from collocation_sysid.extras.studies.study_page import model_views
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.laws.constants import usual_value
 from collocation_sysid.fem.laws.materials import MATERIALS
@@ -719,6 +720,58 @@ def test_models_that_predict_alike_tell_what_they_disagree_about():
         )
     )
     assert "have E" not in said
+
+
+def test_a_constant_at_its_bound_is_marked_and_named(tmp_path):
+    bounded = row_of("mooney-rivlin", 2, {"a": WAVY.tolist()}, 900)
+    bounded["found"][""] |= {
+        "parameters": {"c10_pa": 7.5e4, "c01_pa": 1.0},
+        "at_bound": {"c01_pa": "lower"},
+    }
+    other = row_of("yeoh", 4, {"a": (0.5 * WAVY).tolist()}, 800)
+    rows = rows_of(bounded, other)
+    text = advice(rows)
+    assert text.startswith("Use yeoh")
+    assert "mooney-rivlin ended with C₀₁ = 1 Pa (its lower bound)" in text
+    assert "yeoh ended" not in text
+    table = model_views(rows)[-1]
+    assert table.rows[0] == ("C₁₀ Pa", "7.5e+04", "–")
+    assert table.rows[1] == ("C₀₁ Pa", "1 (at lower bound)", "–")
+    inside = row_of("mooney-rivlin", 2, {"a": WAVY.tolist()}, 900)
+    assert "bound" not in advice(rows_of(inside, other))
+
+
+@pytest.mark.parametrize(
+    ("c01_pa", "at_bound"), [(-2e4, {"c01_pa": "lower"}), (2e4, {})]
+)
+def test_a_fit_records_which_constants_end_at_bounds(
+    tmp_path, c01_pa, at_bound
+):
+    stretch = np.linspace(1.05, 2.0, 12)
+    stress_pa = 2 * (stretch - stretch**-2) * (8e4 + c01_pa / stretch)
+    rows = [f"{a},{b}" for a, b in zip(stretch, stress_pa, strict=True)]
+    (tmp_path / "pull.csv").write_text(
+        "\n".join(["stretch,stress (Pa)", *rows]) + "\n"
+    )
+    (tmp_path / "problem.toml").write_text(
+        """[object]
+material = "mooney-rivlin"
+[parameters]
+c10_pa = {}
+c01_pa = {}
+kappa_pa = 1e9
+[[experiment]]
+name = "pull"
+kind = "specimen"
+test = "uniaxial"
+file = "pull.csv"
+sigma_pa = 1e3
+"""
+    )
+    problem = Problem.read(tmp_path / "problem.toml")
+    record = fit_record(problem, "reduced-space", "")
+    assert record["converged"]
+    assert record["at_bound"] == at_bound
 
 
 def test_the_law_is_a_source_of_the_chosen_ones_budget():

@@ -186,8 +186,8 @@ BAD = {
     "two": (
         "Time (s),Load (N),Force (N)\n0,1,1\n1,2,2\n",
         {},
-        "Load (N), Force (N) could all be force; expected one of them, or columns = { force = "
-        '"…" }',
+        "Load (N), Force (N) could all be force; expected one of them, or "
+        'columns = { force = "Load (N)" } or columns = { force = "Force (N)" }',
     ),
     "only stress": (
         "Time (s),Stress (kPa)\n0,1\n1,2\n",
@@ -293,6 +293,40 @@ def test_experiments_share_what_they_do_not_say_themselves(tmp_path):
         tmp_path / "problem.toml", ["experiment_defaults.every=3"]
     )
     np.testing.assert_allclose(overridden.experiments[0].t_s, [0, 0.3])
+
+
+def test_a_half_height_takes_the_scaled_displacement(tmp_path):
+    file = block_problem(tmp_path)
+    complete = Problem.read(file).experiments[1].grasps[1]
+    text = SHARED.replace("sign = -1 }", "sign = -1, scale = 0.5 }", 1)
+    file.write_text(text)
+    problem = Problem.read(file)
+    half = problem.experiments[1].grasps[1]
+    assert half.displacement_scale == 0.5
+    assert np.abs(complete.poses.positions_m[:, 2]).max() > 0
+    np.testing.assert_allclose(
+        half.poses.positions_m, complete.poses.positions_m / 2
+    )
+    # Files of a simulation have the displacement of the whole specimen again.
+    write_data(Problem.read(file, simulation=True), tmp_path / "twin")
+    written = read_displacement(tmp_path / "twin" / "second.csv", sign=-1)
+    np.testing.assert_allclose(
+        written.positions_m, complete.poses.positions_m, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ("scale = 0", "greater than 0|above 0|positive"),
+        ("scale = -0.5", "greater than 0|above 0|positive"),
+        ('scale = 0.5, length_m = "body"', "expected one of them"),
+    ],
+)
+def test_a_scale_is_positive_and_not_of_strains(tmp_path, stated, message):
+    text = SHARED.replace("sign = -1 }", f"sign = -1, {stated} }}", 1)
+    with pytest.raises(InputError, match=message):
+        Problem.read(block_problem(tmp_path, text))
 
 
 @pytest.mark.long
@@ -599,8 +633,14 @@ def test_a_simulated_bench_is_solved_by_its_own_problem(tmp_path, kind):
             "Time (s),Displacement (mm),F (N)",
             "Time (s),displacement_m,F (N)",
         ),
+        (
+            "sign = -1, scale = 0.5",
+            "sign = -1, symmetry = 4",
+            "Time (s),Displacement (mm),Force (N)",
+            "t_s,displacement_m,force_n",
+        ),
     ],
-    ids=["signs", "names", "strain and stress", "a name for one"],
+    ids=["signs", "names", "strain and stress", "a name for one", "half"],
 )
 def test_a_simulated_table_reads_back_as_what_was_simulated(
     tmp_path, displacement, wrench, measured, simulated

@@ -33,6 +33,8 @@ from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.numerical_damping import numerical_mode
 from collocation_sysid.model.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem
+from collocation_sysid.recording.obstacle import Obstacle
+from collocation_sysid.recording.obstacle_solids import Sphere
 from collocation_sysid.result.check_sections import (
     full_check_tables,
     quick_check_tables,
@@ -44,9 +46,12 @@ from collocation_sysid.runs.check.body_check import (
     worst_elements,
 )
 from collocation_sysid.runs.check.cost import (
+    FRICTION_FACTOR,
+    STATIC_FACTOR,
     MethodCost,
     cost_concerns,
     cost_notes,
+    search_factor,
 )
 from collocation_sysid.runs.check.derivatives import shortened_problem
 from collocation_sysid.runs.check.modes_check import (
@@ -411,6 +416,26 @@ def test_every_method_has_a_cost_and_the_chosen_one_counts(tiny: Path):
     )
     assert findings.method == "interior-point"
     assert findings.memory_mb == by_name["interior-point"].memory_mb
+
+
+def test_the_time_of_a_search_counts_equilibria_and_estimated_friction():
+    ball = Obstacle(shape=Sphere(radius_m=0.01), friction="ball_friction")
+    pressed = block("xyz")
+    touched = pressed.with_obstacles([ball])
+    alone = search_factor(pressed, {"young_pa"})
+    assert search_factor(hung_cube(), {"young_pa"}) == 1.0
+    assert alone == STATIC_FACTOR > 1.5
+    assert search_factor(touched, {"young_pa"}) == alone
+    assert search_factor(
+        touched, {"young_pa", "ball_friction"}
+    ) == pytest.approx(FRICTION_FACTOR * alone)
+
+
+def test_times_are_called_estimates_for_the_number_of_samples(tiny: Path):
+    outcome = run_command("check", tiny / "problem.toml")
+    (line,) = [e for e in outcome.out.splitlines() if "rough estimates" in e]
+    count = checked(tiny).timesteps
+    assert f"for {count:,} time steps or equilibria" in line
 
 
 def test_a_method_that_does_not_fit_into_memory_is_warned_of(monkeypatch):

@@ -29,9 +29,9 @@ YOUNG_PA = 8e3
 COMPLIANCE_M_N, DEVIATION_M_N = 5e-5, 5e-6
 
 
-def bench(z_m: np.ndarray, symmetry: int = 1) -> Experiment:
+def bench(z_m: np.ndarray, symmetry: int = 1, scale: float = 1.0) -> Experiment:
     """The block with its force measured under the upper platen, which is at heights `z_m`; it is one
-    part of `symmetry` equal ones of the specimen.
+    part of `symmetry` equal ones of the specimen, with this share of the displacement.
     """
     pressed = block("xyz", z_m=z_m)
     lower, upper, *sides = pressed.grasps
@@ -45,11 +45,15 @@ def bench(z_m: np.ndarray, symmetry: int = 1) -> Experiment:
     return replace(
         pressed,
         markers=None,
-        grasps=(lower, replace(upper, wrench=sensor), *sides),
+        grasps=(
+            lower,
+            replace(upper, wrench=sensor, displacement_scale=scale),
+            *sides,
+        ),
     )
 
 
-def measured(symmetry: int) -> Experiment:
+def measured(symmetry: int, scale: float) -> Experiment:
     """The same in a machine that gives way under the load of the specimen, with the displacement
     behind its frame.
     """
@@ -59,14 +63,16 @@ def measured(symmetry: int) -> Experiment:
             bench(z_m), {"young_pa": YOUNG_PA, **STATED}
         ).wrenches
         z_m = PRESSED_M - COMPLIANCE_M_N * wrench_n[:, 2]
-    return with_wrenches(bench(np.array(PRESSED_M), symmetry), [wrench_n])
+    return with_wrenches(
+        bench(np.array(PRESSED_M), symmetry, scale), [wrench_n]
+    )
 
 
-def solved(compliance: object, symmetry: int = 1):
+def solved(compliance: object, symmetry: int = 1, scale: float = 1.0):
     known = dict.fromkeys(Assumptions().deviations, "none")
     stated = Assumptions(**(known | {"machine_compliance_m_n": compliance}))
     problem = Problem(
-        [measured(symmetry)],
+        [measured(symmetry, scale)],
         {"young_pa": Unknown(5e3), **STATED},
         uncertainty=UncertaintyOptions(assumptions=stated),
     )
@@ -103,6 +109,15 @@ def test_the_machine_yields_to_the_load_of_the_whole_specimen():
         "deviation": DEVIATION_M_N / 4,
     }
     estimate = solved(stated, symmetry=4).estimates["young_pa"]
+    assert estimate.value == pytest.approx(YOUNG_PA, rel=5e-3)
+
+
+def test_half_of_the_height_takes_half_of_the_lag_of_the_machine():
+    stated = {
+        "mean": COMPLIANCE_M_N * 2,
+        "deviation": DEVIATION_M_N * 2,
+    }
+    estimate = solved(stated, scale=0.5).estimates["young_pa"]
     assert estimate.value == pytest.approx(YOUNG_PA, rel=5e-3)
 
 

@@ -29,6 +29,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...errors import InputError, SimulationError
+from ...fem.laws.constants import symbol_of, unit_of
 from ...methods.solution import Solution, pooled_wrench_rms
 from ...problem import Problem, RolloutOptions
 from ...recording.experiment import Experiment
@@ -39,6 +40,7 @@ from ...runs.solving import solve
 from ...statistics.budget.consider_analysis import changes_of_assumptions
 from ...statistics.budget.uncertainty_budget import VarianceSources, budget
 from ...statistics.linearised import (
+    AT_BOUND,
     LinearisedFit,
     ResidualBlock,
     factorise_information,
@@ -87,7 +89,8 @@ def model_rows(
         "free" (number of parameters), "unit" of the errors, "rms" of the fit to all, "held_out_rms"
         over all predictions, "predictions" (RMS) and "blocks" (sums of squares) by held-out
         recording, "failures" (messages by recording), "evidence" (fields of `Evidence`),
-        "parameters" and "budget" by name, "total_s", "independent", "delta_aic" (AIC less the
+        "parameters" and "budget" by name, "at_bound" (the bound, "lower" or "upper", by the name of
+        each parameter that ended at it), "total_s", "independent", "delta_aic" (AIC less the
         smallest), "log_ratio" and "log_ratio_error" (logarithm of the prediction error relative to
         the best), "chosen" (true for at most one row). Values are None if they are not known;
         mappings are empty.
@@ -146,6 +149,7 @@ def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
         },
         "evidence": evidence,
         "parameters": complete_fit.get("parameters") or {},
+        "at_bound": complete_fit.get("at_bound") or {},
         "budget": complete_fit.get("budget") or {},
         "total_s": sum(each.get("time_s") or 0.0 for each in fits.values()),
     }
@@ -315,6 +319,33 @@ def advice(rows: Sequence[Row]) -> str:
     chosen = next((row for row in rows if row["chosen"]), None)
     if chosen is None:
         return "No model could be fitted."
+    return " ".join([_reasons(rows, chosen), *bound_sentences(rows)])
+
+
+def bound_sentences(rows: Sequence[Row]) -> list[str]:
+    """Return a sentence for each converged model with constants at bounds, with the remedy.
+
+    The values are those of the fit to all recordings. A constant at a lower bound contributes next
+    to nothing, so that the model is one with fewer terms, or with another sign of the constant.
+    """
+    sentences = []
+    for row in rows:
+        if not row["converged"] or not row["at_bound"]:
+            continue
+        values = " and ".join(
+            f"{symbol_of(name)} = {row['parameters'][name]:.4g} {unit_of(name)}".rstrip()
+            + f" (its {bound} bound)"
+            for name, bound in row["at_bound"].items()
+        )
+        sentences.append(
+            f"{row['model']} ended with {values}: the bound determines the value, not the data; use "
+            "a law without this term, or widen the bound if it is not physical."
+        )
+    return sentences
+
+
+def _reasons(rows: Sequence[Row], chosen: Row) -> str:
+    """Return in words which model to use, why, and how certain that is; see `advice`."""
     others = [row for row in rows if row is not chosen and row["converged"]]
     use = f"Use {chosen['model']}"
     if not others:
@@ -641,8 +672,9 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     Returns
     -------
     dict
-        "status", "converged", "rms" by unit (None where nothing is measured), "parameters", "free"
-        (names) and "time_s". If the fit converged also "evidence" and "budget" if all are fitted,
+        "status", "converged", "rms" by unit (None where nothing is measured), "parameters",
+        "at_bound" ("lower" or "upper" by the name of each parameter that ended at this bound),
+        "free" (names) and "time_s". If the fit converged also "evidence" and "budget" if all are fitted,
         else "prediction", which is None with a "failure" if the simulation failed. A fit that
         cannot be linearised counts as not converged.
 
@@ -666,6 +698,7 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
             STRESS_UNIT: _pooled_stress_rms_pa(solution),
         },
         "parameters": parameter_values(solution.collocation, solution.q),
+        "at_bound": _names_at_bounds(solution),
         "free": [item.name for item in problem.parameters.free],
         "time_s": solution.timing.total,
     }
@@ -697,6 +730,25 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
             complete_experiment, rollout, start_s=start_s
         )
     }
+
+
+def _names_at_bounds(solution: Solution) -> dict[str, str]:
+    """Return "lower" or "upper" by the name of each free parameter that ended at this bound, as the
+    intervals define it: within `AT_BOUND` of the bound in the coordinates of the solver.
+    """
+    parameters = solution.collocation.parameters
+    at_bound: dict[str, str] = {}
+    for item, coordinate, lower, upper in zip(
+        parameters.free,
+        np.asarray(solution.q, dtype=float),
+        *parameters.bounds_q,
+        strict=True,
+    ):
+        if coordinate - lower < AT_BOUND:
+            at_bound[item.name] = "lower"
+        elif upper - coordinate < AT_BOUND:
+            at_bound[item.name] = "upper"
+    return at_bound
 
 
 def _budget_record(

@@ -575,9 +575,7 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
     moduli: dict[str, Cell] = {}
     names = dict.fromkeys(name for row in rows for name in row["parameters"])
     for name in names:
-        moduli[symbol_with_unit(name)] = _number_cell(
-            name, 1, form=".4g", among="parameters"
-        )
+        moduli[symbol_with_unit(name)] = _bounded_cell(name)
     model = {
         "": lambda row: "→" if row["chosen"] else "",
         "model": _text_cell("model"),
@@ -713,6 +711,20 @@ def _number_cell(
     return lambda row: shown.format(
         row[among].get(name) if among else row[name]
     )
+
+
+def _bounded_cell(name: str) -> Cell:
+    """Return the cell of a parameter of a row of `model_rows`: its value, followed by "at lower
+    bound" or "at upper bound" if it ended there; "–" if the model has no such parameter.
+    """
+    number = _number_cell(name, 1, form=".4g", among="parameters")
+
+    def cell(row: Row) -> str:
+        """Return the text of the cell in a row."""
+        bound = row["at_bound"].get(name)
+        return f"{number(row)} (at {bound} bound)" if bound else number(row)
+
+    return cell
 
 
 def _error_cells(rows: Sequence[Row]) -> dict[str, Cell]:

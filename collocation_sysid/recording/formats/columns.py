@@ -7,8 +7,9 @@ further columns.
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -178,6 +179,7 @@ def read_columns(
     blank_allowed: bool = False,
     requires_times: bool = True,
     requires_all: bool = False,
+    column_advice: Callable[[TextTable], str] | None = None,
 ) -> QuantityTable:
     """Read those of some quantities that a table has, in any order, in SI units.
 
@@ -195,6 +197,9 @@ def read_columns(
         Whether times are required; otherwise rows are numbered in seconds if there are no times.
     requires_all : bool
         Whether each of `quantities` is required; otherwise one is enough.
+    column_advice : callable, optional
+        Returns for the table the remedy that a message names if several columns fit one quantity;
+        by default the statements that choose one of them, see `column_statement`.
 
     Raises
     ------
@@ -205,7 +210,12 @@ def read_columns(
     grid = read_table(decode(read_bytes(path)))
     if "t_s" in grid.columns and not column_names:
         _require_known_columns(grid, quantities, all_of=requires_all)
-    places = _find_columns(grid, quantities, mapped=column_names or {})
+    places = _find_columns(
+        grid,
+        quantities,
+        mapped=column_names or {},
+        column_advice=column_advice,
+    )
     t = places.pop(TIME.key, None)
     if len(places) < (len(quantities) if requires_all else 1) or (
         requires_times and t is None
@@ -233,7 +243,10 @@ def read_columns(
 
 
 def _find_columns(
-    grid: TextTable, quantities: Sequence[Quantity], mapped: Mapping[str, str]
+    grid: TextTable,
+    quantities: Sequence[Quantity],
+    mapped: Mapping[str, str],
+    column_advice: Callable[[TextTable], str] | None = None,
 ) -> dict[str, tuple[int, float]]:
     """Return index of the column and factor to SI of each quantity that the table has, by the
     quantity's key; quantities without a column are omitted.
@@ -246,6 +259,8 @@ def _find_columns(
     mapped : mapping of str to str
         Names of columns by key, as stated by the user. If it contains more than the time, only the
         time is recognised by its name; other quantities are those stated.
+    column_advice : callable, optional
+        See `read_columns`.
 
     Raises
     ------
@@ -269,7 +284,8 @@ def _find_columns(
         quantity.key: column
         for quantity in (TIME, *sought)
         if quantity.key not in chosen
-        and (column := find_column(grid, quantity)) is not None
+        and (column := find_column(grid, quantity, advice=column_advice))
+        is not None
     }
     return chosen | recognised
 
@@ -311,15 +327,54 @@ def _column_named_by_user(
 
 
 def find_column(
-    grid: TextTable, quantity: Quantity
+    grid: TextTable,
+    quantity: Quantity,
+    advice: Callable[[TextTable], str] | None = None,
 ) -> tuple[int, float] | None:
     """Return index and factor to SI of the column whose name and unit fit a quantity; None if no
     name fits. Of several columns with a fitting name, those with another unit are ignored.
+
+    Parameters
+    ----------
+    grid : TextTable
+    quantity : Quantity
+    advice : callable, optional
+        See `column_advice` of `read_columns`.
 
     Raises
     ------
     InputError
         If several columns fit, or names fit but no unit does.
+    """
+    units = _fitting_names(grid, quantity)
+    fitting = _fitting_columns(grid, quantity)
+    if len(fitting) > 1:
+        names = [grid.columns[k] for k, _ in fitting]
+        if len(set(names)) < len(names):
+            remedy = "different names"
+        elif advice is not None:
+            remedy = advice(grid)
+        else:
+            remedy = " or ".join(
+                column_statement({quantity.key: name}) for name in names
+            )
+        raise grid.error_at(
+            f"the columns {', '.join(names)} could all be {quantity.key}; expected one of them, "
+            f"or {remedy}"
+        )
+    if units and not fitting:
+        first = next(iter(units))
+        raise _unit_error(
+            grid, grid.columns[first], unit=units[first], quantity=quantity
+        )
+    return fitting[0] if fitting else None
+
+
+def _fitting_names(
+    grid: TextTable, quantity: Quantity
+) -> Mapping[int, str | None]:
+    """Return the unit by index of each column whose name fits a quantity, whatever its unit; None
+    for a column without a unit, 1 if the quantity is `unitless`.
     """
     units = {
         k: name_and_unit(column)[1]
@@ -328,26 +383,33 @@ def find_column(
     }
     if quantity.unitless:
         units = {k: unit or quantity.unit for k, unit in units.items()}
+    return units
+
+
+def _fitting_columns(
+    grid: TextTable, quantity: Quantity
+) -> list[tuple[int, float]]:
+    """Return index and factor to SI of each column whose name and unit fit a quantity."""
     factors = {
         k: si_factor(unit, quantity.dimension)
-        for k, unit in units.items()
+        for k, unit in _fitting_names(grid, quantity).items()
         if unit
     }
-    fitting = [
-        (k, factor) for k, factor in factors.items() if factor is not None
+    return [(k, factor) for k, factor in factors.items() if factor is not None]
+
+
+def fitting_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
+    """Return the names of all columns whose name and unit fit a quantity, in their order."""
+    return [grid.columns[k] for k, _ in _fitting_columns(grid, quantity)]
+
+
+def column_statement(names: Mapping[str, str]) -> str:
+    """Return the key `columns` of a problem file in TOML that names a column for each quantity."""
+    entries = [
+        f"{key} = {json.dumps(name, ensure_ascii=False)}"
+        for key, name in names.items()
     ]
-    if len(fitting) > 1:
-        raise grid.error_at(
-            f"the columns {', '.join(grid.columns[k] for k, _ in fitting)} could all be "
-            f'{quantity.key}; expected one of them, or columns = {{ {quantity.key} = "…" }} to '
-            "say which"
-        )
-    if units and not fitting:
-        first = next(iter(units))
-        raise _unit_error(
-            grid, grid.columns[first], unit=units[first], quantity=quantity
-        )
-    return fitting[0] if fitting else None
+    return f"columns = {{ {', '.join(entries)} }}"
 
 
 def _name_fits(column: str, quantity: Quantity) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +22,7 @@ from ...program.lifted.lifted_collocation import (
 )
 from ...program.linear_algebra.factorisation import Choice
 from ...program.sweep import Sweep
+from ...recording.experiment import Experiment
 from ...recording.measurement_selection import shortened_experiment
 from ...statistics.concerns import Concern
 from .derivatives import first_sample_count, shortened_problem
@@ -133,6 +134,13 @@ def _count_nonzeros(problem: Problem) -> NDArray[np.int64]:
 TIMED_ROWS = 12
 # Sweeps that the reduced space mostly takes.
 TYPICAL_SWEEPS = 10
+# Time of a search in equilibria over that of `TYPICAL_SWEEPS` sweeps, whose equilibria start from
+# solved ones: 1.9 and 2.5 with a prescribed platen, 1.6 and 2.0 with an obstacle as platen, 0.9 and
+# 2.6 with friction, for quarter cylinders of 11 and 21 samples.
+STATIC_FACTOR = 2.2
+# The same ratio if a coefficient of friction is estimated, over that without: 1.3 and 3.5 for the
+# same cylinders, because the search needs more iterations and restarts.
+FRICTION_FACTOR = 3.0
 # Iterations that interior point mostly takes.
 TYPICAL_ITERATIONS = 10
 # Time of an iteration [s] per nonzero and per TIMESTEP_POWER of the unknowns of a step: IPOPT with
@@ -289,7 +297,7 @@ def _estimated_sweeps_s(
     factorisation: Choice,
 ) -> float | None:
     """Return the estimated time of all sweeps of a solve [s], from one timed sweep over the first
-    rows of each experiment; None if the equations cannot be solved.
+    rows of each experiment and its `search_factor`; None if the equations cannot be solved.
 
     Parameters
     ----------
@@ -303,6 +311,7 @@ def _estimated_sweeps_s(
         Option of reduced space.
     """
     total = 0.0
+    free_names = {item.name for item in collocation.parameters.free}
     for segment, part in zip(
         collocation.transcriptions, short.iterates(z), strict=True
     ):
@@ -314,5 +323,22 @@ def _estimated_sweeps_s(
             solver.forward(part.x[:rows], setting)
         except SimulationError:
             return None
-        total += segment.grid_times / rows * (time.perf_counter() - began)
+        sweep_s = segment.grid_times / rows * (time.perf_counter() - began)
+        total += search_factor(segment.experiment, free_names) * sweep_s
     return TYPICAL_SWEEPS * total
+
+
+def search_factor(experiment: Experiment, free_names: Set[str]) -> float:
+    """Return the time of the search in an experiment over that of `TYPICAL_SWEEPS` sweeps, as
+    measured for experiments of its kind.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    free_names : set of str
+        Names of the estimated parameters, which may be coefficients of friction.
+    """
+    factor = STATIC_FACTOR if experiment.is_static else 1.0
+    if any(each.friction in free_names for each in experiment.obstacles):
+        factor *= FRICTION_FACTOR
+    return factor

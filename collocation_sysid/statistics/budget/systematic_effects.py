@@ -640,7 +640,8 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
     behind its frame.
 
     Each grasp that is moved along an axis lags behind by the force of the specimen along it, which
-    is `Experiment.symmetry` times that of the modelled part. Specimens are treated by
+    is `Experiment.symmetry` times that of the modelled part; the part takes the share
+    `Grasp.displacement_scale` of it. Specimens are treated by
     `_machine_of_specimen`.
     """
     experiment = at.iterate.segment.experiment
@@ -657,9 +658,8 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
                 & (prescribed.dofs % 3 == axis)
             )
             if driven[here].any():
-                displacement_m[:, here] = -at.grasp_force_n[:, here].sum(
-                    axis=1, keepdims=True
-                )
+                force_n = at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
+                displacement_m[:, here] = -grasp.displacement_scale * force_n
     return Effect(displacement_m=experiment.symmetry * displacement_m)
 
 

@@ -1,0 +1,147 @@
+"""Loading and unloading branches of material tests."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+from kit.problem_files import run_command
+
+import collocation_sysid as cs
+from collocation_sysid.recording.specimen_hysteresis import (
+    loading_rows,
+    unloading_difference,
+)
+from collocation_sysid.statistics.assessment import probe_concerns
+from collocation_sysid.statistics.probes.relaxed_assumptions import (
+    EstimateChange,
+    Probe,
+)
+
+LOADING = np.linspace(0.0, 0.8, 21)
+CYCLE = np.concatenate([LOADING, LOADING[-2:0:-1]])
+STRAIN = np.concatenate([np.tile(CYCLE, 3), [0.0]])
+SIGMA_PA = 1000.0
+PROBLEM = f"""[object]
+material = "neo-hookean"
+[parameters]
+mu_pa = {{}}
+kappa_pa = 1e9
+[[experiment]]
+name = "pull"
+kind = "specimen"
+test = "uniaxial"
+file = "pull.csv"
+sigma_pa = {SIGMA_PA}
+"""
+
+
+def stresses_pa(softening=0.0):
+    """Stresses of a rubber that is softer by a share wherever it unloads."""
+    rng = np.random.default_rng(1)
+    stretch = 1 + STRAIN
+    stress_pa = 1e5 * (stretch - stretch**-2)
+    is_unloading = np.append(np.diff(STRAIN) < 0, True)
+    is_unloading[1:] = np.diff(STRAIN) < 0
+    noise_pa = SIGMA_PA * rng.normal(size=len(STRAIN))
+    return stress_pa * np.where(is_unloading, 1 - softening, 1) + noise_pa
+
+
+def written(folder, softening=0.0, keys="", strain=STRAIN):
+    rows = [
+        f"{a},{b}" for a, b in zip(strain, stresses_pa(softening), strict=True)
+    ]
+    (folder / "pull.csv").write_text(
+        "\n".join(["strain (-),stress (Pa)", *rows]) + "\n"
+    )
+    (folder / "problem.toml").write_text(PROBLEM + keys)
+    return folder / "problem.toml"
+
+
+def only_experiment(*arguments, **keys):
+    (experiment,) = cs.Problem.read(written(*arguments, **keys)).experiments
+    return experiment
+
+
+@pytest.mark.parametrize("keys", ["", "skip_cycles = 2\n"])
+def test_the_loading_branch_is_that_of_the_last_cycle(tmp_path, keys):
+    complete = only_experiment(tmp_path, keys=keys)
+    assert len(complete.t_s) == (41 if keys else len(STRAIN))
+    loading = only_experiment(tmp_path, keys=keys + 'branch = "loading"\n')
+    measured_pa = loading.readings[0].measured_values[:, 0]
+    assert len(measured_pa) == len(LOADING)
+    np.testing.assert_allclose(measured_pa, stresses_pa()[80:101])
+
+
+def test_compression_is_loaded_towards_negative_strains():
+    assert loading_rows(-0.5 * STRAIN) == slice(80, 101)
+
+
+def test_an_unknown_branch_is_refused(tmp_path):
+    file = written(tmp_path, keys='branch = "unloading"\n')
+    with pytest.raises(cs.InputError, match=r"branch.*loading"):
+        cs.Problem.read(file)
+
+
+def test_the_difference_of_the_branches_is_measured(tmp_path):
+    experiment = only_experiment(tmp_path, softening=0.12)
+    assert unloading_difference(experiment) == pytest.approx(-0.12, abs=0.02)
+
+
+def test_branches_that_agree_or_a_single_one_have_no_difference(tmp_path):
+    assert unloading_difference(only_experiment(tmp_path)) is None
+    loading = only_experiment(
+        tmp_path, softening=0.12, keys='branch = "loading"\n'
+    )
+    assert unloading_difference(loading) is None
+
+
+def drift():
+    """Significant and relevant probe of a drift."""
+    moves = {"mu_pa": EstimateChange(9e4, 4e2, 1e4, 2.0, 0.5)}
+    return Probe(
+        "assumption",
+        "stiffness_drift",
+        20.0,
+        moves,
+        -0.12,
+        0.01,
+        ("stiffness_drift",),
+        True,
+        2.0,
+    )
+
+
+def test_a_drift_is_explained_by_hysteresis_where_the_branches_differ(tmp_path):
+    softer = only_experiment(tmp_path, softening=0.12)
+    (concern,) = probe_concerns([drift()], {"mu_pa": 1.0}, [softer])
+    assert "hysteresis resembles such a drift" in concern.message
+    assert re.search(r"by -1[123](\.\d)? % in 'pull'", concern.message)
+    assert 'branch = "loading"' in concern.message
+    elastic = only_experiment(tmp_path)
+    (concern,) = probe_concerns([drift()], {"mu_pa": 1.0}, [elastic])
+    assert "hysteresis" not in concern.message
+
+
+def test_a_solve_of_both_branches_names_hysteresis_and_of_one_does_not(
+    tmp_path,
+):
+    file = written(tmp_path, softening=0.12, keys="skip_cycles = 2\n")
+    head, table = file.read_text().split("[[experiment]]\n")
+    tables = [
+        "[[experiment]]\n" + table.replace('"pull"', f'"pull {k}"')
+        for k in range(3)
+    ]
+    file.write_text(head + "".join(tables))
+    outcome = run_command("solve", file, "--out", tmp_path / "both")
+    assert "hysteresis resembles such a drift" in outcome.out
+    keys = 'skip_cycles = 2\nbranch = "loading"\n'
+    file.write_text(file.read_text().replace("skip_cycles = 2\n", keys))
+    outcome = run_command("solve", file, "--out", tmp_path / "one")
+    assert "hysteresis" not in outcome.out
+    result = json.loads((tmp_path / "one" / "result.json").read_text())
+    assert result["parameters"]["mu_pa"]["value"] == pytest.approx(
+        1e5, rel=0.02
+    )

@@ -1,0 +1,58 @@
+"""Output of the solve of a material test: each statement on a parameter once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from kit.problem_files import run_command
+
+PROBLEM = """[object]
+material = "ogden-2"
+[parameters]
+mu_1_pa = {}
+alpha_1 = {}
+mu_2_pa = { guess = 1e3, typical = 1e3 }
+alpha_2 = { guess = 5.0 }
+kappa_pa = 1e9
+[[experiment]]
+name = "pull"
+kind = "specimen"
+test = "uniaxial"
+file = "pull.csv"
+sigma_pa = 700.0
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Problem of a curve that does not determine one of four constants."""
+    rng = np.random.default_rng(5)
+    stretch = np.linspace(1.05, 3.5, 40)
+    stress_pa = sum(
+        2 * mu / alpha * (stretch ** (alpha - 1) - stretch ** (-alpha / 2 - 1))
+        for mu, alpha in ((1.5e5, 1.6), (3e3, 4.6))
+    ) + 700.0 * rng.normal(size=len(stretch))
+    rows = [f"{a},{b}" for a, b in zip(stretch, stress_pa, strict=True)]
+    (tmp_path / "pull.csv").write_text(
+        "\n".join(["stretch,stress (Pa)", *rows]) + "\n"
+    )
+    (tmp_path / "problem.toml").write_text(PROBLEM)
+    return tmp_path
+
+
+def test_an_undetermined_parameter_is_stated_once(folder):
+    outcome = run_command(
+        "solve", folder / "problem.toml", "--out", folder / "run"
+    )
+    lines = outcome.out.splitlines()
+    of_verdict = [line for line in lines if "do not determine" in line]
+    assert len(of_verdict) == 1
+    assert "mu_2_pa" in of_verdict[0]
+    assert sum("not identifiable from" in line for line in lines) == 1
+    (table_row,) = [line for line in lines if line.startswith("μ₂ Pa")]
+    assert "not identifiable" in table_row
+    text = "\n".join(lines)
+    assert "mu_2_pa is not determined" not in text
+    assert "not determined, because" not in text
+    assert "note: mu_2_pa and alpha_2 are confounded" not in text
+    assert "of mu_2_pa and alpha_2 only the combination" in text
