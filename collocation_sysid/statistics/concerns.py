@@ -384,7 +384,9 @@ TOPICS: Mapping[str, Topic] = {
         "The mesh",
         "mesh",
         remedy='Refine it, and use element = "tet10", or "tet10-p0" for ν ≥ 0.45. The command '
-        "refine RUN measures the remaining error.",
+        "refine RUN measures the remaining error. Recordings that were simulated with the same "
+        'elements have no such error: declare them by assumptions = "none" in [uncertainty], or '
+        'damping_law = "none" in [uncertainty.assumptions].',
         messages={
             "refined": "step and mesh dominate the uncertainty of {name}: it was corrected by "
             "{percent:+.2g} %, {errors:.2g} standard uncertainties",
