@@ -115,6 +115,10 @@ TOPICS: Mapping[str, Topic] = {
             "poses-constant": "the markers move by {by_mm:.3g} mm, but the poses are constant and "
             "nothing else drives the body, which starts at rest: check the file and the columns of "
             "grasp.poses, and whether they are those of this recording",
+            "not-at-rest": "the markers move by {by_mm:.2g} mm (RMS) within the first "
+            "{within_ms:.3g} ms, in which the grasp moves by {grasp_mm:.2g} mm: the body was not at "
+            'rest at the beginning, as start = "equilibrium" assumes, or the markers\' clock is late; '
+            "begin window_s, or the recording, when the body is at rest",
             "unlike": "the tracks do not move like a grasped body: for every stiffness they are "
             "{by_mm:.3g} mm (RMS) away from markers that move with the grasp, on a body of "
             "{size_mm:.3g} mm, and no single common mistake explains this; check frames, "
