@@ -250,8 +250,9 @@ TOPICS: Mapping[str, Topic] = {
         "budget",
         remedy="Find out whether the assumption is wrong, for instance by repeating the first "
         "recording at the end, or whether the model lacks an effect with similar "
-        "consequences, as a missing memory resembles a drift. The command solve --probe "
-        "computes the effect beyond first order and relaxes the other assumptions.",
+        "consequences, as a missing memory resembles a drift, and a wrong damping law a clock "
+        "rate. The commands compare-models --damping and --materials test other laws. The command "
+        "solve --probe (probe=True in Python) computes the effect beyond first order and relaxes the other assumptions.",
         messages={
             "contradicted": "the data contradict the assumption that {assumption}: with {name} = "
             "{size} ± {size_error} χ² decreases by {chi_squared:.3g}, and the estimates become "
