@@ -252,7 +252,8 @@ TOPICS: Mapping[str, Topic] = {
         "recording at the end, or whether the model lacks an effect with similar "
         "consequences, as a missing memory resembles a drift, and a wrong damping law a clock "
         "rate. The commands compare-models --damping and --materials test other laws. The command "
-        "solve --probe (probe=True in Python) computes the effect beyond first order and relaxes the other assumptions.",
+        "solve --probe (probe=True in Python) computes the effect beyond first order and relaxes "
+        "the other assumptions.",
         messages={
             "contradicted": "the data contradict the assumption that {assumption}: with {name} = "
             "{size} ± {size_error} χ² decreases by {chi_squared:.3g}, and the estimates become "

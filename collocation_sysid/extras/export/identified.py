@@ -21,7 +21,6 @@ from ...fem.body import Body
 from ...fem.laws.moduli import engineering_constants
 from ...fem.laws.ogden import is_power_law, term_numbers
 from ...problem import Problem
-from ...program.transcription import Transcription
 from ...recording import Experiment, Markers, Obstacle
 from ...recording.measurement_selection import NO_SENSORS
 from ...recording.obstacle_solids import solid_key
@@ -279,10 +278,9 @@ class IdentifiedBody:
             if replay.undeformed_m.shape != nodes_m.shape:
                 raise ValueError("the mesh is not that of the problem file")
         with located(folder):
-            return cls._from_segment(
+            return cls._from_experiment(
                 result,
-                segment,
-                phi=phi,
+                segment.corrected_experiment(phi),
                 values=values,
                 simulated_m=replay.rolled_out_positions_m,
                 title=problem.title,
@@ -315,10 +313,9 @@ class IdentifiedBody:
             raise InputError(_not_fitted(experiment, list(parts)))
         part = parts[experiment] if experiment else next(iter(parts.values()))
         rollout = run.rollouts[part.segment.experiment.name]
-        return cls._from_segment(
+        return cls._from_experiment(
             build_result(run),
-            part.segment,
-            phi=part.phi,
+            part.segment.corrected_experiment(part.phi),
             values=run.parameters,
             simulated_m=rollout.trajectory.positions_m
             if isinstance(rollout, ForwardSimulation)
@@ -327,12 +324,11 @@ class IdentifiedBody:
         )
 
     @classmethod
-    def _from_segment(
+    def _from_experiment(
         cls,
         result: Result,
-        segment: Transcription,
+        corrected: Experiment,
         *,
-        phi: Array,
         values: Mapping[str, float],
         simulated_m: Array | None,
         title: str,
@@ -343,10 +339,8 @@ class IdentifiedBody:
         ----------
         result : Result
             Content of ``result.json``.
-        segment : Transcription
-            The fitted experiment to export.
-        phi : array
-            Estimated nuisance parameters of the experiment.
+        corrected : Experiment
+            The fitted experiment to export, with its estimated nuisance parameters.
         values : mapping of name to float
             Estimated and fixed parameters.
         simulated_m : (T, n, 3) array or None
@@ -359,8 +353,7 @@ class IdentifiedBody:
         InputError
             If the body cannot be separated from its obstacles, see `without_obstacles`.
         """
-        corrected = segment.corrected_experiment(phi)
-        body = segment.body
+        body = corrected.body
         obstacles = tuple(
             replace(o, friction=values[o.friction])
             if isinstance(o.friction, str)
