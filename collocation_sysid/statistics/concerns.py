@@ -117,8 +117,8 @@ TOPICS: Mapping[str, Topic] = {
             "grasp.poses, and whether they are those of this recording",
             "not-at-rest": "the markers move by {by_mm:.2g} mm (RMS) within the first "
             "{within_ms:.3g} ms, in which the grasp moves by {grasp_mm:.2g} mm: the body was not at "
-            'rest at the beginning, as start = "equilibrium" assumes, or the markers\' clock is late; '
-            "begin window_s, or the recording, when the body is at rest",
+            'rest at the beginning, as start = "equilibrium" assumes, or the clocks of markers and '
+            "poses differ; begin window_s, or the recording, when the body is at rest",
             "unlike": "the tracks do not move like a grasped body: for every stiffness they are "
             "{by_mm:.3g} mm (RMS) away from markers that move with the grasp, on a body of "
             "{size_mm:.3g} mm, and no single common mistake explains this; check frames, "
