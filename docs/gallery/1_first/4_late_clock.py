@@ -56,9 +56,7 @@ parameters = {
     "gamma_r_s": cs.Unknown(),
     "gamma_m_1_s": cs.Unknown(),
 }
-simulated = cs.UncertaintyOptions(
-    assumptions=cs.Assumptions(damping_law="none")
-)
+simulated = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())
 runs = {}
 for label, prior_s in (("one clock", None), ("a clock of their own", 0.05)):
     told = replace(
