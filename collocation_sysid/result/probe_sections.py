@@ -28,8 +28,8 @@ EXPLICABLE_CONCERNS = (
 # Topics of a verdict that come first.
 FIRST_TO_CORRECT = ("description", "solve")
 DEEPER_CHECK_ADVICE = (
-    "For a deeper check, run `solve --probe`: it refits subsets of the data and relaxes each "
-    "assumption."
+    "For a deeper check, run `solve --probe` (in Python `cs.run(problem, probe=True)`): it refits "
+    "subsets of the data and relaxes each assumption."
 )
 
 
@@ -89,13 +89,17 @@ def probe_lines(result: Result) -> list[str | Table]:
     ]
 
 
-def _size_and_gain(probe: Probe) -> str:
-    """Return the size of a relaxed assumption with its standard error, and the reduction of χ² by
-    it, in words; a size or error that is None counts as zero.
+def _size_and_ratio(probe: Probe) -> str:
+    """Return the size of a relaxed assumption with its standard error, and their ratio, which
+    decides on the significance; a size or error that is None counts as zero.
+
+    The standard error is that of the residuals, and χ² that of the stated σ: residuals larger than
+    σ allow a large decrease of χ² that is not significant.
     """
-    size = short(probe.size or 0.0)
-    error = short(probe.size_error or 0.0)
-    return f"{source_label(probe.name)} ({size} ± {error}, −Δχ² {probe.chi_squared:.1f})"
+    size = probe.size or 0.0
+    error = probe.size_error or 0.0
+    ratio = f", {abs(size) / error:.1f} standard errors" if error else ""
+    return f"{source_label(probe.name)} ({short(size)} ± {short(error)}{ratio})"
 
 
 def is_routine(result: Result) -> bool:
@@ -203,7 +207,7 @@ def _conclusions(result: Result) -> Iterator[str]:
         ]:
             yield f"alternative explanations with similar effects: {listed(others)}"
     elif not significant:
-        tested = " or ".join(_size_and_gain(p) for p in result.probes)
+        tested = " or ".join(_size_and_ratio(p) for p in result.probes)
         nothing = "no subset of the data and no relaxed assumption changes the fit significantly"
         yield f"no significant {tested}" if is_routine(result) else nothing
     if not is_routine(result):

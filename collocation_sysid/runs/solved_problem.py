@@ -43,6 +43,7 @@ from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
 from ..statistics.uncertainty import MarkerPlace, Uncertainty, marker_places
 from .check.modes_check import ModesCheck
 from .forward_simulation import ForwardSimulation
+from .mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
 from .result_content import Elapsed, ReportedEstimate
 from .verdict import (
     combined_concerns,
@@ -293,8 +294,17 @@ class SolvedProblem:
                 ],
             )
             causes = cause_concerns(self.causes)
+            meshes = mesh_resolution_concerns(self.problem, self.refinement)
             return Assessment.from_concerns(
-                (*causes, *of_fit, *of_fields, *probed, *numerical, *vague)
+                (
+                    *causes,
+                    *of_fit,
+                    *of_fields,
+                    *probed,
+                    *numerical,
+                    *vague,
+                    *meshes,
+                )
             )
         interrupted = Concern(
             "solve/interrupted",
@@ -451,13 +461,15 @@ class SolvedProblem:
 
     @property
     def all_notes(self) -> tuple[str, ...]:
-        """Notes on the solve, and with error bars also those on the uncertainty, sentences on what
-        the data determine, and the messages of profiles. Notes that are equal appear once.
+        """Notes on the solve, and with error bars also those on coarse meshes and on the
+        uncertainty, sentences on what the data determine, and the messages of
+        profiles. Notes that are equal appear once.
         """
         if self.uncertainty is None:
             return self.notes
         notes = (
             *self.notes,
+            *mesh_resolution_notes(self.problem),
             *self.uncertainty.notes,
             *identifiability_sentences(self.uncertainty),
         )

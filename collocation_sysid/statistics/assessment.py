@@ -28,7 +28,7 @@ from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, display_name
 from .misspecification.misspecification_hypothesis import Hypothesis
 from .probes.relaxed_assumptions import DRIFT, Probe
-from .probes.routine_probes import is_alarming
+from .probes.routine_probes import ROUTINE, is_alarming
 from .residuals.noise_level import NoiseLevel
 from .residuals.residual_diagnostics import MOST_WILD, MarkerDiagnosis
 from .uncertainty import Uncertainty
@@ -85,6 +85,11 @@ GROSS_E_FOLDINGS = 7.0
 # Combined standard uncertainties by which step and mesh may change a parameter: the half width of
 # its 95 % interval.
 MOVED = 2.0
+# End of the message about an assumption that other laws than the stated ones contradict as well.
+LAWS_ADVICE = (
+    "; a wrong damping or material law has similar effects: compare the laws first, with "
+    "compare-models --damping and --materials"
+)
 # Codes of the concern about an estimated, and about a measured discretisation error.
 NUMERICAL = "scheme/step", "mesh/refined"
 
@@ -394,7 +399,8 @@ def probe_concerns(
         "instead": (
             f"; alternatives that decrease χ² less: {instead}" if others else ""
         )
-        + (_hysteresis_text(experiments) if worst.name == DRIFT else ""),
+        + (_hysteresis_text(experiments) if worst.name == DRIFT else "")
+        + (LAWS_ADVICE if worst.name in ROUTINE else ""),
     }
     return [Concern("assumption/contradicted", data=data)]
 

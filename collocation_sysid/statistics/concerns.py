@@ -115,6 +115,10 @@ TOPICS: Mapping[str, Topic] = {
             "poses-constant": "the markers move by {by_mm:.3g} mm, but the poses are constant and "
             "nothing else drives the body, which starts at rest: check the file and the columns of "
             "grasp.poses, and whether they are those of this recording",
+            "not-at-rest": "the markers move by {by_mm:.2g} mm (RMS) within the first "
+            "{within_ms:.3g} ms, in which the grasp moves by {grasp_mm:.2g} mm: the body was not at "
+            'rest at the beginning, as start = "equilibrium" assumes, or the clocks of markers and '
+            "poses differ; begin window_s, or the recording, when the body is at rest",
             "unlike": "the tracks do not move like a grasped body: for every stiffness they are "
             "{by_mm:.3g} mm (RMS) away from markers that move with the grasp, on a body of "
             "{size_mm:.3g} mm, and no single common mistake explains this; check frames, "
@@ -246,8 +250,10 @@ TOPICS: Mapping[str, Topic] = {
         "budget",
         remedy="Find out whether the assumption is wrong, for instance by repeating the first "
         "recording at the end, or whether the model lacks an effect with similar "
-        "consequences, as a missing memory resembles a drift. The command solve --probe "
-        "computes the effect beyond first order and relaxes the other assumptions.",
+        "consequences, as a missing memory resembles a drift, and a wrong damping law a clock "
+        "rate. The commands compare-models --damping and --materials test other laws. The command "
+        "solve --probe (probe=True in Python) computes the effect beyond first order and relaxes "
+        "the other assumptions.",
         messages={
             "contradicted": "the data contradict the assumption that {assumption}: with {name} = "
             "{size} ± {size_error} χ² decreases by {chi_squared:.3g}, and the estimates become "
@@ -384,7 +390,9 @@ TOPICS: Mapping[str, Topic] = {
         "The mesh",
         "mesh",
         remedy='Refine it, and use element = "tet10", or "tet10-p0" for ν ≥ 0.45. The command '
-        "refine RUN measures the remaining error.",
+        "refine RUN measures the remaining error. Recordings that were simulated with the same "
+        'elements have no such error: declare them by assumptions = "none" in [uncertainty], or '
+        'damping_law = "none" in [uncertainty.assumptions].',
         messages={
             "refined": "step and mesh dominate the uncertainty of {name}: it was corrected by "
             "{percent:+.2g} %, {errors:.2g} standard uncertainties",

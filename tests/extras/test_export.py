@@ -27,6 +27,7 @@ from kit.problems import (
     vertex_markers,
 )
 
+import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.export import (
     MAIN_FILES,
@@ -135,6 +136,29 @@ def exported(body: IdentifiedBody, to: str, folder: Path) -> Path:
 def numbers_in(text: str | None) -> np.ndarray:
     assert text is not None
     return np.array(text.split(), dtype=float)
+
+
+def test_a_run_without_a_problem_file_is_exported_from_python(
+    run_folder, tmp_path
+):
+    problem = cs.Problem.read(run_folder.parent / "problem.toml")
+    run = cs.run(replace(problem, origin=None), "reduced-space")
+    run.save(tmp_path / "run", pictures=False)
+    refused = run_command("export", tmp_path / "run", "--to", "json")
+    assert refused.code == 2
+    assert "IdentifiedBody.from_run(run)" in refused.err
+    found = IdentifiedBody.from_run(run)
+    write_export(found, "mujoco", tmp_path / "deck")
+    expected = IdentifiedBody.read(run_folder)
+    assert found.regions[0].young_pa == pytest.approx(
+        expected.regions[0].young_pa, rel=1e-3
+    )
+    assert found.simulated_m is not None
+    np.testing.assert_allclose(
+        found.simulated_m, expected.simulated_m, atol=1e-4
+    )
+    with pytest.raises(InputError, match="expected swing"):
+        IdentifiedBody.from_run(run, "other")
 
 
 # What files hold

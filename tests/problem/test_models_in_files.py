@@ -110,6 +110,11 @@ def test_a_body_of_two_regions_is_simulated_and_identified(tiny):
             "",
             "c30_pa is missing: the material yeoh of region 'stiff'",
         ),
+        (
+            "stiff.c30_pa = 0.0\n",
+            "",
+            "write stiff.c30_pa = {} to estimate it",
+        ),
         ("stiff.c30_pa", "stif.c30_pa", "did you mean 'stiff.c30_pa'?"),
         (
             "stiff.c30_pa",

@@ -37,11 +37,13 @@ from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.result.probe_sections import (
     DEEPER_CHECK_ADVICE,
+    _size_and_ratio,
     is_deeper_check_worthwhile,
 )
 from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.statistics.assessment import Assessment, probe_concerns
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
+from collocation_sysid.statistics.concerns import TOPICS
 from collocation_sysid.statistics.linearised import (
     gauss_newton_step,
     linearise_fit,
@@ -245,7 +247,9 @@ def test_the_concern_names_the_assumption_and_every_corrected_estimate():
     assert concern.message == (
         "the data contradict the assumption that the stiffness is constant during a recording: "
         "with stiffness drift = -0.05 ± 0.01 χ² decreases by 20, and the estimates become E = "
-        "8181 ± 40 Pa and ν not determined; alternatives that decrease χ² less: clock rate (12)"
+        "8181 ± 40 Pa and ν not determined; alternatives that decrease χ² less: clock rate (12); a "
+        "wrong damping or material law has similar effects: compare the laws first, with "
+        "compare-models --damping and --materials"
     )
     assert probe_concerns([probe(0.0)], {"young_pa": 1.0}) == []
 
@@ -299,3 +303,44 @@ def test_a_static_recording_shows_a_drift_only_where_its_load_returns(
     changes = probed_changes(collocation, z, {**none, DRIFT: 0.02})
     column = changes.names.index(DRIFT)
     assert any(block[..., column].any() for block in changes.blocks) is drifts
+
+
+def test_a_significant_routine_probe_recommends_the_comparison_of_laws():
+    probe = Probe(
+        "assumption",
+        "clock_rate",
+        chi_squared=40.0,
+        moves={},
+        size=0.01,
+        size_error=0.001,
+        sentences=("clock_rate",),
+        routine=True,
+        relevance=1.0,
+    )
+    (concern,) = probe_concerns([probe], {})
+    assert "compare-models --damping and --materials" in concern.message
+    other = replace(probe, name="mass", routine=False)
+    (concern,) = probe_concerns([other], {})
+    assert "compare-models" not in concern.message
+    remedy = TOPICS["assumption"].remedy
+    assert "compare-models --damping" in remedy
+
+
+def test_an_insignificant_probe_shows_what_decides():
+    """Residuals far larger than sigma allow a large decrease of χ²."""
+    probe = Probe(
+        "assumption",
+        "clock_rate",
+        chi_squared=12355.8,
+        moves={},
+        size=0.015,
+        size_error=0.0051,
+        routine=True,
+    )
+    text = _size_and_ratio(probe)
+    assert text == "clock rate (0.015 ± 0.0051, 2.9 standard errors)"
+
+
+def test_the_advice_names_the_command_and_the_argument():
+    assert "`solve --probe`" in DEEPER_CHECK_ADVICE
+    assert "probe=True" in DEEPER_CHECK_ADVICE

@@ -6,7 +6,7 @@ the grasped nodes there, or move them on from there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +25,10 @@ from ...recording import Experiment, Markers, Obstacle
 from ...recording.measurement_selection import NO_SENSORS
 from ...recording.obstacle_solids import solid_key
 from ...result.replay import MotionRecord, damaged_run_refused, read_arrays
+from ...runs.forward_simulation import ForwardSimulation
+from ...runs.result_builder import build_result
 from ...runs.result_content import ReportedEstimate, Result
+from ...runs.solved_problem import SolvedProblem
 from ...runs.warm_start import WarmStart
 
 
@@ -235,9 +238,13 @@ class IdentifiedBody:
         folder = Path(run)
         result = Result.read(folder)
         answer = WarmStart.from_result(result, folder)
-        home = result.problem_folder(folder, "which export needs")
+        home = result.problem_folder(
+            folder,
+            "which export needs: in Python, export the run itself, "
+            'write_export(IdentifiedBody.from_run(run), "mujoco", "deck"), see docs/howto/simulators.md',
+        )
         with damaged_run_refused(folder):
-            warnings = _warnings(result)
+            _warnings(result)
         problem = Problem.read(
             folder / "problem.toml", allow_code=allow_code, folder=home
         )
@@ -248,23 +255,14 @@ class IdentifiedBody:
             problem = answer.apply_to_problem(
                 problem
             )  # which may state no guess itself
-        if any(body.scan_conditions is not None for body in problem.bodies):
-            raise InputError(
-                "the mesh was made under gravity, but simulators assume a stress-free mesh; "
-                "expected a stress-free mesh: write body.stress_free_mesh(theta) to a file, and "
-                'solve with that and rest_shape = "stress_free"',
-                folder,
-                where="object.rest_shape",
-            )
+        with located(folder):
+            _require_stress_free(problem)
         collocation = problem.collocation()
         names = [
             segment.experiment.name for segment in collocation.transcriptions
         ]
         if experiment is not None and experiment not in names:
-            raise InputError(
-                f"no experiment {experiment!r} was fitted; expected {', '.join(names)}",
-                folder,
-            )
+            raise InputError(_not_fitted(experiment, names), folder)
         segment = collocation.transcriptions[
             names.index(experiment) if experiment else 0
         ]
@@ -280,11 +278,86 @@ class IdentifiedBody:
             replay = MotionRecord.from_arrays(
                 segment.experiment.name, read_arrays(folder)
             )
-            body = segment.body
-            if replay.undeformed_m.shape != body.nodes.points_m.shape:
+            nodes_m = segment.body.nodes.points_m
+            if replay.undeformed_m.shape != nodes_m.shape:
                 raise ValueError("the mesh is not that of the problem file")
-        corrected = segment.corrected_experiment(phi)
-        rolled_out_m = replay.rolled_out_positions_m
+        with located(folder):
+            return cls._from_experiment(
+                result,
+                segment.corrected_experiment(phi),
+                values=values,
+                simulated_m=replay.rolled_out_positions_m,
+                title=problem.title,
+            )
+
+    @classmethod
+    def from_run(
+        cls, run: SolvedProblem, experiment: str | None = None
+    ) -> IdentifiedBody:
+        """Build from a run in memory, which needs no problem file.
+
+        Parameters
+        ----------
+        run : SolvedProblem
+            A run, such as the value of `collocation_sysid.run`.
+        experiment : str, optional
+            Name of a fitted experiment; the first by default.
+
+        Raises
+        ------
+        InputError
+            If no such experiment was fitted, the mesh was made under gravity, or obstacles are
+            refused.
+        """
+        _require_stress_free(run.problem)
+        parts = {
+            part.segment.experiment.name: part for part in run.solution.parts
+        }
+        if experiment is not None and experiment not in parts:
+            raise InputError(_not_fitted(experiment, list(parts)))
+        part = parts[experiment] if experiment else next(iter(parts.values()))
+        rollout = run.rollouts[part.segment.experiment.name]
+        return cls._from_experiment(
+            build_result(run),
+            part.segment.corrected_experiment(part.phi),
+            values=run.parameters,
+            simulated_m=rollout.trajectory.positions_m
+            if isinstance(rollout, ForwardSimulation)
+            else None,
+            title=run.problem.title,
+        )
+
+    @classmethod
+    def _from_experiment(
+        cls,
+        result: Result,
+        corrected: Experiment,
+        *,
+        values: Mapping[str, float],
+        simulated_m: Array | None,
+        title: str,
+    ) -> IdentifiedBody:
+        """Build from the result of a run.
+
+        Parameters
+        ----------
+        result : Result
+            Content of ``result.json``.
+        corrected : Experiment
+            The fitted experiment to export, with its estimated nuisance parameters.
+        values : mapping of name to float
+            Estimated and fixed parameters.
+        simulated_m : (T, n, 3) array or None
+            Node positions of the forward simulation [m].
+        title : str
+            Title of the problem.
+
+        Raises
+        ------
+        InputError
+            If the body cannot be separated from its obstacles, see `without_obstacles`.
+        """
+        body = corrected.body
         obstacles = tuple(
             replace(o, friction=values[o.friction])
             if isinstance(o.friction, str)
@@ -293,18 +366,17 @@ class IdentifiedBody:
         )
         touching = corrected.with_obstacles(obstacles) if obstacles else None
         if obstacles:
-            with located(folder):
-                corrected = without_obstacles(corrected)
+            corrected = without_obstacles(corrected)
             body = corrected.body
-            rolled_out_m = (
+            simulated_m = (
                 None
-                if rolled_out_m is None
-                else rolled_out_m[:, : len(body.nodes_m)]
+                if simulated_m is None
+                else simulated_m[:, : len(body.nodes_m)]
             )
         return cls(
-            problem.title,
+            title,
             result.trust.verdict,
-            warnings=warnings,
+            warnings=_warnings(result),
             parameters={
                 n: each
                 for n, each in result.parameters.items()
@@ -313,7 +385,7 @@ class IdentifiedBody:
             body=body,
             theta=body.theta_from_values(values),
             experiment=corrected,
-            simulated_m=rolled_out_m,
+            simulated_m=simulated_m,
             experiment_with_obstacles=touching,
         )
 
@@ -502,6 +574,24 @@ class IdentifiedBody:
             ],
             "node_loads_n": self.node_loads_n,
         }
+
+
+def _not_fitted(experiment: str, names: Sequence[str]) -> str:
+    """Return the message that an experiment is none of the fitted ones, whose `names` it lists."""
+    return (
+        f"no experiment {experiment!r} was fitted; expected {', '.join(names)}"
+    )
+
+
+def _require_stress_free(problem: Problem) -> None:
+    """Raise an `InputError` if the mesh of a body was made under gravity."""
+    if any(body.scan_conditions is not None for body in problem.bodies):
+        raise InputError(
+            "the mesh was made under gravity, but simulators assume a stress-free mesh; "
+            "expected a stress-free mesh: write body.stress_free_mesh(theta) to a file, and "
+            'solve with that and rest_shape = "stress_free"',
+            where="object.rest_shape",
+        )
 
 
 def _warnings(result: Result) -> tuple[str, ...]:

@@ -158,9 +158,11 @@ def find_source(
             )
         names[DENSITY.name] = MASS.name
     if lacking := [own for own in plain if own not in names]:
+        first = f"{region}.{lacking[0]}" if region else lacking[0]
         raise InputError(
             f"{_listed(lacking)} missing: {subject} with its damping expects "
-            f"{_expected(elastic, plain)}"
+            f"{_expected(elastic, plain)}; write {first} = {{}} to estimate it (in Python "
+            "cs.Unknown()), or a number"
         )
     return ConstantSource(material, names)
 

@@ -134,13 +134,10 @@ def element_concerns(
         Element of the lowest quality.
     """
     name = body.element.name
-    needed = CELLS_ACROSS.get(body.element.name, 0.0)
     poisson = max(
         engineering_constants(*lame)[1] for lame in body.lame(theta).values()
     )
     limit = LOCKING_POISSON.get(name, np.inf)
-    slender = shape.length_m > LEAST_SLENDERNESS * shape.thickness_m
-    off, level = ("stiff", "low") if name == LINEAR else ("soft", "high")
     return [
         *concern_if(
             worst.quality < POOR_QUALITY,
@@ -159,19 +156,37 @@ def element_concerns(
             limit=limit,
             remedy=FOR_VOLUME,
         ),
-        *concern_if(
-            slender and shape.cells_across < needed - ROUNDING,
-            False,
-            code="mesh/few",
-            cells=shape.cells_across,
-            element=name,
-            thickness_mm=1e3 * shape.thickness_m,
-            off=off,
-            level=level,
-            remedy=f"{FOR_BENDING}, or refine" if name == LINEAR else "refine",
-            needed=needed,
-        ),
+        *bending_concerns(body, shape),
     ]
+
+
+def bending_concerns(body: Body, shape: Slenderness) -> list[Concern]:
+    """Return the concern "mesh/few", as a list, if a slender body has too few elements across its
+    thickness; else empty.
+
+    Parameters
+    ----------
+    body : Body
+        Body with its elements.
+    shape : Slenderness
+        Slenderness of the body.
+    """
+    name = body.element.name
+    needed = CELLS_ACROSS.get(name, 0.0)
+    slender = shape.length_m > LEAST_SLENDERNESS * shape.thickness_m
+    off, level = ("stiff", "low") if name == LINEAR else ("soft", "high")
+    return concern_if(
+        slender and shape.cells_across < needed - ROUNDING,
+        False,
+        code="mesh/few",
+        cells=shape.cells_across,
+        element=name,
+        thickness_mm=1e3 * shape.thickness_m,
+        off=off,
+        level=level,
+        remedy=f"{FOR_BENDING}, or refine" if name == LINEAR else "refine",
+        needed=needed,
+    )
 
 
 def _covariance(mesh: TetMesh) -> Array:

@@ -24,6 +24,7 @@ from ...program.modes.modal_prediction import (
 )
 from ...recording.experiment import Experiment
 from ..axes import OTHER_AXES
+from .initial_motion import initial_motion_hypotheses
 from .misspecification_hypothesis import (
     Hypothesis,
     HypothesisTest,
@@ -78,7 +79,8 @@ def find_misspecifications_by_modes(
     Notes
     -----
     Without markers only signs of loads are tested; in a static experiment, or where modes are of no
-    use (`ModalComparison.from_experiment`), no modes are used. That no stiffness explains the
+    use (`ModalComparison.from_experiment`), no modes are used. That the body was not at rest at the
+    beginning is only reported if no other hypothesis is. That no stiffness explains the
     tracks is only reported if no other hypothesis is, and without obstacles.
     """
     if not experiment.markers.names:
@@ -99,6 +101,8 @@ def find_misspecifications_by_modes(
         *step_hypotheses(experiment),
     ]
     hypotheses += undriven_motion(experiment)
+    if not hypotheses:
+        hypotheses += initial_motion_hypotheses(experiment)
     if comparison is not None and not hypotheses and not experiment.obstacles:
         hypotheses += comparison.unlike()
     return rank(hypotheses)

@@ -41,6 +41,11 @@ PEAK_BINS = 2
 FEWEST_PERIODS = 3
 # Relative difference of frequencies that are taken as equal.
 SAME_FREQUENCY = 0.2
+# Possible causes of slow residuals, which the residuals alone do not distinguish.
+DRIFT_CAUSES = (
+    "the model lacks creep of the material or slip in the grasp, or the body was not at rest at the "
+    "beginning"
+)
 # RMS residual that is rounding [m].
 ROUNDING_M = 1e-9
 # Share of the samples beyond Huber's threshold that noise alone may explain.
@@ -310,7 +315,7 @@ def _message(
     elif diagnosis.oscillating_share > DOMINANT:
         cause = _oscillation_message(diagnosis, t_s, motion=motion)
     elif persistent and diagnosis.lag1 > DOMINANT:
-        cause = "the residuals drift slowly: the model lacks creep of the material or slip in the grasp"
+        cause = f"the residuals drift slowly: {DRIFT_CAUSES}"
         if block.is_static:
             cause = (
                 "the residuals change with the load: the material law or the boundary "
@@ -353,7 +358,7 @@ def _oscillation_message(
     )
     record_s = (t_s[1] - t_s[0]) * len(t_s)
     if diagnosis.frequency_hz * record_s < FEWEST_PERIODS:
-        return f"{share} is a slow drift: the model lacks creep of the material or slip in the grasp"
+        return f"{share} is a slow drift: {DRIFT_CAUSES}"
     message = f"{share} oscillates at {diagnosis.frequency_hz:.3g} Hz"
     of_motion, _ = _largest_peak(motion - motion.mean(axis=0), t_s)
     if abs(diagnosis.frequency_hz - of_motion) <= SAME_FREQUENCY * of_motion:

@@ -56,12 +56,13 @@ parameters = {
     "gamma_r_s": cs.Unknown(),
     "gamma_m_1_s": cs.Unknown(),
 }
+simulated = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())
 runs = {}
 for label, prior_s in (("one clock", None), ("a clock of their own", 0.05)):
     told = replace(
         recording, nuisance=replace(recording.nuisance, time_shift_s=prior_s)
     )
-    runs[label] = cs.run(cs.Problem([told], parameters))
+    runs[label] = cs.run(cs.Problem([told], parameters, uncertainty=simulated))
     trust = runs[label].trust
     print(label, "->", trust.verdict, *trust.reasons, sep="\n  ")
 
