@@ -60,6 +60,7 @@ from .marker_tracking import (
 )
 from .nuisance_schema import nuisance_from_section
 from .problem_size import MOST_SAMPLES, Say, Size, require_feasible
+from .recording_frames import RecordingFrames
 from .recording_schema import (
     ExperimentSection,
     GraspSection,
@@ -152,6 +153,9 @@ class RecordingReader:
             ]
             for name, word, kind in LOADS
         }
+        declared = declared_in(section, Experiment, where="")
+        declared["gravity_m_s2"] = self._frames.gravity_m_s2()
+        self._add_notes(*self._frames.gravity_notes())
         experiment = Experiment(
             name=section.name,
             body=self.body,
@@ -167,7 +171,7 @@ class RecordingReader:
                 section.nuisance, self.code.nuisance_row
             ),
             air_density_kg_m3=self.air_density_kg_m3,
-            **declared_in(section, Experiment, where=""),
+            **declared,
             **loads,
         )
         if section.has_markers and not self.simulation:
@@ -175,6 +179,11 @@ class RecordingReader:
                 experiment, typical_constants(self.parameters)
             )
         return experiment
+
+    @cached_property
+    def _frames(self) -> RecordingFrames:
+        """Frames in which the files are stated, as far as logs name them."""
+        return RecordingFrames(self.section, self.folder)
 
     @property
     def _is_static(self) -> bool:

@@ -568,6 +568,9 @@ class ExperimentSection(NamedSection):
     ----------
     gravity_m_s2 : list
         Acceleration of gravity [x, y, z].
+    gravity_frame : str, optional
+        Frame of the log in whose axes gravity_m_s2 is stated, such as "base_link"; it must be fixed
+        in the frame of the poses by static transforms. The frame of the poses by default.
     kind : {"dynamic", "static"}
         A motion ("dynamic"); or samples each of which is an equilibrium of its own ("static"), at
         any times (with memory, quasi-static in time).
@@ -612,6 +615,7 @@ class ExperimentSection(NamedSection):
     """
 
     gravity_m_s2: Vector = EARTH_M_S2
+    gravity_frame: Text | None = None
     kind: Kind = "dynamic"
     start: Literal["equilibrium", "undeformed"] = "equilibrium"
     start_rule: StartRule = "standard"

@@ -1,0 +1,192 @@
+"""Coordinate frames of an experiment whose files are topics of logs.
+
+The world of an experiment is the frame of its poses. The log's static transforms relate it to the
+frames of gravity, of the markers and of wrench sensors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from ..common.array_types import Array
+from ..errors import InputError, hint_at, located
+from ..recording.experiment import EARTH_M_S2
+from ..recording.formats.log_frames import (
+    LogFrames,
+    TopicFrames,
+    topic_frames,
+)
+from ..recording.formats.logs import TopicAddress
+from .recording_schema import ExperimentSection
+
+# Names of frames that are level by convention, or their endings; the first are more reliable.
+LEVEL_FRAMES = ("world", "map", "odom", "base_link", "base", "base_footprint")
+# Tilt of a frame against a level one from which on it is reported [degrees]: the prior of gravity.
+SMALLEST_TILT_DEG = 1.0
+
+
+@dataclass
+class RecordingFrames:
+    """Frames in which the recordings of one experiment are stated, as far as logs name them.
+
+    Attributes
+    ----------
+    section : ExperimentSection
+        Table of the experiment.
+    folder : Path
+        Folder that contains the files.
+    """
+
+    section: ExperimentSection
+    folder: Path
+
+    @cached_property
+    def poses(self) -> list[TopicFrames | None]:
+        """Frames of the poses of each grasp, then of each obstacle; None where they are not a topic
+        of a log.
+        """
+        return [
+            topic_frames(self.folder / each.poses) if each.poses else None
+            for each in self.section.moved_sections
+        ]
+
+    @cached_property
+    def markers(self) -> str:
+        """Name of the frame of the markers; empty if no log states it, and if a template moves them
+        to another frame.
+        """
+        markers = self.section.markers
+        if not markers.file or markers.template_m is not None:
+            return ""
+        frames = topic_frames(self.folder / markers.file)
+        return frames.parent if frames is not None else ""
+
+    @cached_property
+    def world(self) -> str:
+        """Name of the frame of the first poses from a log, else of the markers; empty if no log
+        states it.
+        """
+        named = [each.parent for each in self.poses if each and each.parent]
+        return named[0] if named else self.markers
+
+    @cached_property
+    def transforms(self) -> LogFrames | None:
+        """Transforms of the log of the first poses, else of the markers or of a wrench; None if all
+        are files.
+        """
+        section = self.section
+        names = [
+            *(each.poses for each in section.moved_sections),
+            section.markers.file,
+            *(section.file_of(each.wrench) for each in section.moved_sections),
+        ]
+        for name in filter(None, names):
+            if (address := TopicAddress.from_path(self.folder / name)) is None:
+                continue
+            with located(name):
+                return LogFrames.read(address)
+        return None
+
+    # Gravity --------------------------------------------------------------------------------------
+
+    def gravity_m_s2(self) -> Array:
+        """Return gravity (3,) [m/s²] in the axes of the world: as stated, or rotated from
+        `gravity_frame` by the log's static transforms.
+
+        Raises
+        ------
+        InputError
+            At "gravity_frame", if it is not connected with the world by static transforms.
+        """
+        gravity = np.array(self.section.gravity_m_s2, dtype=float)
+        if (frame := self.section.gravity_frame) is None:
+            return gravity
+        with located(where="gravity_frame"):
+            rotation = self._require_static_transform(self.world, frame)[:3, :3]
+        rotated: Array = rotation @ gravity
+        return rotated
+
+    def _require_static_transform(self, parent: str, child: str) -> Array:
+        """Return the pose (4, 4) of a frame in another one from the log's static transforms.
+
+        Raises
+        ------
+        InputError
+            If there is no log, the log does not state the frame `parent` (empty), or the frames are
+            not connected by static transforms.
+        """
+        if self.transforms is None:
+            raise InputError(
+                f"found {child!r}, but poses and markers are not topics of a log, which would "
+                "state frames; expected no such key, and values in the axes of the poses"
+            )
+        if not parent:
+            raise InputError(
+                f"found {child!r}, but the log {self.transforms.name} does not state the frame of "
+                "poses or markers; expected no such key, and values in the axes of the poses"
+            )
+        matrix = self.transforms.static_transform(parent, child)
+        if matrix is not None:
+            return matrix
+        names = self.transforms.static_neighbours(parent)
+        if self.transforms.is_connected(parent, child):
+            fault = f"moves relative to {parent!r}, the frame of the recording"
+        else:
+            fault = (
+                "is not connected by the log's transforms with "
+                f"{parent!r}, the frame of the recording"
+            )
+        known = ", ".join([parent, *names])
+        raise InputError(
+            f"found {child!r}, which {fault}; expected a frame that is fixed in it: {known}"
+            f"{hint_at(child, names)}"
+        )
+
+    def gravity_notes(self) -> list[str]:
+        """Return a note if gravity is along −z of the world by default, but the log tilts that
+        frame against one that is level by its name (`LEVEL_FRAMES`); else an empty list.
+        """
+        states_gravity = {"gravity_m_s2", "gravity_frame"} & (
+            self.section.model_fields_set
+        )
+        if states_gravity or not self.world or self.transforms is None:
+            return []
+        names = self.transforms.static_neighbours(self.world)
+        for name in sorted(names, key=_level_rank):
+            if _level_rank(name) >= _level_rank(self.world):
+                return []
+            matrix = self.transforms.static_transform(self.world, name)
+            assert matrix is not None
+            tilt_deg = float(
+                np.degrees(np.arccos(np.clip(matrix[2, 2], -1, 1)))
+            )
+            if tilt_deg > SMALLEST_TILT_DEG:
+                gravity = matrix[:3, :3] @ np.array(EARTH_M_S2)
+                vector = ", ".join(f"{value:.4g}" for value in gravity)
+                return [
+                    f"gravity is along −z of {self.world!r}, the frame of the recording, but the "
+                    f"log tilts this frame by {tilt_deg:.2g}° against {name!r}: if {name!r} is "
+                    f'level, state gravity_frame = "{name}", or gravity_m_s2 = [{vector}]; '
+                    f'if {self.world!r} is level, state gravity_frame = "{self.world}"'
+                ]
+            return []
+        return []
+
+
+def _level_rank(name: str) -> int:
+    """Return the place of a frame in `LEVEL_FRAMES`, by its name without namespace and prefix; the
+    number of these if it has none of these names.
+    """
+    bare = name.rpartition("/")[2].lower()
+    return next(
+        (
+            rank
+            for rank, level in enumerate(LEVEL_FRAMES)
+            if bare == level or bare.endswith(f"_{level}")
+        ),
+        len(LEVEL_FRAMES),
+    )
