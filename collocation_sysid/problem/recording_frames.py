@@ -11,9 +11,11 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
 from ..errors import InputError, hint_at, located
+from ..recording.checked_arrays import point_text
 from ..recording.experiment import EARTH_M_S2
 from ..recording.formats.log_frames import (
     LogFrames,
@@ -21,12 +23,74 @@ from ..recording.formats.log_frames import (
     topic_frames,
 )
 from ..recording.formats.logs import TopicAddress
-from .recording_schema import ExperimentSection
+from ..recording.measured_wrench import Frame
+from .recording_schema import ExperimentSection, WrenchSection
 
 # Names of frames that are level by convention, or their endings; the first are more reliable.
 LEVEL_FRAMES = ("world", "map", "odom", "base_link", "base", "base_footprint")
+# Rotation of a sensor [degrees], and distance of its point [m], that contradict the stated ones.
+LARGEST_ROTATION_DEG = 1.0
+LARGEST_OFFSET_M = 0.005
 # Tilt of a frame against a level one from which on it is reported [degrees]: the prior of gravity.
 SMALLEST_TILT_DEG = 1.0
+
+
+@dataclass(frozen=True)
+class SensorMounting:
+    """Pose of a wrench sensor, from the transforms of a log.
+
+    Attributes
+    ----------
+    sensor : str
+        Name of the sensor's frame.
+    frame : {"grasp", "world"}
+        Frame in which the sensor is fixed: that of the undeformed body as the grasp carries it, or
+        the world.
+    pose : (4, 4) array
+        Pose of the sensor in that frame.
+    """
+
+    sensor: str
+    frame: Frame
+    pose: Array
+
+    @property
+    def point_m(self) -> Array:
+        """Origin (3,) of the sensor in `frame` [m]."""
+        return self.pose[:3, 3]
+
+    @property
+    def angle_deg(self) -> float:
+        """Angle between the axes of the sensor and those of `frame` [degrees]."""
+        rotation = Rotation.from_matrix(self.pose[:3, :3])
+        return float(np.degrees(rotation.magnitude()))
+
+    def rotate(self, values: Array) -> Array:
+        """Return wrenches (S, 6) in the sensor's axes, expressed in the axes of `frame`; NaN if any
+        component of the force, or of the torque, is missing.
+        """
+        rows = values.reshape(-1, 2, 3) @ self.pose[:3, :3].T
+        return rows.reshape(-1, 6)
+
+    def describe(self) -> str:
+        """Return a sentence about what was done with the wrench."""
+        owner = "the body" if self.frame == "grasp" else "the world"
+        return (
+            f"the wrench is measured in {self.sensor!r}: by the static transforms of the log its "
+            f"components are rotated by {self.angle_deg:.3g}° to the axes of {owner}, and its "
+            f"torques are about the point {point_text(self.point_m)} m "
+            f"{'of the undeformed body' if self.frame == 'grasp' else 'in the world'}; other "
+            "axes are stated by frame and point_m"
+        )
+
+    def contradicts(self, section: WrenchSection) -> bool:
+        """Whether a table states the same frame, but other axes or another point, see
+        `LARGEST_ROTATION_DEG` and `LARGEST_OFFSET_M`.
+        """
+        offset_m = np.linalg.norm(self.point_m - np.array(section.point_m))
+        return section.frame == self.frame and bool(
+            self.angle_deg > LARGEST_ROTATION_DEG or offset_m > LARGEST_OFFSET_M
+        )
 
 
 @dataclass
@@ -134,12 +198,9 @@ class RecordingFrames:
             return matrix
         names = self.transforms.static_neighbours(parent)
         if self.transforms.is_connected(parent, child):
-            fault = f"moves relative to {parent!r}, the frame of the recording"
+            fault = f"moves relative to {parent!r}"
         else:
-            fault = (
-                "is not connected by the log's transforms with "
-                f"{parent!r}, the frame of the recording"
-            )
+            fault = f"is not connected by the log's transforms with {parent!r}"
         known = ", ".join([parent, *names])
         raise InputError(
             f"found {child!r}, which {fault}; expected a frame that is fixed in it: {known}"
@@ -175,6 +236,95 @@ class RecordingFrames:
                 ]
             return []
         return []
+
+    # Wrenches -------------------------------------------------------------------------------------
+
+    def sensor_mounting(
+        self, section: WrenchSection, key: str, k: int
+    ) -> SensorMounting | None:
+        """Return the pose of the wrench sensor of a grasp in the body, else in the world.
+
+        The sensor's frame is `sensor_frame`, else that of the log's messages. None if no frame is
+        known, or if none is stated and static transforms connect it neither with the frame whose
+        poses are recorded nor with the world.
+
+        Parameters
+        ----------
+        section : WrenchSection
+        key : str
+            Dotted key of the section, for messages.
+        k : int
+            Index of the grasp, or of the obstacle after the grasps.
+
+        Raises
+        ------
+        InputError
+            If `sensor_frame` is stated, and is not connected with either.
+        """
+        sensor = self._sensor_frame(section)
+        if not sensor or self.transforms is None:
+            if section.sensor_frame is not None:
+                with located(where=f"{key}.sensor_frame"):
+                    self._require_static_transform(self.world, sensor)
+            return None
+        frames = self.poses[k]
+        if frames is not None and frames.child:
+            pose = self.transforms.static_transform(frames.child, sensor)
+            if pose is not None:
+                transform = self.section.moved_sections[k].gripper_to_body
+                if transform is not None:
+                    pose = np.linalg.inv(transform.matrix) @ pose
+                return SensorMounting(sensor, "grasp", pose)
+        pose = (
+            self.transforms.static_transform(self.world, sensor)
+            if self.world
+            else None
+        )
+        if pose is not None:
+            return SensorMounting(sensor, "world", pose)
+        if section.sensor_frame is not None:
+            child = frames.child if frames is not None else ""
+            with located(where=f"{key}.sensor_frame"):
+                self._require_static_transform(child or self.world, sensor)
+        return None
+
+    def _sensor_frame(self, section: WrenchSection) -> str:
+        """Return the name of the frame of a wrench, stated or of its messages; empty if unknown."""
+        if section.sensor_frame is not None:
+            return section.sensor_frame
+        if (file := self.section.file_of(section)) is None:
+            return ""
+        frames = topic_frames(self.folder / file)
+        return frames.parent if frames is not None else ""
+
+    def sensor_note(
+        self, section: WrenchSection, mounting: SensorMounting | None
+    ) -> str:
+        """Return a note on the axes of a wrench: those that the log gives, or that the stated ones
+        contradict the log, or that the frame of the messages is not connected; else "".
+        """
+        file = self.section.file_of(section)
+        if mounting is None:
+            sensor = self._sensor_frame(section)
+            if not sensor or section.states_axes or sensor == self.world:
+                return ""
+            return (
+                f"{file}: the wrench is measured in {sensor!r}, which no static transform of the "
+                "log connects with the gripper or the poses: its components are taken along the "
+                "axes of the world; state sensor_frame, or frame and point_m"
+            )
+        if not section.states_axes:
+            moves = mounting.angle_deg or mounting.point_m.any()
+            is_usual = mounting.frame == "world" and not moves
+            return "" if is_usual else f"{file}: {mounting.describe()}"
+        if mounting.contradicts(section):
+            return (
+                f'{file}: frame = "{section.frame}" and point_m state axes and point, but by the '
+                f"static transforms of the log the sensor's frame {mounting.sensor!r} is rotated "
+                f"by {mounting.angle_deg:.3g}° against these axes, with its origin at "
+                f"{point_text(mounting.point_m)} m; omit frame and point_m to use the transforms"
+            )
+        return ""
 
 
 def _level_rank(name: str) -> int:

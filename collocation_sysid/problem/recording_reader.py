@@ -357,7 +357,7 @@ class RecordingReader:
             section, kind, where=self._grasp_key(k)
         )
         wrench = section.wrench and self._wrench(
-            section.wrench, self._grasp_key(k, word), t_s=t_s
+            section.wrench, self._grasp_key(k, word), k=k, t_s=t_s
         )
         with located(where=self._grasp_key(k)):
             grasp = kind(**arguments, poses=poses, zero=zero, wrench=wrench)
@@ -383,10 +383,14 @@ class RecordingReader:
             timed=self._requires_times,
         )
 
-    def _wrench(self, section: WrenchSection, key: str, t_s: Array) -> Wrench:
+    def _wrench(
+        self, section: WrenchSection, key: str, k: int, t_s: Array
+    ) -> Wrench:
         """Return the measured wrench within the times t_s of the experiment, and note how many
         samples are used.
 
+        Unless the section states frame or point_m, the transforms of a log express it in the axes
+        of the body or of the world, see `RecordingFrames.sensor_mounting`, with a note.
         If a simulation has no file, the wrench is zero at t_s, with a `sigma_nm` of 1 unless
         stated. Of equilibria without markers, only measurements at the times t_s are used, if there
         are any. Stated sigmas are divided by the section's `symmetry`.
@@ -396,6 +400,8 @@ class RecordingReader:
         section : WrenchSection
         key : str
             Dotted key of the section, for messages.
+        k : int
+            Index of the grasp, or of the obstacle after the grasps.
         t_s : (N,) array
             Times of the experiment [s].
 
@@ -417,6 +423,13 @@ class RecordingReader:
                     **{"sigma_nm": 1.0, **arguments},
                 )
             at_s, values = self._read_wrench(section, key)
+            mounting = self._frames.sensor_mounting(section, key, k=k)
+            if note := self._frames.sensor_note(section, mounting):
+                self._add_notes(note)
+            if mounting is not None and not section.states_axes:
+                values = mounting.rotate(values)
+                arguments["frame"] = mounting.frame
+                arguments["point_m"] = mounting.point_m
             is_used = is_within_experiment(
                 at_s, t_s, name=str(name), is_static=self._is_static
             )

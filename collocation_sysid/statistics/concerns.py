@@ -156,12 +156,13 @@ TOPICS: Mapping[str, Topic] = {
             "specimen-unit": "its stresses fit if multiplied by {factor:g}: the unit of the column "
             "is probably {unit}",
             "wrench-sign": "it fits with the opposite sign: it is the force of the body on the "
-            "grasp instead of that of the grasp on the body; change its sign",
+            "grasp instead of that of the grasp on the body; set sign = -1 in the table of the "
+            "wrench",
             "wrench-sign/part": "its {what} fit with the opposite sign, the other components do "
             "not: change the sign of these columns",
             "wrench-axes": "its axes are exchanged or reversed: it fits with ({axes}) in place "
-            "of (x, y, z), both forces and torques; reorder the columns, or rotate the sensor's "
-            "axes",
+            "of (x, y, z), both forces and torques; reorder the columns, rotate the sensor's axes, or "
+            "for a log state sensor_frame in the table of the wrench",
             "wrench-gain": "its {what} fit if multiplied by {factor:.3g}: check the calibration of "
             "the sensor, and the density or mass of the body",
             "wrench-point": "its torques refer to a point {by_mm:.3g} mm away from point_m: they "

@@ -29,16 +29,19 @@ def robot_problem(
     markers_frame: str = "mocap",
     base: str = "base_link",
     wrenches: np.ndarray | None = None,
+    sensor: str = "sensor",
 ) -> Path:
     """Write the tiny problem with poses and markers from a log, and return its path.
 
     Wrenches (N, 6) at the times of the markers, in the sensor's axes and about its origin, are
-    written to the topic /wrench.
+    written to the topic /wrench; its messages name the frame `sensor`.
     """
     file = write_problem(folder, {"swing": 12})
     bag(
         folder / "trial",
-        _messages(folder, markers_frame, base=base, wrenches=wrenches),
+        _messages(
+            folder, markers_frame, base=base, wrenches=wrenches, sensor=sensor
+        ),
     )
     text = file.read_text()
     text = text.replace("swing_motion.csv", POSES)
@@ -47,7 +50,11 @@ def robot_problem(
 
 
 def _messages(
-    folder: Path, markers_frame: str, base: str, wrenches: np.ndarray | None
+    folder: Path,
+    markers_frame: str,
+    base: str,
+    wrenches: np.ndarray | None,
+    sensor: str,
 ) -> Iterator[Message]:
     of = Messages()
     yield of.tree(
@@ -73,5 +80,5 @@ def _messages(
         yield at, topic, kind, message
         if wrenches is not None:
             at, topic, kind, message = of.wrench(t, wrenches[k])
-            message.header.frame_id = "sensor"
+            message.header.frame_id = sensor
             yield at, topic, kind, message

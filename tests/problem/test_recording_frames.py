@@ -7,7 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kit.problem_files import run_command, write_problem
-from kit.robot_log import CAMERAS, robot_problem
+from kit.robot_log import (
+    CAMERAS,
+    CAMERAS_M,
+    GRIPPER_M,
+    SENSOR,
+    SENSOR_M,
+    robot_problem,
+)
+from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.problem import Problem
@@ -107,3 +115,128 @@ def test_a_frame_without_a_log_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match="not topics of a log"):
         Problem.read(file)
+
+
+# Wrenches -----------------------------------------------------------------------------------------
+
+WRENCHES = np.random.default_rng(4).normal(size=(13, 6))
+SIGMAS = "sigma_n = 0.01, sigma_nm = 0.001"
+
+
+def with_wrench(file: Path, keys: str = "", grasp: str = "") -> Path:
+    """The problem with the wrench of the log, more keys of it, and more keys of its grasp."""
+    table = f'wrench = {{ file = "trial#/wrench", {SIGMAS}{keys} }}{grasp}'
+    file.write_text(file.read_text().replace("poses =", f"{table}, poses =", 1))
+    return file
+
+
+def wrench_notes(problem: Problem) -> list[str]:
+    return [note for note in problem.notes if "axes" in note]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_wrench_is_expressed_in_the_body_by_the_transforms_of_the_log(
+    tmp_path: Path, sign: int
+) -> None:
+    body = Rotation.from_euler("z", 30, degrees=True)
+    quaternion = body.as_quat().tolist()
+    file = with_wrench(
+        robot_problem(tmp_path, wrenches=WRENCHES),
+        f", sign = {sign}" if sign < 0 else "",
+        ", gripper_to_body = { position_m = [0, 0, 0.01], "
+        f"quaternion_xyzw = {quaternion} }}",
+    )
+    problem = Problem.read(file)
+    wrench = problem.experiments[0].grasps[0].wrench
+    assert wrench is not None
+    assert wrench.frame == "grasp"
+    rotation = body.inv() * SENSOR
+    for columns in (slice(0, 3), slice(3, 6)):
+        np.testing.assert_allclose(
+            wrench.values[:, columns],
+            sign * rotation.apply(WRENCHES[: len(wrench.t_s), columns]),
+            atol=1e-12,
+        )
+    expected_m = body.inv().apply(SENSOR_M - GRIPPER_M - [0, 0, 0.01])
+    np.testing.assert_allclose(wrench.point_m, expected_m, atol=1e-12)
+    (note,) = wrench_notes(problem)
+    angle_deg = np.degrees(rotation.magnitude())
+    for part in ("'sensor'", f"{angle_deg:.3g}°", "trial#/wrench"):
+        assert part in note
+
+
+def test_a_sensor_that_is_fixed_in_the_world_measures_in_its_axes(
+    tmp_path: Path,
+) -> None:
+    file = with_wrench(
+        robot_problem(tmp_path, wrenches=WRENCHES),
+        ', sensor_frame = "base_link"',
+    )
+    wrench = Problem.read(file).experiments[0].grasps[0].wrench
+    assert wrench is not None
+    assert wrench.frame == "world"
+    np.testing.assert_allclose(
+        wrench.values[:, :3],
+        CAMERAS.inv().apply(WRENCHES[: len(wrench.t_s), :3]),
+    )
+    np.testing.assert_allclose(
+        wrench.point_m, -CAMERAS.inv().apply(CAMERAS_M), atol=1e-12
+    )
+
+
+def test_stated_axes_are_kept_and_a_contradiction_of_the_log_is_noted(
+    tmp_path: Path,
+) -> None:
+    file = with_wrench(
+        robot_problem(tmp_path, wrenches=WRENCHES), ', frame = "grasp"'
+    )
+    problem = Problem.read(file)
+    wrench = problem.experiments[0].grasps[0].wrench
+    assert wrench is not None
+    np.testing.assert_array_equal(
+        wrench.values, WRENCHES[: len(wrench.t_s)].astype(float)
+    )
+    (note,) = wrench_notes(problem)
+    assert "is rotated by 180° against these axes" in note
+    assert "omit frame and point_m" in note
+
+
+def test_axes_that_agree_with_the_log_are_not_noted(tmp_path: Path) -> None:
+    file = with_wrench(
+        robot_problem(tmp_path, wrenches=WRENCHES, sensor="gripper"),
+        ', frame = "grasp"',
+    )
+    assert not wrench_notes(Problem.read(file))
+
+
+def test_a_sensor_without_transforms_is_noted(tmp_path: Path) -> None:
+    file = with_wrench(
+        robot_problem(tmp_path, wrenches=WRENCHES, sensor="netft")
+    )
+    problem = Problem.read(file)
+    wrench = problem.experiments[0].grasps[0].wrench
+    assert wrench is not None
+    assert wrench.frame == "world"
+    (note,) = wrench_notes(problem)
+    assert "'netft', which no static transform" in note
+    assert "sensor_frame" in note
+
+
+@pytest.mark.parametrize(
+    ("keys", "parts"),
+    [
+        (', sensor_frame = "sensr"', ["did you mean 'sensor'", "sensor_frame"]),
+        (
+            ', sensor_frame = "sensor", frame = "grasp"',
+            ["sensor_frame together with frame or point_m"],
+        ),
+    ],
+)
+def test_a_wrong_frame_of_a_sensor_is_refused(
+    tmp_path: Path, keys: str, parts: list[str]
+) -> None:
+    file = with_wrench(robot_problem(tmp_path, wrenches=WRENCHES), keys)
+    result = run_command("check", file)
+    assert result.code == 2
+    for part in ("swing", "wrench", *parts):
+        assert part in result.err
