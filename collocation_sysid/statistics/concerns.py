@@ -171,6 +171,11 @@ TOPICS: Mapping[str, Topic] = {
             "wrench-unit": "its {what} seem to be in {unit}: multiply by {factor:g}",
             "wrench-clock": "it was measured about {by_ms:.3g} ms {when} than its times t_s "
             "state: its clock differs from that of the poses",
+            "wrench-offset": "most of its deviation from the simulation at the guess{after} is an "
+            "offset, in {component} {offset} ({deviations:.3g} standard deviations of its noise): zero the "
+            "sensor before the grasp or subtract a reading without the body; or state "
+            "nuisance.tare = {{ prior_sigmas = {prior} }}, and nuisance.tool if a gripper hangs "
+            "between sensor and body",
             "camera": "only {percent:.0f} % of the body's visible surface have measured points "
             "within {within_mm:.3g} mm: check camera.pose (camera frame: x to the right, y down, "
             "z forward) and the unit of the depth; check draws a picture of both",

@@ -3,7 +3,7 @@
 - `misspecification_hypothesis`: a hypothesis, its strength and how hypotheses are ranked.
 - `plausibility`: contradictions that no simulation is needed for; `placement_causes`: loose parts,
   and bodies inside obstacles; `modal_misspecifications`: predictions by natural modes.
-- `wrench_causes`: force sensors; `obstacle_misspecifications`: obstacles and their loads;
+- `wrench_causes`, `wrench_at_guess`: force sensors; `obstacle_misspecifications`: obstacles and their loads;
   `camera_misspecifications`, `camera_image_misspecifications`, `camera_clock_misspecifications`:
   depth cameras, their images and times; `specimen_misspecifications`: homogeneous tests.
 - `fit_misspecifications`: hypotheses after a fit.
