@@ -237,6 +237,48 @@ class RecordingFrames:
             return []
         return []
 
+    # Markers --------------------------------------------------------------------------------------
+
+    def markers_fault(self) -> str:
+        """Return a sentence about markers and poses in different frames, with the address of the
+        poses that resolves it; "" if logs state the same frame, or not both.
+
+        Frames that coincide by the log's static transforms are the same.
+        """
+        poses = [
+            (moved.poses, frames)
+            for moved, frames in zip(
+                self.section.moved_sections, self.poses, strict=True
+            )
+            if frames is not None and frames.parent
+        ]
+        if not self.markers:
+            return ""
+        for name, frames in poses:
+            if frames.parent == self.markers:
+                continue
+            file = self.section.markers.file
+            fault = (
+                f"the poses {name} are in the frame {frames.parent!r}, the markers {file} in "
+                f"{self.markers!r}; expected one frame"
+            )
+            if self.transforms is None:
+                return fault
+            pose = self.transforms.static_transform(frames.parent, self.markers)
+            if pose is not None and np.allclose(pose, np.eye(4)):
+                continue
+            chain = f"{frames.parent}>{frames.child}"
+            is_readable = str(name).endswith(chain) and (
+                self.transforms.is_connected(self.markers, frames.child)
+            )
+            if not is_readable:
+                return f"{fault}: convert the poses or the markers"
+            address = str(name).removesuffix(chain)
+            return (
+                f'{fault}: set poses = "{address}{self.markers}>{frames.child}"'
+            )
+        return ""
+
     # Wrenches -------------------------------------------------------------------------------------
 
     def sensor_mounting(

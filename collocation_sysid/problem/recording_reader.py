@@ -175,9 +175,14 @@ class RecordingReader:
             **loads,
         )
         if section.has_markers and not self.simulation:
+            frames_fault = self._frames.markers_fault()
             require_plausible_markers(
-                experiment, typical_constants(self.parameters)
+                experiment,
+                typical_constants(self.parameters),
+                frames_fault=frames_fault,
             )
+            if frames_fault:
+                self._add_notes(frames_fault)
         return experiment
 
     @cached_property
@@ -978,7 +983,9 @@ def _require_known_markers(
 
 
 def require_plausible_markers(
-    experiment: Experiment, constants: Mapping[str, float]
+    experiment: Experiment,
+    constants: Mapping[str, float],
+    frames_fault: str = "",
 ) -> None:
     """Raise `InputError` if the tracks cannot belong to this body, because of a wrong unit or
     frame; see `_implausible_markers`.
@@ -989,9 +996,14 @@ def require_plausible_markers(
         Experiment with markers.
     constants : mapping of str to float
         Physical values by name, to find the likely cause, which the message then names.
+    frames_fault : str
+        Known fault of the frames of poses and markers, which the message begins with; then no other
+        cause is sought.
     """
     if (message := _implausible_markers(experiment)) is None:
         return
+    if frames_fault:
+        raise InputError(f"{frames_fault}; {message}", where="markers")
     likeliest = "".join(
         f"; likely {cause.message}"
         for cause in find_misspecifications_by_modes(experiment, constants)[:1]

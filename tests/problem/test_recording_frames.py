@@ -117,6 +117,40 @@ def test_a_frame_without_a_log_is_refused(tmp_path: Path) -> None:
         Problem.read(file)
 
 
+# Markers ------------------------------------------------------------------------------------------
+
+
+def test_poses_in_another_frame_than_the_markers_are_named_first(
+    tmp_path: Path,
+) -> None:
+    file = robot_problem(tmp_path)
+    file.write_text(file.read_text().replace("mocap>", "base_link>"))
+    result = run_command("check", file)
+    assert result.code == 2
+    for part in (
+        "trial#/tf#base_link>gripper are in the frame 'base_link'",
+        "trial#/markers in 'mocap'",
+        'set poses = "trial#/tf#mocap>gripper"',
+    ):
+        assert part in result.err
+    assert result.err.index("set poses") < result.err.index("measured at")
+    assert "likely" not in result.err
+    text = file.read_text().replace("base_link>", "mocap>")
+    file.write_text(text)  # as the message says
+    assert not markers_notes(Problem.read(file))
+
+
+def test_frames_of_other_names_are_noted(tmp_path: Path) -> None:
+    problem = Problem.read(robot_problem(tmp_path, markers_frame="optitrack"))
+    (note,) = markers_notes(problem)
+    assert "in 'optitrack'" in note
+    assert "convert the poses or the markers" in note
+
+
+def markers_notes(problem: Problem) -> list[str]:
+    return [note for note in problem.notes if "the markers trial" in note]
+
+
 # Wrenches -----------------------------------------------------------------------------------------
 
 WRENCHES = np.random.default_rng(4).normal(size=(13, 6))
