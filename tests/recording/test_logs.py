@@ -26,6 +26,7 @@ from kit.logs import (
     recorded,
 )
 from kit.problem_files import run_command, write_problem
+from kit.robot_log import POSES, robot_problem
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -267,6 +268,25 @@ def test_topics_offer_the_chains_of_frames_that_can_be_read(
         topics["/tf_static"].serves
         == "static frames, part of the chains of /tf"
     )
+
+
+def test_topics_offer_chains_from_the_frame_of_the_markers(
+    tmp_path: Path,
+) -> None:
+    robot_problem(tmp_path)
+    log = tmp_path / "trial"
+    addresses = {each.name: each for each in list_topics(log)}["/tf"].write
+    assert addresses == (
+        "trial#/tf#base_link>gripper",
+        "trial#/tf#base_link>sensor",
+        "trial#/tf#base_link>tool0",
+        "trial#/tf#mocap>gripper",
+        "trial#/tf#mocap>sensor",
+        "trial#/tf#mocap>tool0",
+    )
+    assert POSES in addresses
+    for address in addresses:  # each can be read as it is written
+        assert len(read_poses(tmp_path / address).t_s) == 13
 
 
 def test_addresses_of_topics_are_lines_that_can_be_copied(

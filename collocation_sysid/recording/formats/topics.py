@@ -99,8 +99,12 @@ def list_topics(path: str | Path) -> list[LogTopic]:
         If the path is no log, the log is damaged, or a package that reads it is missing.
     """
     with open_log(Path(path), episode=0) as log:
+        marker_frames = _marker_frames(log)
         topics = [
-            _describe_topic(log, Path(path), name=name) for name in log.topics
+            _describe_topic(
+                log, Path(path), name=name, marker_frames=marker_frames
+            )
+            for name in log.topics
         ]
         points = [
             each.name
@@ -173,7 +177,28 @@ def topic_as_csv(address: TopicAddress) -> bytes:
     return csv_content(columns, times, values=values)
 
 
-def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
+def _marker_frames(log: Log) -> list[str]:
+    """Return the frames in which topics with points are stated, each once, by the first message of
+    each topic.
+    """
+    frames = []
+    for name in log.topics:
+        for _, message in islice(log.messages(name), 1):
+            is_other = is_transforms(message) or depth_kind(message)
+            frame = nested_field(message, "header.frame_id")
+            if (
+                frame
+                and not is_other
+                and _pose_of_message(message) is None
+                and _points_of_message(message, by_namespace=False)
+            ):
+                frames.append(str(frame).lstrip("/"))
+    return list(dict.fromkeys(frames))
+
+
+def _describe_topic(
+    log: Log, path: Path, name: str, marker_frames: Iterable[str]
+) -> LogTopic:
     """Return the description of a topic from its first messages: type, number of messages, rate,
     possible uses and the addresses to write for them.
 
@@ -184,6 +209,8 @@ def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
         Path of the log.
     name : str
         Name of the topic.
+    marker_frames : iterable of str
+        Frames of markers, from which chains of frames begin too.
     """
     kind, count = log.topics[name]
     first = list(islice(log.messages(name), _FIRST))
@@ -192,9 +219,9 @@ def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
     serves = ""
     write = [f"{path.name}#{name}"]
     if first and is_transforms(first[0][1]):
-        chains = moving_chains(
-            _all_transforms(log, log.messages(name), topic=name)
-        )
+        edges = _all_transforms(log, log.messages(name), topic=name)
+        chains = moving_chains(edges)
+        chains += chains_from(edges, marker_frames, chains=chains)
         serves = (
             "poses of one frame relative to another"
             if chains
@@ -568,6 +595,36 @@ def moving_chains(edges: Edges) -> list[tuple[str, str]]:
             chains.append((chain[-1], frame))
     carrying = set(above.values())
     return sorted(chains, key=lambda chain: chain[1] in carrying)
+
+
+def chains_from(
+    edges: Edges, frames: Iterable[str], chains: Iterable[tuple[str, str]]
+) -> list[tuple[str, str]]:
+    """Return pairs of each of some frames and each frame that moves in it, apart from `chains`.
+
+    Parameters
+    ----------
+    edges : Edges
+    frames : iterable of str
+        Frames at which chains begin; those without a transform are ignored.
+    chains : iterable of (str, str)
+        Pairs of a root frame and a frame that moves in it, see `moving_chains`.
+    """
+    known = list(chains)
+    connected = {name for edge in edges for name in edge}
+    found = []
+    for frame in frames:
+        for _, child in known:
+            pair = frame, child
+            if frame not in connected or frame == child or pair in known:
+                continue
+            try:
+                path = frame_path(edges, frame, child=child)
+            except InputError:  # not connected
+                continue
+            if any(len(edges[edge]) > 1 for edge in path):
+                found.append(pair)
+    return found
 
 
 def _poses_through_frames(
