@@ -394,8 +394,10 @@ def test_points_of_several_topics_are_one_set_of_markers(
     np.testing.assert_allclose(base[[0, 1, 3], 1], [0, 0.5, 1.5])
     # The median interval is 0.375 s: 0.5 s is no gap.
     np.testing.assert_allclose(base[2], [0, 1.0, 0])
+    together = "run.mcap#/mocap/tip/point,/mocap/base/point"
     for topic in list_topics(log):
-        assert topic.write[-1] == "run.mcap#/mocap/tip/point,/mocap/base/point"
+        assert topic.write[-1] == together
+    assert run_command("log", log).out.count(together) == 1
 
 
 def test_a_point_is_missing_where_its_topic_has_a_gap_or_has_ended(
