@@ -301,7 +301,7 @@ def checked_causes(problem: Problem) -> tuple[Hypothesis, ...]:
             problem, collocation.iterates(variables)
         )
         causes = rank((*causes, *mistakes))
-    return causes or rank(wrench_mistakes(collocation))
+    return causes or rank(wrench_mistakes(collocation).hypotheses)
 
 
 def solve_report(problem: Problem, family: Family) -> SolveReport:

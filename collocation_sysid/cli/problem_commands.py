@@ -35,6 +35,7 @@ from .common import (
     EXIT_INTERRUPTED,
     EXIT_NOT_CONVERGED,
     error_console,
+    interruption_exit,
     print_result,
 )
 
@@ -113,15 +114,21 @@ def solve(options: SolveCommand) -> None:
         with SolveProgress(
             error_console, problem, verbose=options.verbose, quiet=options.quiet
         ) as progress:
-            finished = run(
-                problem,
-                options.method,
-                watch=progress.iteration,
-                log=progress.say,
-                start=options.start,
-                scheduler=options.scheduler,
-                probe=options.probe,
-            )
+            try:
+                finished = run(
+                    problem,
+                    options.method,
+                    watch=progress.iteration,
+                    log=progress.say,
+                    start=options.start,
+                    scheduler=options.scheduler,
+                    probe=options.probe,
+                )
+            except KeyboardInterrupt:
+                raise interruption_exit(
+                    f"the search had no iterate yet; nothing was written to {folder}",
+                    continues=False,
+                ) from None
             until_shown.enter_context(INTERRUPTS.deferred())
         if not options.as_json:
             print_result(run_summary(finished.result, budget=options.budget))

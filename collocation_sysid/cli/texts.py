@@ -171,7 +171,13 @@ def log(options: LogCommand) -> None:
         for each in listed
     )
     heads = ("topic", "type", "messages", "Hz", "use")
-    addresses = [f"  {address}" for each in listed for address in each.write]
+    # Several topics of points have their joint address in common.
+    addresses = [
+        f"  {address}"
+        for address in dict.fromkeys(
+            address for each in listed for address in each.write
+        )
+    ]
     what = (
         ["", "In place of a file name write:", *addresses] if addresses else []
     )

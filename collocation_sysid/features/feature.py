@@ -73,6 +73,9 @@ class SimulatedCheck:
         ``fit_s(samples)``, the estimated time [s] to fit the first samples to the markers.
     report_progress : callable
         Called with progress messages.
+    is_simulated : bool
+        Whether `parts` are simulated; false if a simulation failed, and a body is only moved
+        rigidly with its grasp.
     """
 
     problem: Problem
@@ -82,6 +85,7 @@ class SimulatedCheck:
     is_full: bool
     fit_s: Callable[[int], float]
     report_progress: Callable[[str], None]
+    is_simulated: bool = True
 
 
 @dataclass(frozen=True, eq=False)

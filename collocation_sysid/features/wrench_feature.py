@@ -21,6 +21,7 @@ from ..statistics.misspecification.misspecification_hypothesis import (
     rank,
 )
 from ..statistics.misspecification.plausibility import load_sign_hypotheses
+from ..statistics.misspecification.wrench_at_guess import wrench_deviations
 from ..statistics.misspecification.wrench_causes import (
     CHECKED_SAMPLES,
     wrench_causes,
@@ -117,28 +118,44 @@ def step_differences(
 def simulated_hypotheses(
     check: SimulatedCheck,
 ) -> tuple[Sequence[Hypothesis], Sequence[str]]:
-    """Return likely errors of wrenches, by a fit of the first samples to the markers.
+    """Return likely errors of wrenches, and notes with the deviation of each from the simulation.
 
-    Nothing is compared without wrenches and markers in one recording, or if another error is
-    likely; if the fit takes long, a note says so.
+    The first samples are fitted to the markers, unless another error is likely or the fit takes
+    long, which a note says. Wrenches that no such fit predicts are compared with the simulation at
+    the guess instead. Nothing is compared if the simulation failed.
     """
+    deviations = wrench_deviations(check.parts) if check.is_simulated else []
+    notes = [deviation.note() for deviation in deviations]
+    if check.causes:
+        return (), notes
+    unpredicted = {each.experiment for each in deviations}
+    hypotheses: list[Hypothesis] = []
     has_both = any(
         each.wrenches and each.markers.sample_count
         for each in check.problem.experiments
     )
-    if not has_both or check.causes:
-        return (), ()
-    fit_s = check.fit_s(CHECKED_SAMPLES)
-    if not check.is_full and fit_s > LONGEST_FIT_S:
-        note = (
+    fit_s = check.fit_s(CHECKED_SAMPLES) if has_both else 0.0
+    if has_both and not check.is_full and fit_s > LONGEST_FIT_S:
+        notes.append(
             "the wrenches were not compared with the prediction from the markers, which would "
             f"take about {fit_s:.2g} s; check --full does it"
         )
-        return (), (note,)
-    check.report_progress(
-        "comparing the wrenches with the prediction from the markers"
-    )
-    return rank(wrench_mistakes(check.collocation)), ()
+    elif has_both:
+        check.report_progress(
+            "comparing the wrenches with the prediction from the markers"
+        )
+        comparison = wrench_mistakes(check.collocation)
+        hypotheses = list(comparison.hypotheses)
+        unpredicted -= set(comparison.predicted)
+        notes += [
+            f"no fit explains the markers of '{name}', so that its wrench was compared with the "
+            "simulation at the guess alone"
+            for name in sorted(unpredicted)
+        ]
+    for deviation in deviations:
+        if deviation.experiment in unpredicted:
+            hypotheses += deviation.hypotheses()
+    return rank(hypotheses), notes
 
 
 def fit_hypotheses(solution: Solution) -> list[Hypothesis]:

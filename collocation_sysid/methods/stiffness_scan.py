@@ -56,6 +56,9 @@ BETTER = 0.01
 MORE_STARTS = 2
 # Largest misfit of another start over the best one.
 EQUIVALENT_LOSS_RATIO = 4.0
+# Misfit at a guess over that at the best start of a scan, up to which the guess is kept: smaller
+# differences come from tares, clocks and poses, which are not estimated in a scan.
+CLEARLY_BETTER = 1.2
 NO_GUESS = "no guess"
 
 
@@ -126,9 +129,9 @@ def start_problem(
 ) -> tuple[Collocation, Scan | None]:
     """Return the problem with a guess of every parameter, and the scan; None if there was no scan.
 
-    Given guesses are kept, unless the body cannot be simulated with them or fits worse than an
-    undeformed one, and the scan finds better ones. The given problem is not modified; it is
-    returned itself if nothing changes.
+    Given guesses are kept, unless the body cannot be simulated with them, or it fits worse than an
+    undeformed one and the scan finds initial values that fit clearly better (`CLEARLY_BETTER`).
+    The given problem is not modified; it is returned itself if nothing changes.
 
     Parameters
     ----------
@@ -162,8 +165,15 @@ def start_problem(
     result = rescue(collocation, reason, is_complete=is_complete)
     if result is None:
         return collocation, None  # the method reports what it needs
-    if failure is None and misfit <= result.misfit[result.best]:
+    best = float(result.misfit[result.best])
+    if failure is None and misfit <= CLEARLY_BETTER * best:
         return collocation, None
+    if failure is None:
+        result = replace(
+            result,
+            reason=f"{reason} (misfit {misfit:.3g} standard deviations at the guess, {best:.3g} at "
+            "the initial values of the scan, which replace all guesses)",
+        )
     return replace(collocation, parameters=result.parameters), result
 
 

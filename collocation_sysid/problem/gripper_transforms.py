@@ -5,9 +5,6 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterable
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
 from ..common.array_types import Array
 from .problem import Problem
 from .schema import ProblemFile
@@ -43,11 +40,5 @@ def gripper_transforms(
     transforms: list[Array | None] = []
     for k in indices:
         stated = section.moved_sections[k].gripper_to_body
-        if stated is None:
-            transforms.append(None)
-            continue
-        matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_quat(stated.quaternion_xyzw).as_matrix()
-        matrix[:3, 3] = stated.position_m
-        transforms.append(matrix)
+        transforms.append(None if stated is None else stated.matrix)
     return transforms

@@ -60,6 +60,7 @@ from .marker_tracking import (
 )
 from .nuisance_schema import nuisance_from_section
 from .problem_size import MOST_SAMPLES, Say, Size, require_feasible
+from .recording_frames import RecordingFrames
 from .recording_schema import (
     ExperimentSection,
     GraspSection,
@@ -152,6 +153,9 @@ class RecordingReader:
             ]
             for name, word, kind in LOADS
         }
+        declared = declared_in(section, Experiment, where="")
+        declared["gravity_m_s2"] = self._frames.gravity_m_s2()
+        self._add_notes(*self._frames.gravity_notes())
         experiment = Experiment(
             name=section.name,
             body=self.body,
@@ -167,14 +171,24 @@ class RecordingReader:
                 section.nuisance, self.code.nuisance_row
             ),
             air_density_kg_m3=self.air_density_kg_m3,
-            **declared_in(section, Experiment, where=""),
+            **declared,
             **loads,
         )
         if section.has_markers and not self.simulation:
+            frames_fault = self._frames.markers_fault()
             require_plausible_markers(
-                experiment, typical_constants(self.parameters)
+                experiment,
+                typical_constants(self.parameters),
+                frames_fault=frames_fault,
             )
+            if frames_fault:
+                self._add_notes(frames_fault)
         return experiment
+
+    @cached_property
+    def _frames(self) -> RecordingFrames:
+        """Frames in which the files are stated, as far as logs name them."""
+        return RecordingFrames(self.section, self.folder)
 
     @property
     def _is_static(self) -> bool:
@@ -348,7 +362,7 @@ class RecordingReader:
             section, kind, where=self._grasp_key(k)
         )
         wrench = section.wrench and self._wrench(
-            section.wrench, self._grasp_key(k, word), t_s=t_s
+            section.wrench, self._grasp_key(k, word), k=k, t_s=t_s
         )
         with located(where=self._grasp_key(k)):
             grasp = kind(
@@ -380,10 +394,14 @@ class RecordingReader:
             timed=self._requires_times,
         )
 
-    def _wrench(self, section: WrenchSection, key: str, t_s: Array) -> Wrench:
+    def _wrench(
+        self, section: WrenchSection, key: str, k: int, t_s: Array
+    ) -> Wrench:
         """Return the measured wrench within the times t_s of the experiment, and note how many
         samples are used.
 
+        Unless the section states frame or point_m, the transforms of a log express it in the axes
+        of the body or of the world, see `RecordingFrames.sensor_mounting`, with a note.
         If a simulation has no file, the wrench is zero at t_s, with a `sigma_nm` of 1 unless
         stated. Of equilibria without markers, only measurements at the times t_s are used, if there
         are any. Stated sigmas are divided by the section's `symmetry`.
@@ -393,6 +411,8 @@ class RecordingReader:
         section : WrenchSection
         key : str
             Dotted key of the section, for messages.
+        k : int
+            Index of the grasp, or of the obstacle after the grasps.
         t_s : (N,) array
             Times of the experiment [s].
 
@@ -414,6 +434,13 @@ class RecordingReader:
                     **{"sigma_nm": 1.0, **arguments},
                 )
             at_s, values = self._read_wrench(section, key)
+            mounting = self._frames.sensor_mounting(section, key, k=k)
+            if note := self._frames.sensor_note(section, mounting):
+                self._add_notes(note)
+            if mounting is not None and not section.states_axes:
+                values = mounting.rotate(values)
+                arguments["frame"] = mounting.frame
+                arguments["point_m"] = mounting.point_m
             is_used = is_within_experiment(
                 at_s, t_s, name=str(name), is_static=self._is_static
             )
@@ -962,7 +989,9 @@ def _require_known_markers(
 
 
 def require_plausible_markers(
-    experiment: Experiment, constants: Mapping[str, float]
+    experiment: Experiment,
+    constants: Mapping[str, float],
+    frames_fault: str = "",
 ) -> None:
     """Raise `InputError` if the tracks cannot belong to this body, because of a wrong unit or
     frame; see `_implausible_markers`.
@@ -973,9 +1002,14 @@ def require_plausible_markers(
         Experiment with markers.
     constants : mapping of str to float
         Physical values by name, to find the likely cause, which the message then names.
+    frames_fault : str
+        Known fault of the frames of poses and markers, which the message begins with; then no other
+        cause is sought.
     """
     if (message := _implausible_markers(experiment)) is None:
         return
+    if frames_fault:
+        raise InputError(f"{frames_fault}; {message}", where="markers")
     likeliest = "".join(
         f"; likely {cause.message}"
         for cause in find_misspecifications_by_modes(experiment, constants)[:1]

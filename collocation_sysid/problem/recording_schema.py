@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field, model_validator
+from scipy.spatial.transform import Rotation
 
+from ..common.array_types import Array
 from ..common.schema_tables import ByForm, Section, Unit, Vector, used_keys
 from ..common.validated_types import (
     AtLeastOne,
@@ -51,6 +54,15 @@ class TransformSection(Section):
         0.0,
         1.0,
     )
+
+    @property
+    def matrix(self) -> Array:
+        """(4, 4) matrix of the motion."""
+        matrix = np.eye(4)
+        rotation = Rotation.from_quat(self.quaternion_xyzw)
+        matrix[:3, :3] = rotation.as_matrix()
+        matrix[:3, 3] = self.position_m
+        return matrix
 
 
 class TableSection(Section):
@@ -119,7 +131,8 @@ class WrenchSection(TableSection):
     """The measured force and torque that the grasp exerts on the body.
 
     Columns t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, in these or other units, at their
-    own rate; or a machine's force, or engineering stress with an area. Blank cells are missing.
+    own rate; or a machine's force, or engineering stress with an area. Blank cells are missing. For
+    a sensor that reports the reaction, the wrench of the body on the grasp, set sign = -1.
 
     Attributes
     ----------
@@ -133,6 +146,10 @@ class WrenchSection(TableSection):
     point_m : list
         Point [x, y, z] of the torque: fixed in the world, or, in the frame "grasp", on the
         undeformed body and carried by the grasp.
+    sensor_frame : str, optional
+        Frame of the log in which the sensor measures, instead of frame and point_m: the log's
+        static transforms rotate the components to the body, or to the world, and give the point. By
+        default the frame of the messages, if frame and point_m are not stated either.
     area_m2 : float, optional
         Undeformed area by which an engineering stress is multiplied [m²].
     symmetry : int
@@ -145,8 +162,24 @@ class WrenchSection(TableSection):
     sigma_nm: Positive | None = None
     frame: Frame = "world"
     point_m: Vector = (0.0, 0.0, 0.0)
+    sensor_frame: Text | None = None
     symmetry: AtLeastOne = 1
     area_m2: Positive | None = None
+
+    @property
+    def states_axes(self) -> bool:
+        """Whether the table states the axes of the components or the point of the torque."""
+        return bool({"frame", "point_m"} & self.model_fields_set)
+
+    @model_validator(mode="after")
+    def _require_one_frame(self) -> WrenchSection:
+        """Return the section itself; raise `ValueError` for sensor_frame with frame or point_m."""
+        if self.sensor_frame is not None and self.states_axes:
+            raise ValueError(
+                "found sensor_frame together with frame or point_m; expected either sensor_frame, "
+                "from which the log's transforms give both, or frame and point_m"
+            )
+        return self
 
 
 def _as_table(value: str | DisplacementSection) -> DisplacementSection:
@@ -583,6 +616,9 @@ class ExperimentSection(NamedSection):
     ----------
     gravity_m_s2 : list
         Acceleration of gravity [x, y, z].
+    gravity_frame : str, optional
+        Frame of the log in whose axes gravity_m_s2 is stated, such as "base_link"; it must be fixed
+        in the frame of the poses by static transforms. The frame of the poses by default.
     kind : {"dynamic", "static"}
         A motion ("dynamic"); or samples each of which is an equilibrium of its own ("static"), at
         any times (with memory, quasi-static in time).
@@ -627,6 +663,7 @@ class ExperimentSection(NamedSection):
     """
 
     gravity_m_s2: Vector = EARTH_M_S2
+    gravity_frame: Text | None = None
     kind: Kind = "dynamic"
     start: Literal["equilibrium", "undeformed"] = "equilibrium"
     start_rule: StartRule = "standard"

@@ -264,9 +264,12 @@ class ObjectSection(Section):
         """
         if self.has_shape:
             require_one(self, *SHAPES)
-        if self.has_shape and (self.mesh is None) != (
-            self.edge_length_m is not None
-        ):
+        if self.has_shape and self.mesh is None and self.edge_length_m is None:
+            raise ValueError(
+                "edge_length_m is missing; expected the length of the elements' edges beside "
+                "surface, cylinder or box_m"
+            )
+        if self.mesh is not None and self.edge_length_m is not None:
             raise ValueError(
                 "edge_length_m is used only with surface, cylinder or box_m; expected one of "
                 "these, or no edge_length_m"

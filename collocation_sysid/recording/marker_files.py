@@ -293,10 +293,10 @@ def _require_rate(t_s: Array, key: str, rate_hz: float) -> None:
 def _mark_missing(
     raw: RawTracks, names: Iterable[str]
 ) -> tuple[Array, list[str]]:
-    """Return coordinates (T, M, 3) with NaN for missing samples, and notes on how many are missing.
+    """Return coordinates (T, M, 3) with NaN for missing samples, and a note on how many are missing.
 
     A sample is missing if a coordinate is NaN, or all are 0 in a format in which zeros mean that.
-    Markers with the same losses share a note; without losses there is none.
+    The note lists all markers, those with the same losses together; without losses there is none.
     """
     x = raw.coordinates
     blank = np.asarray(np.isnan(x).any(axis=2))
@@ -310,8 +310,9 @@ def _mark_missing(
             )
             loss = f"{missing} of {len(x)} samples missing ({kinds})"
             markers_by_loss.setdefault(loss, []).append(name)
-    notes = [
+    losses = [
         f"{listed(markers)}: {'each ' * (len(markers) > 1)}{loss}"
         for loss, markers in markers_by_loss.items()
     ]
+    notes = ["; ".join(losses)] if losses else []
     return np.where((blank | zero)[:, :, None], np.nan, x), notes

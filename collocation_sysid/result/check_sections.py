@@ -319,8 +319,8 @@ def _solve_section(findings: CheckResult) -> Table:
         )
     if findings.costs:
         rows["times"] = (
-            f"rough estimates of the search for {findings.timesteps:,} time steps or equilibria, "
-            "obstacles and friction included; the checks of the result come on top"
+            f"rough estimates for {findings.timesteps:,} time steps or equilibria, "
+            "without checks"
         )
     rows["derivatives"] = (
         f"relative errors of Jacobian and Hessian: {findings.jacobian_error:.0e}, "

@@ -495,18 +495,26 @@ def _solve_from_scan(
     scan : Scan or None
         None if the scan finds no start, or the search from there fails too.
     solution : Solution
-        The new solution, also if it was interrupted, or the failed one itself. History, counts and
-        times are those of one of the two searches, not of both.
+        The new solution, also if it was interrupted, or the failed one; after an interrupt of the
+        scan the failed one, as interrupted. History, counts and times are those of one of the two
+        searches, not of both.
     """
     reason = f"the search from the guess failed ({failed.status.value})"
     needs_complete_start = getattr(solver, "needs_complete_start", False)
-    scan = rescue(failed.collocation, reason, is_complete=needs_complete_start)
-    if scan is None:
-        return None, failed
-    again = associated_at_guess(
-        replace(failed.collocation, parameters=scan.parameters)
-    )
-    solution = solve_with_renewed_correspondences(solver, again, watch=watch)
+    try:
+        scan = rescue(
+            failed.collocation, reason, is_complete=needs_complete_start
+        )
+        if scan is None:
+            return None, failed
+        again = associated_at_guess(
+            replace(failed.collocation, parameters=scan.parameters)
+        )
+        solution = solve_with_renewed_correspondences(
+            solver, again, watch=watch
+        )
+    except KeyboardInterrupt:
+        return None, _as_interrupted(failed)
     ended = solution.status.converged or solution.status is Status.INTERRUPTED
     return (scan, solution) if ended else (None, failed)
 
@@ -532,11 +540,16 @@ def best_of_second_start(
     watch : callable or None
         Called with every iteration of the second search.
     """
-    other = second_start_parameters(first)
-    if other is None:
-        return first
-    again = associated_at_guess(replace(first.collocation, parameters=other))
-    second = solve_with_renewed_correspondences(solver, again, watch=watch)
+    try:
+        other = second_start_parameters(first)
+        if other is None:
+            return first
+        again = associated_at_guess(
+            replace(first.collocation, parameters=other)
+        )
+        second = solve_with_renewed_correspondences(solver, again, watch=watch)
+    except KeyboardInterrupt:
+        return _as_interrupted(first)
     gain = first.history[-1].loss - second.history[-1].loss
     if second.status is Status.INTERRUPTED:
         return replace(first, status=second.status, message=second.message)
@@ -547,6 +560,15 @@ def best_of_second_start(
         f"found a better fit (χ² lower by {gain:.3g})"
     )
     return replace(second, notes=(note, *second.notes))
+
+
+def _as_interrupted(solution: Solution) -> Solution:
+    """Return a copy of a solution whose further search was interrupted before an iterate."""
+    return replace(
+        solution,
+        status=Status.INTERRUPTED,
+        message=Status.INTERRUPTED.sentence,
+    )
 
 
 def solve_with_renewed_correspondences(

@@ -160,12 +160,13 @@ TOPICS: Mapping[str, Topic] = {
             "specimen-unit": "its stresses fit if multiplied by {factor:g}: the unit of the column "
             "is probably {unit}",
             "wrench-sign": "it fits with the opposite sign: it is the force of the body on the "
-            "grasp instead of that of the grasp on the body; change its sign",
+            "grasp instead of that of the grasp on the body; set sign = -1 in the table of the "
+            "wrench",
             "wrench-sign/part": "its {what} fit with the opposite sign, the other components do "
             "not: change the sign of these columns",
             "wrench-axes": "its axes are exchanged or reversed: it fits with ({axes}) in place "
-            "of (x, y, z), both forces and torques; reorder the columns, or rotate the sensor's "
-            "axes",
+            "of (x, y, z), both forces and torques; reorder the columns, rotate the sensor's axes, or "
+            "for a log state sensor_frame in the table of the wrench",
             "wrench-gain": "its {what} fit if multiplied by {factor:.3g}: check the calibration of "
             "the sensor, and the density or mass of the body",
             "wrench-point": "its torques refer to a point {by_mm:.3g} mm away from point_m: they "
@@ -174,6 +175,11 @@ TOPICS: Mapping[str, Topic] = {
             "wrench-unit": "its {what} seem to be in {unit}: multiply by {factor:g}",
             "wrench-clock": "it was measured about {by_ms:.3g} ms {when} than its times t_s "
             "state: its clock differs from that of the poses",
+            "wrench-offset": "most of its deviation from the simulation at the guess{after} is an "
+            "offset, in {component} {offset} ({deviations:.3g} standard deviations of its noise): zero the "
+            "sensor before the grasp or subtract a reading without the body; or state "
+            "nuisance.tare = {{ prior_sigmas = {prior} }}, and nuisance.tool if a gripper hangs "
+            "between sensor and body",
             "camera": "only {percent:.0f} % of the body's visible surface have measured points "
             "within {within_mm:.3g} mm: check camera.pose (camera frame: x to the right, y down, "
             "z forward) and the unit of the depth; check draws a picture of both",

@@ -42,7 +42,7 @@ from collocation_sysid.cli import (
     common,
 )
 from collocation_sysid.common.console import PlainConsole
-from collocation_sysid.methods.solution import Iteration
+from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.problem.problem_reading import read_problem_file
 from collocation_sysid.problem.schema import AssumptionsSection, ProblemFile
 from collocation_sysid.recording import read_markers, read_poses
@@ -442,6 +442,37 @@ def test_an_interruption_before_the_first_iterate_writes_nothing(
     before = contents(tiny)
     assert run_command("solve", "problem.toml", "--out", "run").code == 130
     assert contents(tiny) == before
+
+
+def test_an_interruption_of_the_scan_is_told(tiny, monkeypatch):
+    def interrupt(*_: object, **__: object) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(solving, "start_problem", interrupt)
+    before = contents(tiny)
+    outcome = run_command("solve", "problem.toml", "--out", "run")
+    assert outcome.code == 130
+    assert (
+        "interrupted: the search had no iterate yet; nothing was written to run"
+        in outcome.err
+    )
+    assert contents(tiny) == before
+
+
+def test_a_failed_search_survives_an_interrupt_of_the_scan_that_follows(
+    tiny, monkeypatch
+):
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(solving, "rescue", interrupt)
+    monkeypatch.setattr(solving, "FAILED_STATUSES", {*Status})
+    outcome = run_command("solve", "problem.toml", "--out", "run")
+    assert outcome.code == 130
+    assert "Interrupted" in outcome.out
+    result = result_in(tiny / "run")
+    assert result["status"] == "interrupted"
+    assert result["history"]
 
 
 def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):

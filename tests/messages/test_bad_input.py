@@ -264,7 +264,7 @@ OBJECT = [
         options=settings("object.surface=a.stl", "object.edge_length_m=0.02"),
     ),
     bad(
-        "surface-without-edge-length", "object", "edge_length_m is used only with surface",
+        "surface-without-edge-length", "object", "edge_length_m is missing",
         edit=replace_text('mesh = "body.vtu"', 'surface = "a.stl"'),
     ),
     bad(

@@ -34,11 +34,13 @@ from collocation_sysid import (
 from collocation_sysid.fem.meshes.selection import Box
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.stiffness_scan import (
+    CLEARLY_BETTER,
     ScanState,
     TrialSimulation,
     scan_stiffness,
     start_problem,
     typical_parameters,
+    without_guesses,
 )
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
@@ -371,6 +373,8 @@ def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
     assert found.sentence.startswith(
         "at the guess, the simulation is farther from the measurements"
     )
+    assert "standard deviations at the guess" in found.sentence
+    assert "which replace all guesses" in found.sentence
     assert collocation.parameters.guesses["mu_pa"] == pytest.approx(
         found.young_pa[found.best] / 2.6
     )
@@ -383,6 +387,34 @@ def test_a_better_guess_than_the_scans_best_stays(monkeypatch):
     )
     collocation = cube(guessed(**{**TRUTH, "mu_pa": 301.0})).collocation()
     assert start_problem(collocation)[0] is collocation
+
+
+def test_a_guess_is_kept_if_the_scan_fits_hardly_better(monkeypatch):
+    """As where a tare, which is not estimated in a scan, makes most of the misfit."""
+    monkeypatch.setattr(
+        "collocation_sysid.methods.stiffness_scan.TrialSimulation.rigid_misfit",
+        0.0,
+    )
+    problem = cube(guessed(mu_pa=600.0))
+    (experiment,) = problem.experiments
+    markers = experiment.markers
+    moved = replace(
+        markers,
+        positions_m=markers.positions_m
+        + np.random.default_rng(1).normal(
+            scale=0.3, size=markers.positions_m.shape
+        ),
+    )
+    blurred = replace(
+        problem, experiments=[replace(experiment, markers=moved)]
+    ).collocation()
+    trial = TrialSimulation(blurred)
+    misfit, failure = trial.evaluate_guess(False)
+    result = scan_stiffness(without_guesses(blurred))
+    assert failure is None
+    # The scan is better, but hardly.
+    assert 1.0 < misfit / result.misfit[result.best] < CLEARLY_BETTER
+    assert start_problem(blurred) == (blurred, None)
 
 
 def too_soft() -> dict[str, Unknown | float]:

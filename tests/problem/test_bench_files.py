@@ -743,7 +743,7 @@ def test_a_machines_own_file_takes_the_examples_place(tmp_path, monkeypatch):
         ),
         (
             "mass_kg = 1.0",
-            "edge_length_m is used only with surface, cylinder or box_m",
+            "edge_length_m is missing; expected the length",
         ),
         (
             'edge_length_m = 0.01\nmesh = "a.vtu"',

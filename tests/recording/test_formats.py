@@ -187,9 +187,9 @@ def test_missing_samples_are_counted(file, name, lost):
             f"Tip 1 and base: each 1 of 4 samples missing ({lost[0]})",
         )
     else:
-        assert table.notes == tuple(
-            f"{marker}: 1 of 4 samples missing ({kind})"
-            for marker, kind in zip(("Tip 1", "base"), lost, strict=True)
+        assert table.notes == (
+            f"Tip 1: 1 of 4 samples missing ({lost[0]}); "
+            f"base: 1 of 4 samples missing ({lost[1]})",
         )
 
 
@@ -584,7 +584,7 @@ def test_c3d_is_read_with_its_unit_rate_and_gaps(tmp_path):
     np.testing.assert_allclose(table.t_s, [0.0, 0.01, 0.02, 0.03])
     np.testing.assert_allclose(table.positions_m, TRACKS_M, rtol=1e-6)
     assert table.notes == (
-        "Tip 1: 1 of 4 samples missing (1 blank)",
+        "Tip 1: 1 of 4 samples missing (1 blank); "
         "base: 1 of 4 samples missing (1 zeros)",
     )
 

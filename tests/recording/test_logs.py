@@ -26,6 +26,7 @@ from kit.logs import (
     recorded,
 )
 from kit.problem_files import run_command, write_problem
+from kit.robot_log import POSES, robot_problem
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -269,6 +270,25 @@ def test_topics_offer_the_chains_of_frames_that_can_be_read(
     )
 
 
+def test_topics_offer_chains_from_the_frame_of_the_markers(
+    tmp_path: Path,
+) -> None:
+    robot_problem(tmp_path)
+    log = tmp_path / "trial"
+    addresses = {each.name: each for each in list_topics(log)}["/tf"].write
+    assert addresses == (
+        "trial#/tf#base_link>gripper",
+        "trial#/tf#base_link>sensor",
+        "trial#/tf#base_link>tool0",
+        "trial#/tf#mocap>gripper",
+        "trial#/tf#mocap>sensor",
+        "trial#/tf#mocap>tool0",
+    )
+    assert POSES in addresses
+    for address in addresses:  # each can be read as it is written
+        assert len(read_poses(tmp_path / address).t_s) == 13
+
+
 def test_addresses_of_topics_are_lines_that_can_be_copied(
     tmp_path: Path, monkeypatch
 ) -> None:
@@ -374,8 +394,10 @@ def test_points_of_several_topics_are_one_set_of_markers(
     np.testing.assert_allclose(base[[0, 1, 3], 1], [0, 0.5, 1.5])
     # The median interval is 0.375 s: 0.5 s is no gap.
     np.testing.assert_allclose(base[2], [0, 1.0, 0])
+    together = "run.mcap#/mocap/tip/point,/mocap/base/point"
     for topic in list_topics(log):
-        assert topic.write[-1] == "run.mcap#/mocap/tip/point,/mocap/base/point"
+        assert topic.write[-1] == together
+    assert run_command("log", log).out.count(together) == 1
 
 
 def test_a_point_is_missing_where_its_topic_has_a_gap_or_has_ended(

@@ -562,7 +562,7 @@ def test_the_findings_fit_a_screen_with_the_warnings_last(
     lines = [
         line.rstrip() for line in screen.getvalue().rstrip("\n").split("\n")
     ]
-    assert len(lines) <= 40
+    assert len(lines) <= 41
     assert max(map(len, lines)) <= 80
     heads = [
         line.split()[0] for line in lines if line and not line.startswith(" ")

@@ -99,8 +99,12 @@ def list_topics(path: str | Path) -> list[LogTopic]:
         If the path is no log, the log is damaged, or a package that reads it is missing.
     """
     with open_log(Path(path), episode=0) as log:
+        marker_frames = _marker_frames(log)
         topics = [
-            _describe_topic(log, Path(path), name=name) for name in log.topics
+            _describe_topic(
+                log, Path(path), name=name, marker_frames=marker_frames
+            )
+            for name in log.topics
         ]
         points = [
             each.name
@@ -140,7 +144,7 @@ def topic_as_csv(address: TopicAddress) -> bytes:
             raise InputError(
                 f"the topic {address.topic} contains {kind}; expected a topic with numbers"
             )
-        if _is_transforms(messages[0][1]):
+        if is_transforms(messages[0][1]):
             return csv_content(
                 POSE,
                 *_poses_through_frames(
@@ -173,7 +177,28 @@ def topic_as_csv(address: TopicAddress) -> bytes:
     return csv_content(columns, times, values=values)
 
 
-def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
+def _marker_frames(log: Log) -> list[str]:
+    """Return the frames in which topics with points are stated, each once, by the first message of
+    each topic.
+    """
+    frames = []
+    for name in log.topics:
+        for _, message in islice(log.messages(name), 1):
+            is_other = is_transforms(message) or depth_kind(message)
+            frame = nested_field(message, "header.frame_id")
+            if (
+                frame
+                and not is_other
+                and _pose_of_message(message) is None
+                and _points_of_message(message, by_namespace=False)
+            ):
+                frames.append(str(frame).lstrip("/"))
+    return list(dict.fromkeys(frames))
+
+
+def _describe_topic(
+    log: Log, path: Path, name: str, marker_frames: Iterable[str]
+) -> LogTopic:
     """Return the description of a topic from its first messages: type, number of messages, rate,
     possible uses and the addresses to write for them.
 
@@ -184,6 +209,8 @@ def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
         Path of the log.
     name : str
         Name of the topic.
+    marker_frames : iterable of str
+        Frames of markers, from which chains of frames begin too.
     """
     kind, count = log.topics[name]
     first = list(islice(log.messages(name), _FIRST))
@@ -191,10 +218,10 @@ def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
     rate = 1e9 * (len(first) - 1) / span if span > 0 else None
     serves = ""
     write = [f"{path.name}#{name}"]
-    if first and _is_transforms(first[0][1]):
-        chains = moving_chains(
-            _all_transforms(log, log.messages(name), topic=name)
-        )
+    if first and is_transforms(first[0][1]):
+        edges = _all_transforms(log, log.messages(name), topic=name)
+        chains = moving_chains(edges)
+        chains += chains_from(edges, marker_frames, chains=chains)
         serves = (
             "poses of one frame relative to another"
             if chains
@@ -294,7 +321,7 @@ def measurement_time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
     start_ns : int
         Time at which the first message of the log was recorded [ns].
     """
-    first = next(iter(_first_list(message)), None)
+    first = next(iter(first_list(message)), None)
     stamps = (
         nested_field(message, "header.stamp"),
         nested_field(message, "timestamp"),
@@ -393,7 +420,7 @@ def _points_of_message(
     """
     if (one := point_of_message(message)) is not None:
         return {nested_field(message, "header.frame_id") or "point": one}
-    items = enumerate(_first_list(message))
+    items = enumerate(first_list(message))
     places = {
         _item_name(item, k, by_namespace=by_namespace): _position_of_item(item)
         for k, item in items
@@ -407,7 +434,7 @@ def point_of_message(message: Any) -> tuple[float, ...] | None:
     return _vector(one) if _is_vector(one) else None
 
 
-def _first_list(message: Any) -> Any:
+def first_list(message: Any) -> Any:
     """Return the first list of `_LISTS` in a message that is not empty; empty if there is none."""
     lists = (nested_field(message, name) for name in _LISTS)
     return next((each for each in lists if each is not None and len(each)), ())
@@ -451,7 +478,7 @@ def has_namespaces(messages: Iterable[Any]) -> bool:
             {
                 nested_field(item, "ns")
                 for each in messages
-                for item in _first_list(each)
+                for item in first_list(each)
             }
             - {None, ""}
         )
@@ -481,17 +508,17 @@ def _vector(value: Any) -> tuple[float, ...]:
 # Frames and joints --------------------------------------------------------------------------------
 
 
-def _is_transforms(message: Any) -> bool:
+def is_transforms(message: Any) -> bool:
     """Return whether a message places frames in others: it has a list of transforms, or is a
     transform itself.
     """
     return (
         nested_field(message, "transforms") is not None
-        or _transform_frames(message) is not None
+        or transform_frames(message) is not None
     )
 
 
-def _transform_frames(transform: Any) -> tuple[str, str] | None:
+def transform_frames(transform: Any) -> tuple[str, str] | None:
     """Return the parent and the child frame of a transform, without a leading slash; None if the
     message is no transform. Odometry, which has a twist, is none.
     """
@@ -508,7 +535,7 @@ def _transform_frames(transform: Any) -> tuple[str, str] | None:
     return (parent.lstrip("/"), child.lstrip("/")) if is_one else None
 
 
-def _poses_of_transforms(
+def poses_of_transforms(
     messages: Iterable[tuple[int, Any]], start_ns: int
 ) -> Edges:
     """Return poses of child frames in their parents, by (parent, child) and time [s], from messages
@@ -521,7 +548,7 @@ def _poses_of_transforms(
         for each in nested_field(message, "transforms") or [message]:
             pose = _pose_of_message(each)
             if (
-                edge := _transform_frames(each)
+                edge := transform_frames(each)
             ) is not None and pose is not None:
                 edges.setdefault(edge, {}).setdefault(
                     measurement_time_s(each, at_ns, start_ns=start_ns), pose
@@ -544,9 +571,9 @@ def _all_transforms(
     )
     fixed = {
         edge: {0.0: next(iter(of.values()))}
-        for edge, of in _poses_of_transforms(still, log.start_ns).items()
+        for edge, of in poses_of_transforms(still, log.start_ns).items()
     }
-    return fixed | _poses_of_transforms(moving, log.start_ns)
+    return fixed | poses_of_transforms(moving, log.start_ns)
 
 
 def moving_chains(edges: Edges) -> list[tuple[str, str]]:
@@ -568,6 +595,36 @@ def moving_chains(edges: Edges) -> list[tuple[str, str]]:
             chains.append((chain[-1], frame))
     carrying = set(above.values())
     return sorted(chains, key=lambda chain: chain[1] in carrying)
+
+
+def chains_from(
+    edges: Edges, frames: Iterable[str], chains: Iterable[tuple[str, str]]
+) -> list[tuple[str, str]]:
+    """Return pairs of each of some frames and each frame that moves in it, apart from `chains`.
+
+    Parameters
+    ----------
+    edges : Edges
+    frames : iterable of str
+        Frames at which chains begin; those without a transform are ignored.
+    chains : iterable of (str, str)
+        Pairs of a root frame and a frame that moves in it, see `moving_chains`.
+    """
+    known = list(chains)
+    connected = {name for edge in edges for name in edge}
+    found = []
+    for frame in frames:
+        for _, child in known:
+            pair = frame, child
+            if frame not in connected or frame == child or pair in known:
+                continue
+            try:
+                path = frame_path(edges, frame, child=child)
+            except InputError:  # not connected
+                continue
+            if any(len(edges[edge]) > 1 for edge in path):
+                found.append(pair)
+    return found
 
 
 def _poses_through_frames(
@@ -603,8 +660,8 @@ def _poses_through_frames(
         TemporalTransformManager as Manager,
     )
 
-    parent, child = _requested_frames(edges, address)
-    path = _frame_path(edges, parent, child=child)
+    parent, child = requested_frames(edges, address)
+    path = frame_path(edges, parent, child=child)
     moving = [
         np.array(sorted(edges[edge])) for edge in path if len(edges[edge]) > 1
     ]
@@ -634,7 +691,7 @@ def _poses_through_frames(
     return times, pqs_from_transforms(matrices)[:, [0, 1, 2, 4, 5, 6, 3]]
 
 
-def _requested_frames(
+def requested_frames(
     edges: Mapping[tuple[str, str], Any], address: TopicAddress
 ) -> tuple[str, str]:
     """Return the parent and the child frame that an address states; without a statement, those of
@@ -661,7 +718,7 @@ def _requested_frames(
     return address.frames
 
 
-def _frame_path(
+def frame_path(
     edges: Mapping[tuple[str, str], Any], parent: str, child: str
 ) -> list[tuple[str, str]]:
     """Return the edges (parent, child) on the path from one frame through the common ancestor to

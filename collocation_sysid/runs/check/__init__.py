@@ -321,6 +321,7 @@ def check_problem(
         is_full=full,
         fit_s=partial(_fit_to_markers_s, collocation, total_s),
         report_progress=report_progress,
+        is_simulated=not start_notes,
     )
     # In reverse order, because comparisons that need a fit are made only if no other is likely.
     for feature in reversed(FEATURES):

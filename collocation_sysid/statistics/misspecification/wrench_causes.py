@@ -122,11 +122,28 @@ def wrench_causes(solution: Solution) -> list[Hypothesis]:
     )
 
 
-def wrench_mistakes(collocation: Collocation) -> list[Hypothesis]:
+@dataclass(frozen=True, eq=False)
+class WrenchComparison:
+    """Comparison of wrenches with their prediction from the markers.
+
+    Attributes
+    ----------
+    hypotheses : list of Hypothesis
+        Likely mistakes.
+    predicted : list of str
+        Names of the experiments whose markers the fit explains; only these were compared.
+    """
+
+    hypotheses: list[Hypothesis]
+    predicted: list[str]
+
+
+def wrench_mistakes(collocation: Collocation) -> WrenchComparison:
     """Return hypotheses about wrongly described wrenches before any solve.
 
     The first samples of the experiments with markers and wrenches are fitted to their markers
-    alone. Empty where that fit does not explain the markers. The collocation is not modified.
+    alone. Experiments whose markers that fit does not explain are not compared. The collocation is
+    not modified.
     """
     with_both = [
         s
@@ -135,14 +152,18 @@ def wrench_mistakes(collocation: Collocation) -> list[Hypothesis]:
     ]
     shorter = [first_samples(s.experiment, CHECKED_SAMPLES) for s in with_both]
     if not shorter:
-        return []
+        return WrenchComparison([], [])
     beginning = replace(collocation, experiments=shorter)
     method = ReducedSpace(
         max_iterations=CHECKED_SWEEPS, tolerance=CHECKED_TOLERANCE
     )
     parts = _from_markers(beginning, beginning.transcriptions, method=method)
-    return _of_parts(
-        [part for part in parts if _markers_misfit(part) < MARKERS_MISFIT]
+    explained = [
+        part for part in parts if _markers_misfit(part) < MARKERS_MISFIT
+    ]
+    return WrenchComparison(
+        _of_parts(explained),
+        [part.segment.experiment.name for part in explained],
     )
 
 

@@ -1,0 +1,384 @@
+"""Coordinate frames of an experiment whose files are topics of logs.
+
+The world of an experiment is the frame of its poses. The log's static transforms relate it to the
+frames of gravity, of the markers and of wrench sensors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..common.array_types import Array
+from ..errors import InputError, hint_at, located
+from ..recording.checked_arrays import point_text
+from ..recording.experiment import EARTH_M_S2
+from ..recording.formats.log_frames import (
+    LogFrames,
+    TopicFrames,
+    topic_frames,
+)
+from ..recording.formats.logs import TopicAddress
+from ..recording.measured_wrench import Frame
+from .recording_schema import ExperimentSection, WrenchSection
+
+# Names of frames that are level by convention, or their endings; the first are more reliable.
+LEVEL_FRAMES = ("world", "map", "odom", "base_link", "base", "base_footprint")
+# Rotation of a sensor [degrees], and distance of its point [m], that contradict the stated ones.
+LARGEST_ROTATION_DEG = 1.0
+LARGEST_OFFSET_M = 0.005
+# Tilt of a frame against a level one from which on it is reported [degrees]: the prior of gravity.
+SMALLEST_TILT_DEG = 1.0
+
+
+@dataclass(frozen=True)
+class SensorMounting:
+    """Pose of a wrench sensor, from the transforms of a log.
+
+    Attributes
+    ----------
+    sensor : str
+        Name of the sensor's frame.
+    frame : {"grasp", "world"}
+        Frame in which the sensor is fixed: that of the undeformed body as the grasp carries it, or
+        the world.
+    pose : (4, 4) array
+        Pose of the sensor in that frame.
+    """
+
+    sensor: str
+    frame: Frame
+    pose: Array
+
+    @property
+    def point_m(self) -> Array:
+        """Origin (3,) of the sensor in `frame` [m]."""
+        return self.pose[:3, 3]
+
+    @property
+    def angle_deg(self) -> float:
+        """Angle between the axes of the sensor and those of `frame` [degrees]."""
+        rotation = Rotation.from_matrix(self.pose[:3, :3])
+        return float(np.degrees(rotation.magnitude()))
+
+    def rotate(self, values: Array) -> Array:
+        """Return wrenches (S, 6) in the sensor's axes, expressed in the axes of `frame`; NaN if any
+        component of the force, or of the torque, is missing.
+        """
+        rows = values.reshape(-1, 2, 3) @ self.pose[:3, :3].T
+        return rows.reshape(-1, 6)
+
+    def describe(self) -> str:
+        """Return a sentence about what was done with the wrench."""
+        owner = "the body" if self.frame == "grasp" else "the world"
+        return (
+            f"the wrench is measured in {self.sensor!r}: by the static transforms of the log its "
+            f"components are rotated by {self.angle_deg:.3g}° to the axes of {owner}, and its "
+            f"torques are about the point {point_text(self.point_m)} m "
+            f"{'of the undeformed body' if self.frame == 'grasp' else 'in the world'}; other "
+            "axes are stated by frame and point_m"
+        )
+
+    def contradicts(self, section: WrenchSection) -> bool:
+        """Whether a table states the same frame, but other axes or another point, see
+        `LARGEST_ROTATION_DEG` and `LARGEST_OFFSET_M`.
+        """
+        offset_m = np.linalg.norm(self.point_m - np.array(section.point_m))
+        return section.frame == self.frame and bool(
+            self.angle_deg > LARGEST_ROTATION_DEG or offset_m > LARGEST_OFFSET_M
+        )
+
+
+@dataclass
+class RecordingFrames:
+    """Frames in which the recordings of one experiment are stated, as far as logs name them.
+
+    Attributes
+    ----------
+    section : ExperimentSection
+        Table of the experiment.
+    folder : Path
+        Folder that contains the files.
+    """
+
+    section: ExperimentSection
+    folder: Path
+
+    @cached_property
+    def poses(self) -> list[TopicFrames | None]:
+        """Frames of the poses of each grasp, then of each obstacle; None where they are not a topic
+        of a log.
+        """
+        return [
+            topic_frames(self.folder / each.poses) if each.poses else None
+            for each in self.section.moved_sections
+        ]
+
+    @cached_property
+    def markers(self) -> str:
+        """Name of the frame of the markers; empty if no log states it, and if a template moves them
+        to another frame.
+        """
+        markers = self.section.markers
+        if not markers.file or markers.template_m is not None:
+            return ""
+        frames = topic_frames(self.folder / markers.file)
+        return frames.parent if frames is not None else ""
+
+    @cached_property
+    def world(self) -> str:
+        """Name of the frame of the first poses from a log, else of the markers; empty if no log
+        states it.
+        """
+        named = [each.parent for each in self.poses if each and each.parent]
+        return named[0] if named else self.markers
+
+    @cached_property
+    def transforms(self) -> LogFrames | None:
+        """Transforms of the log of the first poses, else of the markers or of a wrench; None if all
+        are files.
+        """
+        section = self.section
+        names = [
+            *(each.poses for each in section.moved_sections),
+            section.markers.file,
+            *(section.file_of(each.wrench) for each in section.moved_sections),
+        ]
+        for name in filter(None, names):
+            if (address := TopicAddress.from_path(self.folder / name)) is None:
+                continue
+            with located(name):
+                return LogFrames.read(address)
+        return None
+
+    # Gravity --------------------------------------------------------------------------------------
+
+    def gravity_m_s2(self) -> Array:
+        """Return gravity (3,) [m/s²] in the axes of the world: as stated, or rotated from
+        `gravity_frame` by the log's static transforms.
+
+        Raises
+        ------
+        InputError
+            At "gravity_frame", if it is not connected with the world by static transforms.
+        """
+        gravity = np.array(self.section.gravity_m_s2, dtype=float)
+        if (frame := self.section.gravity_frame) is None:
+            return gravity
+        with located(where="gravity_frame"):
+            rotation = self._require_static_transform(self.world, frame)[:3, :3]
+        rotated: Array = rotation @ gravity
+        return rotated
+
+    def _require_static_transform(self, parent: str, child: str) -> Array:
+        """Return the pose (4, 4) of a frame in another one from the log's static transforms.
+
+        Raises
+        ------
+        InputError
+            If there is no log, the log does not state the frame `parent` (empty), or the frames are
+            not connected by static transforms.
+        """
+        if self.transforms is None:
+            raise InputError(
+                f"found {child!r}, but poses and markers are not topics of a log, which would "
+                "state frames; expected no such key, and values in the axes of the poses"
+            )
+        if not parent:
+            raise InputError(
+                f"found {child!r}, but the log {self.transforms.name} does not state the frame of "
+                "poses or markers; expected no such key, and values in the axes of the poses"
+            )
+        matrix = self.transforms.static_transform(parent, child)
+        if matrix is not None:
+            return matrix
+        names = self.transforms.static_neighbours(parent)
+        if self.transforms.is_connected(parent, child):
+            fault = f"moves relative to {parent!r}"
+        else:
+            fault = f"is not connected by the log's transforms with {parent!r}"
+        known = ", ".join([parent, *names])
+        raise InputError(
+            f"found {child!r}, which {fault}; expected a frame that is fixed in it: {known}"
+            f"{hint_at(child, names)}"
+        )
+
+    def gravity_notes(self) -> list[str]:
+        """Return a note if gravity is along −z of the world by default, but the log tilts that
+        frame against one that is level by its name (`LEVEL_FRAMES`); else an empty list.
+        """
+        states_gravity = {"gravity_m_s2", "gravity_frame"} & (
+            self.section.model_fields_set
+        )
+        if states_gravity or not self.world or self.transforms is None:
+            return []
+        names = self.transforms.static_neighbours(self.world)
+        for name in sorted(names, key=_level_rank):
+            if _level_rank(name) >= _level_rank(self.world):
+                return []
+            matrix = self.transforms.static_transform(self.world, name)
+            assert matrix is not None
+            tilt_deg = float(
+                np.degrees(np.arccos(np.clip(matrix[2, 2], -1, 1)))
+            )
+            if tilt_deg > SMALLEST_TILT_DEG:
+                gravity = matrix[:3, :3] @ np.array(EARTH_M_S2)
+                vector = ", ".join(f"{value:.4g}" for value in gravity)
+                return [
+                    f"gravity is along −z of {self.world!r}, the frame of the recording, but the "
+                    f"log tilts this frame by {tilt_deg:.2g}° against {name!r}: if {name!r} is "
+                    f'level, state gravity_frame = "{name}", or gravity_m_s2 = [{vector}]; '
+                    f'if {self.world!r} is level, state gravity_frame = "{self.world}"'
+                ]
+            return []
+        return []
+
+    # Markers --------------------------------------------------------------------------------------
+
+    def markers_fault(self) -> str:
+        """Return a sentence about markers and poses in different frames, with the address of the
+        poses that resolves it; "" if logs state the same frame, or not both.
+
+        Frames that coincide by the log's static transforms are the same.
+        """
+        poses = [
+            (moved.poses, frames)
+            for moved, frames in zip(
+                self.section.moved_sections, self.poses, strict=True
+            )
+            if frames is not None and frames.parent
+        ]
+        if not self.markers:
+            return ""
+        for name, frames in poses:
+            if frames.parent == self.markers:
+                continue
+            file = self.section.markers.file
+            fault = (
+                f"the poses {name} are in the frame {frames.parent!r}, the markers {file} in "
+                f"{self.markers!r}; expected one frame"
+            )
+            if self.transforms is None:
+                return fault
+            pose = self.transforms.static_transform(frames.parent, self.markers)
+            if pose is not None and np.allclose(pose, np.eye(4)):
+                continue
+            chain = f"{frames.parent}>{frames.child}"
+            is_readable = str(name).endswith(chain) and (
+                self.transforms.is_connected(self.markers, frames.child)
+            )
+            if not is_readable:
+                return f"{fault}: convert the poses or the markers"
+            address = str(name).removesuffix(chain)
+            return (
+                f'{fault}: set poses = "{address}{self.markers}>{frames.child}"'
+            )
+        return ""
+
+    # Wrenches -------------------------------------------------------------------------------------
+
+    def sensor_mounting(
+        self, section: WrenchSection, key: str, k: int
+    ) -> SensorMounting | None:
+        """Return the pose of the wrench sensor of a grasp in the body, else in the world.
+
+        The sensor's frame is `sensor_frame`, else that of the log's messages. None if no frame is
+        known, or if none is stated and static transforms connect it neither with the frame whose
+        poses are recorded nor with the world.
+
+        Parameters
+        ----------
+        section : WrenchSection
+        key : str
+            Dotted key of the section, for messages.
+        k : int
+            Index of the grasp, or of the obstacle after the grasps.
+
+        Raises
+        ------
+        InputError
+            If `sensor_frame` is stated, and is not connected with either.
+        """
+        sensor = self._sensor_frame(section)
+        if not sensor or self.transforms is None:
+            if section.sensor_frame is not None:
+                with located(where=f"{key}.sensor_frame"):
+                    self._require_static_transform(self.world, sensor)
+            return None
+        frames = self.poses[k]
+        if frames is not None and frames.child:
+            pose = self.transforms.static_transform(frames.child, sensor)
+            if pose is not None:
+                transform = self.section.moved_sections[k].gripper_to_body
+                if transform is not None:
+                    pose = np.linalg.inv(transform.matrix) @ pose
+                return SensorMounting(sensor, "grasp", pose)
+        pose = (
+            self.transforms.static_transform(self.world, sensor)
+            if self.world
+            else None
+        )
+        if pose is not None:
+            return SensorMounting(sensor, "world", pose)
+        if section.sensor_frame is not None:
+            child = frames.child if frames is not None else ""
+            with located(where=f"{key}.sensor_frame"):
+                self._require_static_transform(child or self.world, sensor)
+        return None
+
+    def _sensor_frame(self, section: WrenchSection) -> str:
+        """Return the name of the frame of a wrench, stated or of its messages; empty if unknown."""
+        if section.sensor_frame is not None:
+            return section.sensor_frame
+        if (file := self.section.file_of(section)) is None:
+            return ""
+        frames = topic_frames(self.folder / file)
+        return frames.parent if frames is not None else ""
+
+    def sensor_note(
+        self, section: WrenchSection, mounting: SensorMounting | None
+    ) -> str:
+        """Return a note on the axes of a wrench: those that the log gives, or that the stated ones
+        contradict the log, or that the frame of the messages is not connected; else "".
+        """
+        file = self.section.file_of(section)
+        if mounting is None:
+            sensor = self._sensor_frame(section)
+            if not sensor or section.states_axes or sensor == self.world:
+                return ""
+            return (
+                f"{file}: the wrench is measured in {sensor!r}, which no static transform of the "
+                "log connects with the gripper or the poses: its components are taken along the "
+                "axes of the world; state sensor_frame, or frame and point_m"
+            )
+        if not section.states_axes:
+            moves = mounting.angle_deg or mounting.point_m.any()
+            is_usual = mounting.frame == "world" and not moves
+            return "" if is_usual else f"{file}: {mounting.describe()}"
+        if mounting.contradicts(section):
+            return (
+                f'{file}: frame = "{section.frame}" and point_m state axes and point, but by the '
+                f"static transforms of the log the sensor's frame {mounting.sensor!r} is rotated "
+                f"by {mounting.angle_deg:.3g}° against these axes, with its origin at "
+                f"{point_text(mounting.point_m)} m; omit frame and point_m to use the transforms"
+            )
+        return ""
+
+
+def _level_rank(name: str) -> int:
+    """Return the place of a frame in `LEVEL_FRAMES`, by its name without namespace and prefix; the
+    number of these if it has none of these names.
+    """
+    bare = name.rpartition("/")[2].lower()
+    return next(
+        (
+            rank
+            for rank, level in enumerate(LEVEL_FRAMES)
+            if bare == level or bare.endswith(f"_{level}")
+        ),
+        len(LEVEL_FRAMES),
+    )
