@@ -126,7 +126,7 @@ def solve(options: SolveCommand) -> None:
                 )
             except KeyboardInterrupt:
                 raise interruption_exit(
-                    f"the search had no iterate yet; nothing was written to {folder}",
+                    f"no result could be kept; nothing was written to {folder}",
                     continues=False,
                 ) from None
             until_shown.enter_context(INTERRUPTS.deferred())

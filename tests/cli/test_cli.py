@@ -453,7 +453,7 @@ def test_an_interruption_of_the_scan_is_told(tiny, monkeypatch):
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
     assert (
-        "interrupted: the search had no iterate yet; nothing was written to run"
+        "interrupted: no result could be kept; nothing was written to run"
         in outcome.err
     )
     assert contents(tiny) == before

@@ -20,6 +20,7 @@ from collocation_sysid.statistics.misspecification.misspecification_hypothesis i
 )
 from collocation_sysid.statistics.misspecification.wrench_at_guess import (
     WrenchDeviation,
+    has_inertial_wrenches,
     wrench_deviations,
 )
 
@@ -76,6 +77,18 @@ def test_a_mistake_is_named_without_a_fit(
     change: Callable[[Wrench], Wrench], expected: list[str]
 ) -> None:
     assert codes(deviation(change).hypotheses()) == expected
+
+
+def test_nothing_is_concluded_from_a_body_that_a_second_grasp_deforms() -> None:
+    wrong = deviation(lambda wrench: shift(reverse(wrench)))
+    assert not replace(wrong, is_inertial=False).hypotheses()
+    experiment = swung()
+    (grasp,) = experiment.grasps
+    assert has_inertial_wrenches(experiment)
+    free = np.setdiff1d(np.arange(len(experiment.body.nodes_m)), grasp.nodes)
+    second = replace(grasp, nodes=free[-3:], wrench=None)
+    pressed = replace(experiment, grasps=[grasp, second], markers=None)
+    assert not has_inertial_wrenches(pressed)
 
 
 def test_the_deviation_has_the_offset_of_the_sensor() -> None:

@@ -1,9 +1,10 @@
 """Comparison of measured wrenches with the simulation at the guess.
 
-Use this comparison where no fit to the markers predicts the wrenches. Weight and inertia of the
-body hardly depend on its stiffness, so that the simulation at the guess shows a wrong sign,
-exchanged axes and an offset. It does not show delays, points or frames, which a wrong stiffness
-imitates.
+Use this comparison where no fit to the markers predicts the wrenches. If one gripper swings the
+body, the wrench is its weight and inertia, which hardly depend on its stiffness, so that the
+simulation at the guess shows a wrong sign, exchanged axes and an offset. It does not show delays,
+points or frames, which a wrong stiffness imitates. Loads of a body that is deformed between grasps
+or obstacles are proportional to its stiffness, so that nothing is concluded from them.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...program.collocation import ExperimentIterate
+from ...recording.experiment import Experiment
 from ...recording.measured_wrench import COMPONENTS, UNITS
 from ..axes import OTHER_AXES
 from .misspecification_hypothesis import Hypothesis
@@ -49,6 +51,8 @@ class WrenchDeviation:
         Standard deviations of the components [N, N m].
     tare : float
         Standard deviation of each tare, in standard deviations of the noise.
+    is_inertial : bool
+        Whether the wrench is the weight and inertia of the body, see `has_inertial_wrenches`.
     """
 
     experiment: str
@@ -56,6 +60,7 @@ class WrenchDeviation:
     simulated: Array
     sigmas: Array
     tare: float
+    is_inertial: bool
 
     @property
     def subject(self) -> str:
@@ -96,9 +101,10 @@ class WrenchDeviation:
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return a wrong sign or exchanged axes, with which the variation of the wrench agrees, and
-        an offset that is the largest part of what remains; empty if the deviation is small.
+        an offset that is the largest part of what remains; empty if the deviation is small, or if
+        the wrench depends on the stiffness.
         """
-        if self.rms_sigmas < SMALLEST_MISFIT:
+        if self.rms_sigmas < SMALLEST_MISFIT or not self.is_inertial:
             return []
         hypotheses: list[Hypothesis] = []
         corrected = self.measured
@@ -212,9 +218,22 @@ def wrench_deviations(
                         simulated=simulated / wrench.sigmas,
                         sigmas=wrench.sigmas,
                         tare=segment.experiment.nuisance.tare or 0.0,
+                        is_inertial=has_inertial_wrenches(segment.experiment),
                     )
                 )
     return deviations
+
+
+def has_inertial_wrenches(experiment: Experiment) -> bool:
+    """Return whether the wrenches of an experiment are the weight and inertia of the body: one
+    gripper moves it, and neither other grasps, obstacles nor given loads act on it.
+    """
+    return (
+        not experiment.is_static
+        and len(experiment.grasps) == 1
+        and not experiment.forces
+        and not experiment.pressures
+    )
 
 
 def _column_means(values: Array) -> Array:
