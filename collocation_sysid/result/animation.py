@@ -229,11 +229,11 @@ def film_samples(t_s: Array, fps: float, slowdown: float) -> NDArray[np.int64]:
     Parameters
     ----------
     t_s : (T,)
-        Times of the samples [s].
+        Times of the samples [s], ascending, at least one.
     fps : float
-        Frames per second.
+        Frames per second, above zero.
     slowdown : float
-        How many times slower than the recording the film is.
+        How many times slower than the recording the film is; above zero.
 
     Raises
     ------
@@ -435,13 +435,13 @@ class FilmFigure:
         height_mm: float,
         figure_height_mm: float,
     ) -> Line2D:
-        """Draw the panel of marker errors over time, and return the vertical line that marks the
-        current time.
+        """Draw the panel of marker errors over time, since the first sample, and return the
+        vertical line that marks the current time.
 
         Parameters
         ----------
         trajectories : sequence of (str, (T, M, 3))
-            Label and marker positions [m] of each trajectory.
+            Label and marker positions [m] of each trajectory, one or two.
         left_mm, height_mm, figure_height_mm : float
             Left edge of the panel, height of the body's picture, and height of the figure [mm].
         """

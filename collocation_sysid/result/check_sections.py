@@ -87,8 +87,10 @@ def _check_verdict(findings: CheckResult) -> Line:
 
 
 def _point_masses(body: BodyCheck) -> str:
-    """Return the point masses of a body's experiments as text after its own mass; empty if there
-    are none.
+    """Return the point masses of a body's experiments as text [g] to follow the body's own mass.
+
+    If all experiments have the same mass, the text also has the total; otherwise it names the
+    experiment of each. Empty if there are no point masses.
     """
     masses = body.point_masses_kg
     if not masses:

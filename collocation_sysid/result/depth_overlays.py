@@ -146,7 +146,8 @@ class DepthProjection:
     def point_rows(
         self, sample: int, points_m: Array, rays: Array, distances_m: Array
     ) -> Array:
-        """Return rows (P, 8) of `MotionRecord.visible_points` for the points of one sample.
+        """Return the rows (P, 8) of `MotionRecord.visible_points` for all P given points of one
+        sample.
 
         Parameters
         ----------
@@ -155,7 +156,8 @@ class DepthProjection:
         points_m, rays : (P, 3)
             Points [m] and viewing directions in the camera's frame.
         distances_m : (P,)
-            Distance behind the surface [m]; NaN for points that do not count.
+            Distance behind the surface [m]; NaN for points that do not count, whose rows are
+            returned, too.
         """
         world = self.view.to_world(self.phi, points_m, rays=rays, image=sample)
         t_s = np.full(len(points_m), self.view.depth.sample_times_s[sample])
@@ -185,7 +187,12 @@ class DepthProjection:
 
 
 def surface_rows(surface: SurfaceComparison, up: Array) -> Array:
-    """Return the points of all depth images with their distance from a fitted or simulated surface.
+    """Return the points of the images of a depth camera with their distances from a fitted or
+    simulated surface.
+
+    Only points within the gate of the correspondences are contained, those of images without any
+    compared point are left out. Points within the gate that are not compared, such as grazing ones,
+    have the distance NaN.
 
     Parameters
     ----------
@@ -197,8 +204,9 @@ def surface_rows(surface: SurfaceComparison, up: Array) -> Array:
     Returns
     -------
     (k, 8) array
-        Rows of `MotionRecord.visible_points`, with outlines for at most `MAX_OUTLINED_SAMPLES`
-        samples; no rows if no point of any sample is compared.
+        Rows of `MotionRecord.visible_points`: the points of all images, then the outlines of the
+        surface in at most `MAX_OUTLINED_SAMPLES` evenly chosen ones of these images; no rows if no
+        point of any image is compared.
     """
     correspondences = surface.correspondences
     shapes_m = surface.shapes_m

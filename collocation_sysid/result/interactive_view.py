@@ -300,7 +300,14 @@ class _FrameWindow:
         )
 
     def _field_values(self, mesh: Any) -> np.ndarray:
-        """Return the field of a mesh (n,) or (E,); of vectors their norms."""
+        """Return the field of this window on a mesh, (n,) for point data or (E,) for cell data; of
+        vectors their norms. `KeyError` if the mesh has no such field.
+
+        Parameters
+        ----------
+        mesh : pyvista mesh
+            Mesh of one frame.
+        """
         values = np.asarray(mesh[self.field])
         return np.linalg.norm(values, axis=1) if values.ndim == 2 else values
 

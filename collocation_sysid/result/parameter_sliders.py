@@ -75,7 +75,8 @@ class SliderRange:
 
         It reaches three half widths of the combined interval to either side (on a logarithmic scale
         unless `linear` or the value is not positive), at least a factor of 1.5 or half of the
-        value, and not beyond the bounds. Without an interval the least range is used.
+        value, and not beyond the bounds. Without an interval the least range is used, from −1 to 1
+        for an estimate of zero. An estimate beyond a bound is moved to the bound.
 
         Parameters
         ----------
@@ -312,8 +313,10 @@ class ParameterSliders:
         return "; ".join(texts) or "no measurement to compare with"
 
     def _figure(self, simulation: ForwardSimulation) -> Figure:
-        """Return the picture of the first kind of measurements that the recording has: markers, a
-        wrench, a custom sensor; without these, the picture of the shapes.
+        """Return the picture of the first kind of measurements that the recording has: all markers,
+        the first wrench, or the first custom sensor; without these, the picture of the shapes.
+
+        Wrenches are those on the complete specimen.
         """
         from .pictures.over_time import marker_tracks, sensor_picture
 
@@ -396,9 +399,10 @@ def _slider(widgets: Any, name: str, values: SliderRange) -> Any:
 
 
 def _sensor_columns(t_s: Array, measured: Array, simulated: Array) -> Array:
-    """Return the columns of `sensor_picture`, without a fit.
+    """Return the columns (S, 1 + 3 m) of `sensor_picture`: time, and m values as measured, fitted
+    and simulated; the fitted ones are NaN.
 
-    `t_s` is (S,), `measured` and `simulated` are (S, m).
+    `t_s` is (S,) [s]; `measured` and `simulated` are (S, m), NaN where missing.
     """
     return np.column_stack(
         [t_s, measured, np.full_like(measured, np.nan), simulated]

@@ -138,15 +138,16 @@ def _shown_estimates(result: Result) -> list[str]:
 
 
 def _change_with_ratios(move: EstimateChange | None, value: float) -> str:
-    """Return the change of an estimate with its ratios to the half widths of the statistical and of
-    the combined interval, of which unknown ones are left out; "–" for None.
+    """Return the change of an estimate in percent of its value, with its signed ratios to the half
+    widths of the statistical and of the combined interval in parentheses, of which unknown ones are
+    left out; "–" for None.
 
     Parameters
     ----------
     move : EstimateChange or None
         Change of the estimate in a refit; None if the refit does not have it.
     value : float
-        The estimate itself.
+        The estimate itself; if it is zero, the change is in its unit instead of percent.
     """
     if move is None:
         return "–"

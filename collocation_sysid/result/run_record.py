@@ -147,7 +147,7 @@ def write_pictures(
     say: Callable[[str], None],
 ) -> None:
     """Draw all pictures of a run, including the Jacobian's structure, and write them into its
-    folder; existing ones are replaced.
+    folder as PNG files; existing ones are replaced.
 
     Parameters
     ----------
@@ -156,9 +156,10 @@ def write_pictures(
     result : Result
         Content of its ``result.json``.
     folder : Path
-        The run folder.
+        The run folder, which is made if missing.
     say : callable
-        Called with a sentence about what is being drawn.
+        Called with a sentence about what is being drawn, at the beginning and before each picture
+        is written.
 
     Raises
     ------

@@ -188,8 +188,12 @@ def _estimates_at_optimum(
     """Return the estimates of parameters and derived moduli, without coefficients of fields, before
     the correction of the discretisation error, by name.
 
-    `parameters` are those of the problem; they state which are estimated
-    as values instead of logarithms.
+    Parameters
+    ----------
+    result : Result
+        Content of ``result.json``; not modified.
+    parameters : Parameters
+        Parameters of the problem, which state what is estimated as a value instead of a logarithm.
     """
     return {
         name: each.at_optimum(name, linear=name in parameters.linear_names)
@@ -204,18 +208,20 @@ def _corrected_estimate(
     error: DiscretisationError,
     parameters: Parameters,
 ) -> ReportedEstimate:
-    """Return an estimate corrected for its measured discretisation error.
+    """Return an estimate corrected for its measured discretisation error: value, statistical and
+    combined interval with their standard errors change, everything else stays as before.
 
     Parameters
     ----------
     name : str
         Name of the estimate.
     before : ReportedEstimate
-        The estimate in the result, of which systematic effects are kept.
+        The estimate in the result, whose systematic effects and known effect enter the combined
+        interval; not modified.
     optimum : Estimate
         The estimate at the optimum, before any correction.
     error : DiscretisationError
-        The measured discretisation error.
+        The measured discretisation error, which is stored in the estimate.
     parameters : Parameters
         Parameters with their coordinates and bounds.
     """

@@ -206,8 +206,8 @@ def run_report(run: str | Path) -> TitledParts:
 
 
 def _outcome_section(result: Result) -> TitledParts:
-    """Return how the solve ended, with the largest violations of the equations of motion if it
-    failed.
+    """Return the message with which the solve ended, in the colour of the verdict, followed by the
+    largest violations of the equations of motion if it did not converge; the title is empty.
     """
     parts: list[Shown] = [Line(result.message, result.trust.verdict)]
     if not result.converged:
@@ -460,8 +460,12 @@ def _deviation_text(deviation: float | None) -> str:
 
 
 def refinement_table(result: Result) -> Table | Line:
-    """Return the table of measured discretisation errors, with corrected values and combined
-    intervals; a sentence if no estimate changed.
+    """Return the table of measured discretisation errors, a line for each estimate that has one:
+    the errors of step and mesh with their observed orders, the corrected value and the combined
+    interval.
+
+    Unknown numbers are empty. If no estimate has such an error, a sentence is returned that no
+    estimate changed; the result must therefore be that of a refinement.
     """
     if not result.numerical_errors:
         return Line(
@@ -502,8 +506,8 @@ def _interval_text(ends: tuple[float, float] | None) -> str:
 
 
 def _fit_section(result: Result) -> TitledParts:
-    """Return the misfit of measurements and equations, the predictions, the time taken, and side
-    results.
+    """Return the section "Fit": misfit of the measurements, violation of the equations of motion,
+    errors of each forward simulation, elapsed times, iterations, and notes on nuisance parameters.
     """
     fit = result.fit
     experiments = result.fit.experiments
@@ -561,7 +565,9 @@ def _elapsed_text(elapsed: Elapsed) -> str:
 
 
 def _iterations_text(result: Result) -> str:
-    """Return the number of iterations, and how much time of the search they took."""
+    """Return the number of iterations, how much time [s] of the search they took, and how much of
+    that linear algebra and evaluations took, as text.
+    """
     timing = result.timing_s
     return (
         f"{result.iterations} iterations in {timing.total:.1f} s of the search "

@@ -162,7 +162,14 @@ class SolveProgress(Watched):
             self._heartbeat.stop()
 
     def iteration(self, line: Iteration) -> None:
-        """Show an iteration; the callback of a method."""
+        """Show an iteration as the last line of the table, and print it if verbose; the callback of
+        a method.
+
+        Parameters
+        ----------
+        line : Iteration
+            Numbers of the iteration, stored for the table.
+        """
         self._lines.append(line)
         self._update_activity(self._search, "  ".join(_iteration_row(line)))
 
@@ -179,12 +186,14 @@ class SolveProgress(Watched):
 
     def share(self, done: float | None) -> None:
         """Show the completed share of the current phase, with the remaining time, at most every
-        `SHARE_INTERVAL_S`.
+        `SHARE_INTERVAL_S`; the state of an iteration (see `state`) is no longer shown once the
+        share grows.
 
         Parameters
         ----------
         done : float or None
-            Share from 0 to 1; a smaller one than before begins a phase, and None ends it.
+            Share from 0 to 1; a smaller one than before begins a phase, and None ends it, after
+            which the elapsed time is shown instead.
         """
         now_s = time.monotonic()
         if done is None:

@@ -157,7 +157,7 @@ def write_page(
 
 def _trajectories(replay: MotionRecord) -> dict[str, Array]:
     """Return the node positions (T, n, 3) [m] of the trajectories that exist, by "fitted" and
-    "simulated".
+    "simulated"; empty if there is neither.
     """
     named = {
         "fitted": replay.positions_m,
@@ -167,8 +167,31 @@ def _trajectories(replay: MotionRecord) -> dict[str, Array]:
 
 
 def _page_data(replay: MotionRecord, colouring: Colouring) -> dict[str, Any]:
-    """Return the data of the page for an experiment and its colouring, ready for JSON; arrays are
-    in base64, see `_base64`, and samples are thinned to at most `MAX_PAGE_FRAMES`.
+    """Return the data of the page for an experiment and its colouring, ready for JSON.
+
+    Of more than `MAX_PAGE_FRAMES` samples every second, third, … is kept. The page shows the
+    trajectories of `colouring.values` alone. Faces whose value is NaN have the colour of the lower
+    end.
+
+    Parameters
+    ----------
+    replay : MotionRecord
+        Experiment with the trajectories of the colouring, the first of which must be finite at one
+        sample that is kept.
+    colouring : Colouring
+        Values of at least one trajectory.
+
+    Returns
+    -------
+    dict
+        Arrays in base64 (see `_base64`): "faces" and "sides" (for each face its corners and the
+        nodes on its sides, as indices of surface nodes; "sides" is empty for linear elements),
+        "held" (whether each node is grasped), "outlines" of obstacles ("" without any), "measured"
+        markers, and by trajectory "shapes" (positions of the surface nodes [m]) and "shares"
+        (colours of the faces from 0 to 255). Else "t_s", "nodes" and "markers" (counts), "quantity"
+        and "ends" (labels of the scale), "opening" (index of the sample to begin with, the one with
+        the strongest colours), "colours" of the scale, "axes" of the camera, "centre" and "size" of
+        the motion [m], and the largest dimension "body" [m].
     """
     samples = np.arange(
         0, len(replay.t_s), -(-len(replay.t_s) // MAX_PAGE_FRAMES)

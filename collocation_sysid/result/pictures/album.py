@@ -45,11 +45,12 @@ def all_pictures(
     Parameters
     ----------
     replays : sequence of MotionRecord
-        The experiments; the mesh is drawn with grasps and markers of the first.
+        The experiments, perhaps none. Mesh, elements and spatially varying constants are drawn of
+        the first one with a mesh, with its grasps and markers.
     result : Result
         Content of ``result.json`` of the same run.
     truth : mapping, optional
-        True values of all estimated parameters by name, see `convergence`.
+        True values of all estimated parameters by name, see `convergence`; unknown by default.
     """
     names = [
         n

@@ -34,16 +34,18 @@ OUTLINE_MARGIN = 0.5
 
 
 def depth_picture(rows: Array) -> Figure:
-    """Return a figure of depth images with outlines of the surface, and below them of the
-    distances from the surface.
+    """Return a figure of depth images with outlines of the surface, and below them of the distances
+    from the surface.
 
-    The samples that have outlines are shown side by side. Without a fit there is no second row; if
-    no point counts, the picture has only a sentence about that.
+    The samples that have outlines are shown side by side. Without a fit there is no second row;
+    without any point, the picture has only a sentence that none is near enough to the body to be
+    compared. Points whose distance is NaN are grey in the second row.
 
     Parameters
     ----------
     rows : (k, 8)
-        Rows of `MotionRecord.visible_points`.
+        Rows of `MotionRecord.visible_points`; if it has points, also the outlines of at least one
+        sample.
     """
     times = np.unique(rows[np.isnan(rows[:, 3]), 0])
     points = rows[np.isfinite(rows[:, 3])]
@@ -127,15 +129,16 @@ def _new_panels(
     Parameters
     ----------
     points : (P, 8)
-        Points of `MotionRecord.visible_points`.
+        Points of `MotionRecord.visible_points`, at least one.
     times : (m,)
-        Times of the samples, one column each.
+        Times of the samples, one column each, at least one.
     rows : int
         Number of rows of panels.
 
     Returns
     -------
     axes : (rows, m) array of Axes
+        Axes of a new figure.
     dot : float
         Area of a dot [pt²], such that dots cover the share `COVERED_SHARE` of the extent.
     """

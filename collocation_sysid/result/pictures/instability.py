@@ -35,6 +35,14 @@ RELATIVE_AMPLITUDE = 0.08
 def instability_picture(instability: StabilityLoss) -> Figure:
     """Return a figure of the body displaced along its unstable mode, coloured by the mode's
     amplitude, with its stretches and wavelength as the title.
+
+    The largest displacement is the share `RELATIVE_AMPLITUDE` of the body's largest dimension; z is
+    drawn upwards, whatever the direction of gravity.
+
+    Parameters
+    ----------
+    instability : StabilityLoss
+        Positions at the loss of stability, and the mode, whose largest amplitude is 1.
     """
     extent_m = float(np.ptp(instability.positions_m, axis=0).max())
     shown_m = (

@@ -142,10 +142,20 @@ def _first_steps(
 def _draw_magnitudes(
     axes: Axes, matrix: sp.csc_array, norm: LogNorm
 ) -> AxesImage:
-    """Draw the magnitudes of a sparse matrix without negative entries on a raster no finer than the
-    picture, and return the image.
+    """Draw the magnitudes of a sparse matrix on a raster no finer than the picture, and return the
+    image.
 
-    Each raster element has the largest magnitude of its entries; those without an entry stay empty.
+    Each raster element has the largest magnitude of its entries, of which NaN counts as zero;
+    elements without an entry stay empty.
+
+    Parameters
+    ----------
+    axes : Axes
+        Modified in place; their coordinates are columns and rows of the matrix.
+    matrix : (rows, columns) sparse array
+        Magnitudes, none negative.
+    norm : LogNorm
+        Colour scale.
     """
     rows, columns = matrix.shape  # type: ignore[misc]
     entries = sp.coo_array(matrix)

@@ -295,17 +295,20 @@ def marker_errors(
     fitted_m: Array | None,
     simulated_m: Array | None = None,
 ) -> Figure:
-    """Return a figure of the root mean square distance of the markers over time, fitted and
-    simulated.
+    """Return a figure of the root mean square distance [mm] of the markers over time, fitted and
+    simulated, with that over all samples in the legend.
+
+    The axis is logarithmic if the two differ by more than a factor of `LOG_AXIS_RATIO`.
 
     Parameters
     ----------
     t_s : (T,)
-        Times of the samples.
+        Times of the samples [s].
     measured_m : (T, M, 3)
-        Measured markers, NaN where missing; samples without any marker leave a gap.
+        Measured markers [m], NaN where missing; samples without any marker leave a gap.
     fitted_m, simulated_m : (T, M, 3) or None
-        Fitted and simulated markers [m]; None is left out, and without both the axes are empty.
+        Fitted and simulated markers [m]. None is left out, and so is a trajectory without any
+        finite distance; without both the axes are empty.
     """
     figure = framed_figure(
         COLUMN_MM, 52, left_mm=13, right_mm=2, foot_mm=9.5, top_mm=9

@@ -146,8 +146,10 @@ def with_nearby_outlines(points_m: Array, outlines_m: Array | None) -> Array:
     """Return the points (T, n, 3) of a body joined with the outlines (T, o, 3) of obstacles near
     it, as (T, n + o, 3).
 
-    Outline points further away than half the body's extent are moved to that distance; NaN stays
-    NaN. Without outlines (None) the points alone are returned.
+    Outline points that are, along an axis, further from the body's bounding box at that sample than
+    half of its largest side are moved to that distance along the axis; NaN stays NaN. At each
+    sample one point of the body at least must not be NaN. Without outlines (None) the points alone
+    are returned.
     """
     if outlines_m is None:
         return points_m
