@@ -208,8 +208,9 @@ def _corrected_estimate(
     error: DiscretisationError,
     parameters: Parameters,
 ) -> ReportedEstimate:
-    """Return an estimate corrected for its measured discretisation error: value, statistical and
-    combined interval with their standard errors change, everything else stays as before.
+    """Return an estimate corrected for its measured discretisation error: value, known correction,
+    and the statistical and combined intervals with their standard errors change, everything else
+    stays as before.
 
     Parameters
     ----------

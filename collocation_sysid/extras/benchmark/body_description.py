@@ -116,12 +116,19 @@ def _introduction(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _material(content: Mapping[str, Any]) -> Iterator[str]:
-    """Yield lines of the Markdown section on the material: laws, density, and a table of the
-    constants with their intervals.
+    """Yield lines of the Markdown section on the material: laws, density, a table of the constants,
+    and the recordings from which they were identified.
 
-    `content` is that of body.json: "law", "energy", "damping" (None: no line), "damping_force",
-    "density_kg_m3" (None: no line), "constants" (with "combined95" None for stated ones) and
-    "identified_from".
+    The table has name, unit, value, combined interval ("stated" or "none" instead where it is None)
+    and true value (empty where it is None) of each constant.
+
+    Parameters
+    ----------
+    content : mapping
+        Content of body.json: "law", "energy", "damping" (None: no line), "damping_force",
+        "density_kg_m3" (None: no line), "identified_from" (names of recordings), and "constants", a
+        sequence of mappings with "name", "unit", "value", "combined95" ((lower, upper) or None),
+        "is_stated" and "true_value".
     """
     yield "## Material\n"
     yield f"- Energy density, law `{content['law']}`: {content['energy']}."

@@ -157,13 +157,14 @@ def score(recording: StoredRecording, source: str, predicted: Signal) -> Score:
     Parameters
     ----------
     recording : StoredRecording
-        Recording with at least one measured value, which must not all equal those of the undeformed
-        body (otherwise `ZeroDivisionError`).
+        Recording with measured values, which must not all equal those of the undeformed body
+        (otherwise `ZeroDivisionError`).
     source : str
         Who predicted it, see `Score`.
     predicted : Signal
         Prediction at the samples of the measured signal, with the same columns; a NaN counts as not
-        measured.
+        measured. At least one marker, with all its coordinates, or one load must be both measured
+        and predicted (otherwise `ValueError`).
     """
     signals = recording.signals
     measured = signals.measured

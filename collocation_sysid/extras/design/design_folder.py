@@ -206,8 +206,9 @@ def _error_bars_json(bars: ErrorBars) -> dict[str, Any]:
 
 
 def _gripper_poses(design: Design) -> PoseSequence:
-    """Return the designed poses over time, in the world: of the gripper if the problem states
-    `gripper_to_body` for the first grasp, else of the body in the grasp.
+    """Return the designed poses over time, in the world, for the file of poses: those of the
+    gripper if the problem states `gripper_to_body` for the first grasp, else those of the body in
+    the grasp, `Design.poses`.
     """
     recording = design.recording
     (body_in_gripper,) = gripper_transforms(

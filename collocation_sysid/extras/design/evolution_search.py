@@ -78,7 +78,13 @@ def minimise(
         Function that is called after each evaluation with the number of evaluations so far and the
         smallest value.
     start : (d,) array, optional
-        Initial coefficients; by default the best of random samples.
+        Initial coefficients, which are evaluated first and searched around more closely than
+        without; by default the best of random samples, the share `EXPLORED` of all evaluations.
+
+    Returns
+    -------
+    SearchResult
+        Best coefficients, their value, and the smallest value after each evaluation.
 
     Raises
     ------

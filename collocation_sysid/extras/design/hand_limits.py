@@ -42,7 +42,7 @@ class CameraSection(Section):
 
     @model_validator(mode="after")
     def _require_direction(self) -> CameraSection:
-        """Raise `ValueError` if the camera is at the point that it looks at."""
+        """Return the camera, unchanged; raise `ValueError` if it is at the point it looks at."""
         if self.position_m == self.looks_at_m:
             raise ValueError("looks_at_m is position_m; expected another point")
         return self

@@ -514,14 +514,16 @@ def _before(objective: MotionObjective, add: bool) -> ErrorBars | None:
 def _error_bars(
     objective: MotionObjective, results: list[SimulatedMotion]
 ) -> ErrorBars:
-    """Return the error bars of a motion, together with existing recordings and priors.
+    """Return the error bars of a motion, together with existing recordings and priors: those at the
+    middle, with the lowest and the highest relative error over all draws.
 
     Parameters
     ----------
     objective : MotionObjective
         Objective with the existing recordings and the draws of q.
     results : list of SimulatedMotion
-        The motion simulated at each draw, in the order of `objective.draws`, the middle first.
+        The motion simulated at each draw, in the order of `objective.draws`, the middle first; as
+        many as draws (otherwise `ValueError`).
     """
     pairs = zip(results, objective.draws, strict=True)
     return ErrorBars.from_draws(
@@ -532,11 +534,12 @@ def _error_bars(
 def _draws_from_recordings(
     problem: Problem, options: DesignOptions
 ) -> tuple[list[Array], Array]:
-    """Solve the existing recordings; return draws (nq,) of the parameters q around the estimate,
-    the estimate first, and the information (nq, nq) of the recordings.
+    """Solve the existing recordings; return draws of the parameters q around the estimate, and the
+    information of the recordings.
 
-    q are the solver's coordinates: logarithms, or values of linear parameters. Poorly determined
-    parameters are drawn no wider than `options.spread`.
+    q are the solver's coordinates: logarithms, or values of linear parameters. The draws are 1 + 2
+    · `options.pairs` arrays (nq,), the estimate first. Poorly determined parameters are drawn no
+    wider than `options.spread`. The information (nq, nq) is about q, without priors.
 
     Raises
     ------

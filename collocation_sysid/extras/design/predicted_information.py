@@ -421,12 +421,13 @@ class FutureRecording:
         )
 
     def bounds(self, limits: Limits) -> HandBounds:
-        """Return the limits of the hand relative to its initial position.
+        """Return the limits of the hand relative to its initial position, the middle of the grasped
+        nodes at the template's first sample.
 
         Raises
         ------
         InputError
-            If the hand starts outside the workspace.
+            If the hand starts outside the workspace or on its boundary.
         """
         rotation, translation = self.start_pose
         return limits.bounds_from(rotation @ self.hand_m + translation)

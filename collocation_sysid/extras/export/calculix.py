@@ -54,8 +54,11 @@ FOAM_LIMITATION = (
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the input deck, with one step for each sample of a static recording and else for the
-    first sample alone, and what CalculiX cannot express; damping is not exported.
+    """Return the input deck, one text file, and what CalculiX cannot express; nothing is written.
+
+    The deck has one step for each sample of a static recording, else one for the first sample
+    alone. Damping is not exported. A material that CalculiX does not have becomes a neo-Hookean
+    one, with a sentence on that.
     """
     static = body.experiment.is_static
     limits = replace(

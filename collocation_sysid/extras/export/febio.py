@@ -63,8 +63,11 @@ class ElasticLaw(NamedTuple):
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the model file of a static step with growing loads, at the first sample, and what
-    FEBio cannot express; damping and motion are not exported.
+    """Return the model file, one text file, and what FEBio cannot express; nothing is written.
+
+    The model is a static step with growing loads, at the first sample; damping and motion are not
+    exported. A material that FEBio does not have becomes a neo-Hookean one, with a sentence on
+    that.
     """
     limits = CAPABILITIES.limitations(body)
     materials = "".join(
@@ -136,7 +139,8 @@ def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> ElasticLaw:
     """Return the elastic law of a region in FEBio. One that FEBio does not have becomes the
     neo-Hookean law of the same E and ν at small strain.
 
-    A sentence on what the law does not express is appended to `limits`, in place.
+    For the linear material a sentence on the difference is appended to `limits`, in place; the
+    sentence on a material that FEBio does not have is one of `TargetCapabilities.limitations`.
     """
     c = region.constants
     if region.material == "mooney-rivlin":

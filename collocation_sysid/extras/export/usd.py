@@ -155,7 +155,8 @@ def _tilt_deg(gravity_m_s2: Array) -> float:
 
 
 def _import_usd() -> Any:
-    """Return the modules of usd-core as attributes of one object.
+    """Return the modules of usd-core as attributes of one object: `Gf`, `Sdf`, `Usd`, `UsdGeom`,
+    `UsdPhysics`, `UsdShade` and `Vt`.
 
     Raises
     ------
@@ -395,9 +396,10 @@ def _add_obstacle(
     stage : Stage
         Modified in place.
     path : str
-        Path of the obstacle in the stage.
+        Path of the obstacle in the stage, such as "/World/Obstacle_1".
     obstacle : Obstacle
-        Its friction coefficient must be a number.
+        Its friction coefficient must be a number, not the name of a parameter; zero is exported,
+        too.
     body : IdentifiedBody
         Body with the times of the samples.
     """

@@ -192,13 +192,14 @@ def parse_custom_readings(
     readings: Mapping[str, Any] | None, gauges: Sequence[Gauge], t_s: float
 ) -> tuple[InstrumentSample, ...]:
     """Return samples of custom sensors, each as number of the instrument (from 1), time [s] and
-    values; a sample without a time has the time of the frame.
+    values (m,); a sample without a time has the time of the frame.
 
     Parameters
     ----------
     readings : mapping of name to samples, or None
-        Samples of each sensor: its values (a number, if there is one), a mapping with the keys
-        "t_s" and "values", or a list of such mappings. None, also as values, for no samples.
+        Samples of each sensor: its m values (or a number, if there is one), a mapping with exactly
+        the keys "t_s" and "values", or a list of such mappings. None, also as values, for no
+        sample; single values that are None or NaN are missing and become NaN.
     gauges : sequence of Gauge
         Custom sensors of the problem; instrument k is the k-th of them, from 1.
     t_s : float
@@ -207,7 +208,8 @@ def parse_custom_readings(
     Raises
     ------
     InputError
-        For unknown sensors, or values of the wrong number.
+        If `readings` is no mapping, for unknown sensors, other keys, a time that is not finite, and
+        values that are text, of the wrong number, or beyond `LARGEST_NUMBER` in magnitude.
     """
     if readings is None:
         return ()
@@ -248,9 +250,10 @@ def parse_wrenches(
     Parameters
     ----------
     wrench_data : wrench, mapping of grasp number to wrench, or None
-        Force [N] and torque [N m], 6 values or the first 3 of them; or a mapping with the keys
-        "t_s" and "values", or a list of such mappings. With several sensors a mapping of these by
-        the number of the grasp, as text such as "1".
+        Force [N] and torque [N m], 6 values or the first 3 of them; or a mapping with exactly the
+        keys "t_s" and "values", or a list of such mappings. With several sensors a mapping of these
+        by the number of the grasp, as text such as "1". None, also as values, for no sample; single
+        values that are None or NaN become NaN.
     wrenches : mapping of grasp number to Wrench
         Sensors of the problem, by the number of the grasp from 1 on.
     instruments_before : int
@@ -261,7 +264,8 @@ def parse_wrenches(
     Raises
     ------
     InputError
-        For unknown sensors, or values that are not a wrench.
+        For unknown sensors, one wrench for several sensors, other keys, a time that is not finite,
+        and values that are text, neither 6 nor 3, or beyond `LARGEST_NUMBER` in magnitude.
     """
     if wrench_data is None or not wrenches:
         return ()
@@ -305,7 +309,8 @@ def _parse_samples(
     ----------
     samples : samples
         Values, a mapping with exactly the keys ``t_s`` and ``values``, or a list of such mappings.
-        Values are a sequence, or a number if `count` is 1; None is a missing sample.
+        Values are a sequence, or a number if `count` is 1; None is a missing sample, and None among
+        the values becomes NaN.
     what : str
         Name of the instrument for messages.
     count : int
@@ -318,7 +323,8 @@ def _parse_samples(
     Raises
     ------
     InputError
-        For other keys, a time that is not finite, or values that are not as many numbers.
+        For other keys, a time that is not finite, or values that are not as many numbers, up to
+        `LARGEST_NUMBER` in magnitude.
     """
     several = isinstance(samples, Sequence) and any(
         isinstance(s, Mapping) for s in samples

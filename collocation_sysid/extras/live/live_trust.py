@@ -116,15 +116,19 @@ def data_concerns(
 ) -> list[Concern]:
     """Return the concerns due to residuals, outliers and restarts; empty if there are none.
 
+    They are residuals larger than σ, correlated residuals, a large share of outliers among
+    `samples`, and any restart. Nothing is changed.
+
     Parameters
     ----------
     scatter : ResidualScatter
         Size and autocorrelation of the residuals.
     counts : Counter
-        Numbers of irregularities, by kind; those of outliers ("wild") and of restarts
-        ("begun anew") are used.
+        Numbers of irregularities, by kind; those of outliers ("wild") and of restarts ("begun
+        anew") are used.
     samples : int
-        Number of marker positions measured so far, each marker of each frame counted once.
+        Number of marker positions measured so far, each marker of each frame counted once; may be
+        0.
     """
     outlier_share = counts["wild"] / max(1, samples)
     restarts = counts["begun anew"]

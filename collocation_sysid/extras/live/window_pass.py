@@ -252,19 +252,20 @@ class WindowPass:
         """Compute the first of the logged rows, at most `repeatable_rows`, and add their samples to
         the pass.
 
-        The rows after them are ignored; the attribute `rows` increases by the number of rows that
-        were computed.
+        Fewer rows, but at least one, are computed if an initial guess turns out to be far off. The
+        rows after them are ignored; the attribute `rows` increases by the number of rows that were
+        computed.
 
         Parameters
         ----------
         rows : sequence of LoggedRow
             Rows that follow those of the pass, with the samples to evaluate after each; at least
-            one.
+            one; not modified.
 
         Raises
         ------
         SimulationError
-            If a row cannot be solved.
+            If a row cannot be solved; no samples are added then.
         """
         done = self.add_rows(
             [row.poses for row in rows[: self.repeatable_rows]]

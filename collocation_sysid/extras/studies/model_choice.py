@@ -523,7 +523,8 @@ def model_notes(rows: Sequence[Row]) -> list[str]:
     Parameters
     ----------
     rows : sequence of Row
-        Rows of `model_rows`, at least one, with "independent".
+        Rows of `model_rows`, at least one, with "predictions", "independent" (may be None),
+        "evidence", "status", "converged" and "failures".
     """
     names = rows[0]["predictions"]
     test_data = (
@@ -663,7 +664,7 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     Parameters
     ----------
     problem : Problem
-        Problem with the model.
+        Problem with the model; not modified.
     method : str
         Name of the method.
     test_name : str
@@ -674,14 +675,16 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     dict
         "status", "converged", "rms" by unit (None where nothing is measured), "parameters",
         "at_bound" ("lower" or "upper" by the name of each parameter that ended at this bound),
-        "free" (names) and "time_s". If the fit converged also "evidence" and "budget" if all are fitted,
-        else "prediction", which is None with a "failure" if the simulation failed. A fit that
-        cannot be linearised counts as not converged.
+        "free" (names) and "time_s". If the fit converged also "evidence" and "budget" if all are
+        fitted, else "prediction" (see `_prediction_error`), which is None with a "failure" if the
+        simulation failed. A fit that cannot be linearised counts as not converged.
 
     Raises
     ------
     InputError
         If the problem cannot be solved with the method.
+    StopIteration
+        If the problem has no recording called `test_name`.
     """
     known, start_s = (
         reserve_test_data(problem, test_name)
@@ -829,7 +832,7 @@ def _stress_residuals_pa(
     Parameters
     ----------
     experiment : Experiment
-        Test of a specimen, with at least one measured stress.
+        Test of a specimen, with at least one measured stress: a custom sensor with the unit Pa.
     predicted : mapping of str to (S, 1) array
         Prediction at the samples of each stress [Pa], by the name of the custom sensor.
     """
@@ -864,23 +867,25 @@ def _prediction_error(
     """Return RMS, number of samples and sums of squares by block, of held-out measurements against
     a simulation.
 
-    The measurements are markers [m] or, without any, forces [N] on the complete specimen, or
-    stresses [Pa] of a specimen without a mesh; "unit" says which.
+    The measurements are stresses [Pa] of a specimen without a mesh, else markers [m], or without
+    any the forces [N] on the complete specimen; "unit" says which. Missing ones (NaN) do not count.
 
     Parameters
     ----------
     experiment : Experiment
-        Recording with all its measurements.
+        Recording with all its measurements; a specimen, or with markers or at least one wrench
+        (otherwise `ValueError`).
     rollout : ForwardSimulation
-        Simulation at the same samples.
+        Simulation at the same samples, which must be finite: a marker that is NaN would not count
+        as an error.
     start_s : float
-        Samples up to this time are ignored.
+        Samples up to this time [s] are ignored; −∞ for none.
 
     Returns
     -------
     dict
-        "rms" (None without samples), "unit", "samples", and "blocks", `BLOCKS` sums of squares in
-        the order of time.
+        "rms" (None without samples), "unit", "samples" (number of marker positions, force vectors
+        or stresses), and "blocks", `BLOCKS` sums of squares in the order of time.
     """
     markers = experiment.markers
     unit = "m"

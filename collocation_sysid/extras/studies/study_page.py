@@ -220,7 +220,8 @@ def load_report(
 
 def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
     """Return what the terminal shows of a study within 80 columns: the advice of a comparison of
-    models, tables, notes, up to `SHOWN_FAILURES` failures, and the folder.
+    models, tables with an empty line after each, notes, up to `SHOWN_FAILURES` failures and the
+    number of others, and the folder.
 
     Parameters
     ----------
