@@ -29,8 +29,8 @@ SHOWN_RECORDINGS = 4
 
 
 def quick_check_tables(quick_check: QuickCheck) -> list[Shown]:
-    """Return a table for each body, also that of specimens without a mesh, then one of the
-    measurements; they need no simulation.
+    """Return the tables of a quick check, which need no simulation: one for each body, also that of
+    specimens without a mesh, then one of the measurements.
     """
     return [
         *map(_body_section, quick_check.bodies),
@@ -39,8 +39,16 @@ def quick_check_tables(quick_check: QuickCheck) -> list[Shown]:
 
 
 def full_check_tables(findings: CheckResult) -> list[Shown]:
-    """Return tables of modes, costs and derivatives, then notes, warnings, remedies and the
-    conclusion.
+    """Return the findings of a check that need simulations, for the terminal.
+
+    First come the natural modes (left out if all recordings are static), then a table of costs and
+    derivatives, notes and warnings if there are any, the command that explains remedies if there is
+    a concern, and the conclusion.
+
+    Parameters
+    ----------
+    findings : CheckResult
+        Result of the check.
     """
     messages = {
         "note": (findings.notes, ""),
@@ -231,6 +239,13 @@ def _measurements_section(findings: QuickCheck) -> Table:
 def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
     """Return table rows with a sentence on each grasp of an experiment, by label; several grasps
     are numbered from 1. Empty without grasps.
+
+    Parameters
+    ----------
+    experiment : str
+        Name of the experiment.
+    holds : iterable of GraspCheck
+        Grasps of all experiments, of which those of this one are used.
     """
     own = [
         grasp_sentence(grasp)

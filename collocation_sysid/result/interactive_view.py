@@ -210,7 +210,14 @@ def _missing_frames(run: str | Path, experiment: str) -> InputError:
 def _frames_of_fit(
     run: str | Path, replay: MotionRecord
 ) -> list[tuple[float, Path]]:
-    """Return times [s] and files of the frames of a fitted experiment, see `frame_files`.
+    """Return times [s] and files of the frames of an experiment that was fitted, see `frame_files`.
+
+    Parameters
+    ----------
+    run : str or Path
+        The run folder.
+    replay : MotionRecord
+        Experiment of this run.
 
     Raises
     ------

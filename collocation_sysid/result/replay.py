@@ -557,8 +557,9 @@ def read_run(folder: str | Path) -> tuple[Result, list[MotionRecord]]:
 
 
 def run_headline(result: Result) -> str:
-    """Return Young's moduli [Pa], each with its combined standard uncertainty if known, and the
-    verdict, as one line of text; the verdict alone if there are no moduli.
+    """Return Young's moduli [Pa] of a result, of regions too, each with its combined standard
+    uncertainty if known, and the verdict, as one line of text; the verdict alone if there are no
+    moduli.
     """
     moduli = {
         symbol_of(n): each

@@ -72,8 +72,13 @@ class StudySummary:
 
 def comparison_report(folder: str | Path) -> TitledParts:
     """Return the report of the folder of a study, which compare-methods, compare-models or sweep
-    wrote: headline, notes, tables, runs without a result, and the pictures that this program wrote
-    there.
+    wrote: headline, notes, tables, runs without a result, and all PNG pictures in the folder,
+    except links that lead out of it.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of the study; nothing is written to it.
 
     Raises
     ------

@@ -180,12 +180,19 @@ def write_pictures(
 
 
 def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
-    """Return the cell data that are the same in every frame: region numbers, if there are several,
-    and spatially varying constants of a body.
+    """Return the cell data that are the same in every frame, by name: "region" (index of the part),
+    if there are several, and spatially varying constants of a body.
 
-    Each array has one row for each of the E elements. A constant has four: its estimate, the ends
-    of its 95 % interval (suffixes ``_lower``, ``_upper``), and its posterior over its prior
-    standard deviation (suffix ``_over_prior``).
+    Each array (E,) has one entry for each element. A constant has four arrays: its estimate, the
+    ends of its 95 % interval (suffixes ``_lower``, ``_upper``), and its posterior over its prior
+    standard deviation (suffix ``_over_prior``); they are NaN in other regions.
+
+    Parameters
+    ----------
+    finished : SolvedProblem
+        The solved problem, with the estimates of the fields.
+    body : Body
+        One of its bodies.
     """
     data: dict[str, Any] = (
         {"region": body.part_of_cells} if len(body.parts) > 1 else {}
@@ -197,12 +204,24 @@ def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
 
 
 def write_all_frames(finished: SolvedProblem, place: Path) -> None:
-    """Write the ParaView frames of every fitted experiment into the folder `place`, which must
-    exist.
+    """Write the ParaView frames of every fitted experiment, see `write_frames`; existing ones are
+    replaced.
 
     With several fitted experiments each has a subfolder of its name, which is made if missing.
     Besides the data of `write_frames` and `_constant_cell_data`, the frames have the residuals of
     the equations of motion, "residual_force_n" [N], which are zero at prescribed dofs.
+
+    Parameters
+    ----------
+    finished : SolvedProblem
+        The solved problem.
+    place : Path
+        Existing folder to write into.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be written.
     """
     for part in finished.solution.parts:
         segment = part.segment
@@ -294,10 +313,18 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
 def _depth_rows(
     finished: SolvedProblem, experiment: Experiment
 ) -> dict[str, Array]:
-    """Return the points of each depth camera on the fitted surface, or else on the simulated one.
+    """Return the points of each depth camera of an experiment on the fitted surface, or else on the
+    simulated one.
 
     The arrays (k, 8), by name of the camera, have the rows of `MotionRecord.visible_points`. The
     mapping is empty where neither surface is known, or without depth cameras.
+
+    Parameters
+    ----------
+    finished : SolvedProblem
+        The solved problem, with the forward simulations.
+    experiment : Experiment
+        One of its experiments, fitted or for validation.
     """
     part = finished.solution.part_of(experiment.name)
     rollout = finished.rollouts[experiment.name]
@@ -317,7 +344,8 @@ def _depth_rows(
 
 
 def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
-    """Return the estimates (E, 4) of each spatially varying constant, by name of the field.
+    """Return the estimates (E, 4) of each spatially varying constant of a body, by name of the
+    field; empty if there is none.
 
     The columns are those of `MotionRecord.fields`. Rows of elements in other regions are NaN.
     """
@@ -348,10 +376,15 @@ def _marker_places_m(finished: SolvedProblem, experiment: str) -> Array | None:
 
 
 def _trajectory_arrays(replays: Sequence[MotionRecord]) -> dict[str, Array]:
-    """Return the arrays of trajectory.npz by name.
+    """Return the arrays of trajectory.npz by name, see `MotionRecord.to_arrays`.
 
-    The name of the experiment precedes the names of its arrays, except if it is the only fitted
-    one.
+    The name of the experiment and a slash precede the names of its arrays, except if it is the only
+    fitted one.
+
+    Parameters
+    ----------
+    replays : sequence of MotionRecord
+        All experiments of a run; one without fitted positions counts as not fitted.
     """
     alone = sum(replay.positions_m is not None for replay in replays) == 1
     arrays = {}

@@ -275,10 +275,17 @@ def _known_levels(file: Path, names: Iterable[str]) -> list[RefinementLevel]:
     """Return the levels that an earlier call finished, with the values of `names` alone; empty
     without a file.
 
+    Parameters
+    ----------
+    file : Path
+        The file ``refinement.json`` of a run folder.
+    names : iterable of str
+        Names of the estimates that each level must have.
+
     Raises
     ------
     InputError
-        If the file is a link or was not written by this program.
+        If the file is a link to another folder.
     KeyError, ValueError
         If the file is damaged, or lacks one of the names.
     """

@@ -138,8 +138,9 @@ def run_summary(
 
 
 def estimate_sections(result: Result) -> list[Shown]:
-    """Return the verdict, the command that explains its remedies, the advice of a deeper check
-    where that is worthwhile, and the table of parameters with their intervals.
+    """Return the verdict, the command that explains its remedies if there is a concern, the advice
+    of a deeper check where that is worthwhile, and the table of parameters with their intervals,
+    each as a part without title.
     """
     sections = [
         verdict_section(result.trust),
@@ -150,8 +151,8 @@ def estimate_sections(result: Result) -> list[Shown]:
 
 
 def run_report(run: str | Path) -> TitledParts:
-    """Return the complete report of a run folder, with the pictures that this program wrote there;
-    nothing is written.
+    """Return the complete report of a run folder, with all PNG pictures in it, see
+    `_captioned_pictures`; nothing is written.
 
     Raises
     ------
@@ -261,8 +262,11 @@ def remedy_command(concerns: Iterable[Concern]) -> list[Line]:
 
 
 def _parameter_section(result: Result) -> TitledParts:
-    """Return the table of corrected values with combined and statistical uncertainties, and remarks
-    on it.
+    """Return the section "Parameters": the table of all estimates with corrected values, combined
+    and statistical uncertainties and guesses, and remarks on it.
+
+    The remarks are on fields, on what the intervals contain, on corrections, on estimates that are
+    not determined, and on the largest contributions; each is left out if it does not apply.
     """
     values = result.values
     rows = tuple(
@@ -428,6 +432,13 @@ def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
     interval the cell is "at its bound"; if the estimate has a `reason`, which is the remark, it is
     "not identifiable", or "not determined" without a statistical interval. Instead of the guess of
     a fixed or tied parameter the cell is "fixed" or "tied".
+
+    Parameters
+    ----------
+    result : Result
+        Content of ``result.json``.
+    name : str
+        Name of one of its estimates; KeyError for another one.
     """
     each = result.values[name]
     interval = _interval_text(each.combined95)
@@ -761,7 +772,14 @@ def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
 
 def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
     """Yield a table with the diagnosis of each marker's residuals, and a headed table of the
-    largest marker errors in the arrays of the folder `run`; a table without rows is left out.
+    largest marker errors; a table without rows is left out.
+
+    Parameters
+    ----------
+    result : Result
+        Content of ``result.json``, with the diagnoses.
+    run : Path
+        Run folder, whose arrays have the marker errors.
 
     Raises
     ------
@@ -841,10 +859,12 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
 
 
 def _captioned_pictures(run: Path) -> list[Picture]:
-    """Return every PNG picture that this program wrote into the folder, with its caption.
+    """Return every PNG file of the folder `run`, also those of other programs, with its caption;
+    links that lead out of the folder are left out.
 
     A picture that compares measurement and fit is first; then follow the pictures known to
-    `PICTURE_CAPTIONS` in that order, and unknown ones, with their name as caption.
+    `PICTURE_CAPTIONS` in that order, and unknown ones, with their name as caption. Empty without
+    pictures.
     """
     order = [*PICTURE_CAPTIONS, ""]
     pictures: list[Picture] = []
@@ -875,8 +895,15 @@ def _captioned_pictures(run: Path) -> list[Picture]:
 
 
 def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:
-    """Yield a table of the problem and software versions, and the problem file as it was run, if
-    this program wrote one into the folder `run`.
+    """Yield a table of the problem and software versions, and the copy of the problem file as it
+    was run, if the run folder has one; a copy that is a link to elsewhere is left out.
+
+    Parameters
+    ----------
+    result : Result
+        Content of ``result.json``.
+    run : Path
+        The run folder.
     """
     rows = content(result.problem) | content(result.provenance)
     listed_rows = (

@@ -55,11 +55,13 @@ class Colouring:
 
     @classmethod
     def by_strain(cls, replay: MotionRecord) -> Colouring:
-        """Return the colouring of all trajectories, at least one, by the largest principal strain.
+        """Return the colouring of all trajectories of an experiment, of which it must have at least
+        one, by the largest principal strain.
 
         The strain (T, F) is the largest stretch minus one, see `surface_strain`; NaN where a
         position is not finite. The scale reaches from 0 to the quantile `STRAIN_QUANTILE` of the
-        absolute strain of the first trajectory, the fitted one if there is one.
+        absolute strain of the first trajectory, the fitted one if there is one, which must be
+        finite somewhere.
         """
         values = {
             name: surface_strain(replay, x)

@@ -170,8 +170,14 @@ def _recordings(problem: Problem, body: BenchmarkBody) -> list[Experiment]:
 def _parameter_values(
     problem: Problem, entry: CatalogueEntry
 ) -> dict[str, float]:
-    """Return the values of all parameters by name, in the units of the problem file: those of the
-    catalogue, else those of fixed parameters.
+    """Return the values of all parameters of a problem by name, in the units of the problem file.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem with the parameters.
+    entry : CatalogueEntry
+        Entry whose constants are used; a parameter that it lacks must be fixed, and has that value.
 
     Raises
     ------

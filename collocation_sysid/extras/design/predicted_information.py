@@ -82,9 +82,14 @@ class DesignCriterion:
         require_among(self.over, get_args(Over), where="--over")
 
     def log_size(self, errors: PredictedErrors) -> float:
-        """Return the logarithm of the relative error bar of the named parameters that is minimised:
-        the largest, for "A" the root mean square, for "D" the geometric mean over the axes of the
-        confidence ellipsoid. The names must be known, see `require_known`.
+        """Return the logarithm of the relative error bar that is minimised, of the parameters named
+        by the criterion: the largest, for "A" the root mean square, for "D" the geometric mean over
+        the axes of the confidence ellipsoid.
+
+        Parameters
+        ----------
+        errors : PredictedErrors
+            Predicted errors, which must have all names, see `require_known`.
         """
         slopes = errors.slopes_of(self.names)
         covariance = slopes @ errors.covariance @ slopes.T
@@ -433,8 +438,8 @@ class FutureRecording:
         return limits.bounds_from(rotation @ self.hand_m + translation)
 
     def highest_hz(self, limits: Limits) -> float:
-        """Return the highest frequency of a wave [Hz]: the stated limit, or a tenth of the sampling
-        rate.
+        """Return the highest frequency of a wave [Hz]: that of the limits, or a tenth of the
+        sampling rate if they state none.
 
         Raises
         ------

@@ -177,12 +177,13 @@ def _step_card(
     t_s: float,
     is_linear: bool,
 ) -> str:
-    """Return one step: prescribed nodes and obstacles at their places at `t_s`, gravity, and the
-    node loads of the first sample.
+    """Return the text of one step: prescribed nodes and obstacles at their places at `t_s`,
+    gravity, and the node loads of the first sample.
 
     Parameters
     ----------
     body : IdentifiedBody
+        Body with its recording.
     obstacles : sequence of FacetedObstacle
         The obstacles.
     t_s : float

@@ -107,8 +107,16 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 def _material_xml(
     number: int, region: IdentifiedRegion, limits: list[str]
 ) -> str:
-    """Return the XML of the material numbered `number` from 1, with its viscoelastic branches;
-    sentences on what it does not express are appended to `limits`, in place.
+    """Return the XML of the material of a region, with its viscoelastic branches.
+
+    Parameters
+    ----------
+    number : int
+        Number of the material in the file, from 1.
+    region : IdentifiedRegion
+        Region with its constants.
+    limits : list of str
+        Sentences on what the material does not express are appended, in place.
     """
     kind, values, uncoupled = _elastic_law(region, limits)
     inner = "".join(
@@ -245,9 +253,17 @@ def _prescribed_displacement_xml(body: IdentifiedBody) -> str:
 def _obstacle_mesh_xml(
     body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]
 ) -> tuple[str, str]:
-    """Return the XML of the obstacles' nodes and elements, and that of the contact surfaces.
+    """Return the XML of the obstacles' nodes and elements, and that of the contact surfaces of body
+    and obstacles; two empty texts without obstacles.
 
     Each obstacle has a tetrahedron under each facet.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+        Body whose faces may touch the obstacles.
+    obstacles : sequence of FacetedObstacle
+        Its obstacles.
     """
     solids = ""
     facets = ""

@@ -98,8 +98,16 @@ def write_rerun(
 
 
 def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
-    """Return the von Mises stress (T, F) [Pa] on the F triangles of the surface of an experiment of
-    a run folder; None if the run has no frames of it, or the experiment was not fitted.
+    """Return the von Mises stress (T, F) [Pa] on the F triangles of the surface of an experiment,
+    at each sample that of the nearest frame; None if the run has no frames of it or damaged ones,
+    or the experiment was not fitted.
+
+    Parameters
+    ----------
+    run : str or Path
+        The run folder.
+    replay : MotionRecord
+        Experiment of this run.
     """
     if replay.positions_m is None:  # only fitted experiments have frames
         return None

@@ -131,8 +131,8 @@ def _contact_xml(body: IdentifiedBody) -> str:
 
 
 def _elastic_law_xml(region: IdentifiedRegion) -> str:
-    """Return the XML of the elastic material; one that SOFA does not have becomes the neo-Hookean
-    material of the same λ and μ.
+    """Return the XML of the elastic material of a region; one that SOFA does not have becomes the
+    neo-Hookean material of the same λ and μ, without a remark here.
     """
     if region.material == "linear":
         return (

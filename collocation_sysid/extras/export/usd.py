@@ -249,10 +249,15 @@ def _add_mesh(
 
 
 def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
-    """Return the mass of each linear tetrahedron [kg], region after region, from its undeformed
-    volume and the density of its region.
+    """Return the mass of each linear tetrahedron [kg] in one array, region after region, from its
+    undeformed volume and the density of its region, without point masses.
 
-    `cells` are the corner nodes of the tetrahedra (k, 4) of each region.
+    Parameters
+    ----------
+    body : IdentifiedBody
+        Body with nodes and regions.
+    cells : list of (k, 4)
+        Corner nodes of the tetrahedra of each region, see `linear_tetrahedra`.
     """
     edges = [np.diff(body.nodes_m[each], axis=1) for each in cells]
     volumes = [np.abs(np.linalg.det(each)) / 6 for each in edges]
@@ -325,11 +330,23 @@ def _add_gripper(
     body: IdentifiedBody,
     start_positions_m: Array,
 ) -> None:
-    """Add a kinematic rigid body that follows the poses of a grasp, and attach the nodes to it that
-    the grasp holds along all axes.
+    """Add a kinematic rigid body that follows the poses of a grasp to the stage, in place, as
+    /World/Gripper_NUMBER, and attach the nodes to it that the grasp holds along all axes.
 
-    `number` counts grasps from 1; `start_positions_m` (n, 3) are the initial node positions in the
-    world. The stage is modified in place.
+    Parameters
+    ----------
+    pxr : namespace
+        Modules of `_import_usd`.
+    stage : Stage
+        Modified in place.
+    number : int
+        Number of the grasp, from 1.
+    grasp : Grasp
+        Its poses at the samples become those of the rigid body.
+    body : IdentifiedBody
+        Body with the times of the samples.
+    start_positions_m : (n, 3)
+        Initial node positions in the world [m].
     """
     path = f"/World/Gripper_{number}"
     gripper = pxr.UsdGeom.Xform.Define(stage, path)

@@ -106,8 +106,9 @@ class InitialRest:
         )
 
     def _displacement_m(self, frame: Frame, reference: Frame) -> float:
-        """Return the largest displacement of a grasp between two frames with poses [m]: its
-        translation, and its rotation as that of a point at the distance of the body's size.
+        """Return the largest displacement [m] of a grasp from one frame to another, both with
+        poses: its translation, plus its rotation as that of a point at the distance of the body's
+        size.
         """
         assert frame.pose is not None
         assert reference.pose is not None

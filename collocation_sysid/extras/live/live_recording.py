@@ -150,8 +150,8 @@ class LiveRecording:
             self._stream.log("notes", rr.TextLog(note))
 
     def _write_number(self, value: float, *path: str) -> None:
-        """Write a number at the present time of the recording under the entity whose path has the
-        parts `path`; nothing if it is not finite.
+        """Write the number `value` at the present time of the recording under the entity whose path
+        has the parts `path`; nothing if it is not finite.
         """
         if np.isfinite(value):
             entity = self._rr.new_entity_path(list(path))

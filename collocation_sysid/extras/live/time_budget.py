@@ -81,15 +81,16 @@ class TimeBudget:
             self.delay = max(self.delay, took_s / expected_s)
 
     def record_relinearisation(self, took_s: float) -> None:
-        """Record the time of a change of the linearisation point [s] in `turn_s`, if it is longer
-        than that.
+        """Record the time `took_s` [s] of a change of the linearisation point in `turn_s`, if it is
+        longer than that; a shorter one changes nothing.
         """
         self.turn_s = max(self.turn_s, took_s)
 
     def record_remainder(self, took_s: float) -> None:
-        """Record the time of the work after the time steps [s].
+        """Record the time `took_s` [s] of the work after the time steps of a frame in `after_s`.
 
-        The largest one counts, but decays slowly, because not every frame needs all of that work.
+        The largest one counts, but decays slowly, by `REMAINDER_DECAY` at each call, because not
+        every frame needs all of that work.
         """
         self.after_s = max(REMAINDER_DECAY * self.after_s, took_s)
 

@@ -338,14 +338,15 @@ class WindowPass:
         return self._positions_at(self.blocks[-1].stored_rows[-1], transformed)
 
     def _predicted_positions(self, base: StoredRow) -> Array:
-        """Return the node positions (3n,) [m] of a stored row at the linearisation point of this
-        pass, to first order with the derivatives of the row.
+        """Return the node positions (3n,) [m] of the stored row `base`, such as one of another
+        pass, at the linearisation point of this pass, to first order with the derivatives of the
+        row.
         """
         return self._positions_at(base, self.sweep.transformed)
 
     def _positions_at(self, base: StoredRow, transformed: Array) -> Array:
-        """Return the node positions (3n,) [m] of a stored row at transformed parameters (P,), to
-        first order with the derivatives of the row.
+        """Return the node positions (3n,) [m] of the stored row `base` at transformed parameters
+        (P,), see `StreamingModel.transformed`, to first order with the derivatives of the row.
         """
         step = (transformed - base.transformed)[self.sweep.moving]
         return base.x + base.columns @ step.astype(np.float32)

@@ -323,7 +323,8 @@ def advice(rows: Sequence[Row]) -> str:
 
 
 def bound_sentences(rows: Sequence[Row]) -> list[str]:
-    """Return a sentence for each converged model with constants at bounds, with the remedy.
+    """Return a sentence for each converged model with constants at bounds, with the remedy; empty
+    if there is none. `rows` are those of `model_rows`.
 
     The values are those of the fit to all recordings. A constant at a lower bound contributes next
     to nothing, so that the model is one with fewer terms, or with another sign of the constant.
@@ -345,7 +346,16 @@ def bound_sentences(rows: Sequence[Row]) -> list[str]:
 
 
 def _reasons(rows: Sequence[Row], chosen: Row) -> str:
-    """Return in words which model to use, why, and how certain that is; see `advice`."""
+    """Return in words which model to use, why, and how certain that is, and in which estimates
+    equally good laws disagree, see `advice`.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `model_rows`; those of models that converged must have "delta_aic".
+    chosen : Row
+        The chosen one of them (the same object).
+    """
     others = [row for row in rows if row is not chosen and row["converged"]]
     use = f"Use {chosen['model']}"
     if not others:

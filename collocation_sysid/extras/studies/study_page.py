@@ -276,10 +276,18 @@ def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
 
 
 def write_report(report: StudyReport, folder: Path) -> None:
-    """Write ``runs.csv``, ``summary.json``, ``summary.md`` and the plots of a study into a folder.
+    """Write ``runs.csv``, ``summary.json``, ``summary.md`` and the plots (PNG) of a study into a
+    folder.
 
     A comparison of methods has also ``summary.csv``; a comparison of models has no plots. Earlier
-    files are replaced, and a missing folder is made.
+    files are replaced, but plots that are no longer made stay.
+
+    Parameters
+    ----------
+    report : StudyReport
+        The study.
+    folder : Path
+        Folder, made if missing.
 
     Raises
     ------
@@ -715,8 +723,9 @@ def _number_cell(
 
 
 def _bounded_cell(name: str) -> Cell:
-    """Return the cell of a parameter of a row of `model_rows`: its value, followed by "at lower
-    bound" or "at upper bound" if it ended there; "–" if the model has no such parameter.
+    """Return the cell of the parameter `name`: a function of a row of `model_rows` that returns its
+    value as text, followed by "(at lower bound)" or "(at upper bound)" if it ended there; "–" if
+    the model has no such parameter.
     """
     number = _number_cell(name, 1, form=".4g", among="parameters")
 

@@ -357,7 +357,7 @@ def plan_models(
 
 
 def fitted_recordings(problem: Problem) -> list[str]:
-    """Return the names of the recordings of a problem that are fitted, in its order; those for
+    """Return the names of the experiments of a problem that are fitted, in its order; those for
     validation are left out.
     """
     return [e.name for e in problem.experiments if not e.validation]

@@ -78,10 +78,15 @@ MARK_STYLES: dict[str, dict[str, Any]] = {
 
 def mesh_picture(replay: MotionRecord) -> Figure:
     """Return a figure of the undeformed body from the front and from behind, with grasped nodes,
-    markers and, if they are few, their names.
+    markers and their names, if there are at most `MAX_WRITTEN_NAMES`.
 
     Tendons are drawn through the body. A cross is the stated place of a marker whose estimated
     place differs; a frame surrounds a marker whose place was not stated.
+
+    Parameters
+    ----------
+    replay : MotionRecord
+        Experiment with a mesh; a node counts as grasped if it is at any sample.
     """
     nodes_m = replay.undeformed_m
     surface = replay.surface

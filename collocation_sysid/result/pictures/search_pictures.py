@@ -94,7 +94,9 @@ def convergence(
 
 
 def _continuation_stages(history: Sequence[Iteration]) -> list[slice]:
-    """Return the ranges of iterations over which the same share of the timesteps was fitted."""
+    """Return the ranges of iterations, as slices of `history`, over which the same share of the
+    timesteps was fitted; empty without iterations.
+    """
     shares = [iteration.share for iteration in history]
     starts = [
         k for k in range(len(shares)) if k == 0 or shares[k] != shares[k - 1]
@@ -152,12 +154,23 @@ def _draw_parameters(
     names: Sequence[str],
     truth: Mapping[str, float] | None,
 ) -> None:
-    """Draw the named parameters over the iterations into `axes`, relative to `truth` or, if that is
-    None, to their final values.
+    """Draw the named parameters over the iterations into `axes`, relative to their true or final
+    values.
 
-    A reference of zero counts as 1, ratios that are not positive are left out, and nothing but the
-    axes is drawn without iterations. Each named parameter must be in `truth`, if given, and in
-    every iteration (otherwise KeyError).
+    A reference of zero counts as 1, and ratios that are not positive are left out. Without
+    iterations only the axes and the line at 1 are drawn.
+
+    Parameters
+    ----------
+    axes : Axes
+        Modified in place; the y axis becomes logarithmic.
+    history : sequence of Iteration
+        Iterations, each with the named parameters (otherwise KeyError).
+    names : sequence of str
+        Names of the parameters.
+    truth : mapping or None
+        True values by name, one for each named parameter (otherwise KeyError); None for the final
+        values.
     """
     axes.axhline(1.0, color=BLACK, lw=0.6)
     numbers = [iteration.number for iteration in history]
