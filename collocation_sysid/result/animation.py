@@ -157,9 +157,11 @@ def film(
         Experiment with at least one trajectory, see `FilmFigure`.
     file : Path
         Ends in .mp4 or .gif; KeyError for another ending. Missing parent folders are made.
-    fps, slowdown, progress
-        See `animate`. A static experiment is shown with `STATIC_SAMPLES_PER_SECOND` samples per
-        second.
+    fps, slowdown : float
+        See `animate`; above zero, which is not checked. A static experiment is shown with
+        `STATIC_SAMPLES_PER_SECOND` samples per second.
+    progress : callable, optional
+        Called with the share of frames written, from 0 to 1.
     names : (str, str)
         Labels of the fitted and of the simulated trajectory.
     headline : str
@@ -199,12 +201,19 @@ def experiment_named(
 ) -> MotionRecord:
     """Return the experiment called `experiment`, or the first one if that is None.
 
-    Experiments without a trajectory do not count. `run` is the run folder that errors name.
+    Parameters
+    ----------
+    replays : sequence of MotionRecord
+        Experiments, of which those without a finite trajectory do not count.
+    experiment : str or None
+        Name of the experiment.
+    run : str or Path, optional
+        The run folder that errors name.
 
     Raises
     ------
     InputError
-        If there is no experiment of that name, or none with a trajectory.
+        If there is no experiment of that name with a trajectory, or none with a trajectory at all.
     """
     available = {replay.name: replay for replay in replays if replay.has_shapes}
     if not available:

@@ -97,7 +97,7 @@ def write_design(
     with_film : bool
         Whether to render the motion as a film.
     say : callable
-        Function that is called with the present activity, a text.
+        Function that is called with the present activity, a text; by default it is printed.
 
     Raises
     ------

@@ -261,6 +261,11 @@ class MotionObjective:
             `TO_FIRST_ORDER` times its `evaluations` are made, with its waves and seed.
         say : callable
             Function that is called with the progress, a text.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            If it is interrupted before the first evaluation.
         """
         sensed = self.recording.template.grasps[0].wrench is not None
         if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:
@@ -541,12 +546,21 @@ def _draws_from_recordings(
     · `options.pairs` arrays (nq,), the estimate first. Poorly determined parameters are drawn no
     wider than `options.spread`. The information (nq, nq) is about q, without priors.
 
+    Parameters
+    ----------
+    problem : Problem
+        Problem with the recordings; not modified.
+    options : DesignOptions
+        Its pairs, spread and seed are used.
+
     Raises
     ------
     InputError
         If the solve does not converge.
+    SimulationError
+        If the solution cannot be linearised.
     KeyboardInterrupt
-        If it is interrupted.
+        If the solve is interrupted.
     """
     solution = solve(problem)
     solution.unless_interrupted()

@@ -238,9 +238,19 @@ def prior_draws(
     `pairs` pairs on either side of it, inside the bounds, see `symmetric_draws`.
 
     A parameter with a prior is drawn from it; the middle is then that of the prior. Others are
-    drawn around their guess, which they must have: logarithms with a standard deviation of ln
-    `spread`, linear ones with `spread` − 1 times their typical size. `seed` decides the random
-    numbers.
+    drawn around their guess.
+
+    Parameters
+    ----------
+    parameters : Parameters
+        Parameters, each with a guess or a prior.
+    spread : float
+        Above 1. Standard deviations of parameters without a prior are ln `spread` for logarithms,
+        and `spread` − 1 times the typical size for linear ones.
+    pairs : int
+        Number of pairs; 0 gives the middle alone.
+    seed : int
+        Seed of the random numbers.
     """
     middle = parameters.guess_q.copy()
     deviation = np.array(

@@ -681,8 +681,9 @@ class LiveEstimator:
         """Return a mask (M,) of markers whose residuals are far larger than usual
         (`OUTLIER_RATIO`).
 
-        It is false for all markers while the estimate has not settled or residuals are gross, if
-        most markers would be outliers, and for missing ones. Nothing is changed.
+        It is false for all markers while the estimate has not settled, the scatter of the residuals
+        is unknown or gross, and if most markers would be outliers; and for missing ones. Nothing is
+        changed.
 
         Parameters
         ----------

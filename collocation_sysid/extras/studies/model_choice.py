@@ -693,6 +693,9 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     ------
     InputError
         If the problem cannot be solved with the method.
+    KeyboardInterrupt
+        If the fit of the nuisance parameters of the held-out recording is interrupted; an
+        interrupted solve is a record that has not converged.
     StopIteration
         If the problem has no recording called `test_name`.
     """

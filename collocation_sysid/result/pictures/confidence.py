@@ -186,8 +186,8 @@ def confidence_ellipses(confidence: Confidence) -> Figure:
 def _draw_pair(
     axes: Axes, outline: Array, half_width: float, half_height: float
 ) -> None:
-    """Draw a region with the outline (points, 2) into `axes`, and a cross of half widths
-    `half_width` and `half_height`.
+    """Draw a region with the outline (points, 2), about the origin, filled into `axes`, and a cross
+    of half widths `half_width` and `half_height`, all as deviations of logarithms.
     """
     axes.fill(*outline.T, facecolor=to_rgba(SKY, 0.35), edgecolor=BLUE, lw=1.0)
     for line in (
