@@ -243,7 +243,7 @@ def prior_draws(
     Parameters
     ----------
     parameters : Parameters
-        Parameters, each with a guess or a prior.
+        Parameters, each with a guess, also if it has a prior.
     spread : float
         Above 1. Standard deviations of parameters without a prior are ln `spread` for logarithms,
         and `spread` − 1 times the typical size for linear ones.
@@ -251,6 +251,11 @@ def prior_draws(
         Number of pairs; 0 gives the middle alone.
     seed : int
         Seed of the random numbers.
+
+    Raises
+    ------
+    InputError
+        If a parameter has no guess.
     """
     middle = parameters.guess_q.copy()
     deviation = np.array(
