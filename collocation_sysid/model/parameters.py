@@ -366,6 +366,8 @@ class Parameters:
                 )
         scalars = {item.name for item in self.scalars}
         for item in self.components:
+            if item.tied is None:
+                continue
             rooted = [
                 other.name
                 for other in (
@@ -373,7 +375,7 @@ class Parameters:
                 )
                 if other.tied is None
             ]
-            if item.tied is not None and item.tied.to not in rooted:
+            if item.tied.to not in rooted:
                 raise InputError(
                     f"tied to {item.tied.to!r}, expected a parameter that is estimated or fixed: "
                     f"{', '.join(rooted)}{hint_at(item.tied.to, rooted)}",
