@@ -6,6 +6,7 @@ beside them is the time that one row takes in a sweep of the whole recording at 
 
     python scripts/benchmark_live.py
     python scripts/benchmark_live.py --frames 360000 --problem block --rows 1   # an hour
+    python scripts/benchmark_live.py --recorded 60000 --budget-ms 8   # ten minutes, then the batch
 """
 
 from __future__ import annotations
@@ -51,6 +52,8 @@ TRUTH = {
     "block": SOFT,
 }
 EARLY_S = 0.3
+# Time between frames at 100 Hz [s].
+FRAME_S = 0.01
 SWEEPS = 5
 
 
@@ -65,11 +68,19 @@ def main() -> None:
     parser.add_argument(
         "--frames", type=int, help="stream to and fro for so many"
     )
+    parser.add_argument(
+        "--recorded",
+        type=int,
+        help="stream a block that moves at random for so many samples, and compare with the batch",
+    )
     arguments = parser.parse_args()
     budget_s = (
         None if arguments.budget_ms is None else 1e-3 * arguments.budget_ms
     )
     options = LiveOptions(budget_s=budget_s, rows=arguments.rows)
+    if arguments.recorded:
+        compare_long_recording(arguments.recorded, options)
+        return
     for name in arguments.problem or NOISE_M:
         problem = _noisy(name)
         live = LiveEstimator(problem, options, time.thread_time)
@@ -178,6 +189,61 @@ def _endless(
             print(
                 f"{name}: {k + 1} frames, {len(live.log)} rows kept, {used_mb:.0f} MB at most"
             )
+
+
+def compare_long_recording(samples: int, options: LiveOptions) -> None:
+    """Stream a long recording, then solve it as a batch, and print latency, memory and differences.
+
+    The block moves at random from beginning to end, so that all frames contain information. The
+    recording and its frames exist before the first frame; the growth of memory from frame 1,000 to
+    the last is that of the estimator.
+
+    Parameters
+    ----------
+    samples : int
+        Camera frames at 100 Hz, above 1,000.
+    options : LiveOptions
+    """
+    problem = twin("block", SOFT, seed=0, samples=samples)
+    live = LiveEstimator(problem, options, time.thread_time)
+    frames = list(frames_of_recording(problem.experiments[0], live.model))
+    latencies_s = np.zeros(len(frames))
+    with without_garbage_of_startup():
+        for k, frame in enumerate(frames):
+            update = live.process_frame(frame)
+            latencies_s[k] = update.latency_s
+            if k in (999, len(frames) - 1):
+                print(f"block: {k + 1} frames, {peak_memory_mb():.0f} MB")
+    median_ms, late_ms, worst_ms = 1e3 * np.percentile(
+        latencies_s, [50, 99, 100]
+    )
+    print(
+        f"    median {median_ms:.2f} ms, 99 % below {late_ms:.2f} ms, longest {worst_ms:.2f} ms; "
+        f"{100 * np.mean(latencies_s < FRAME_S):.2f} % within {1e3 * FRAME_S:g} ms"
+    )
+    began_s = time.process_time()
+    whole = replace(problem, substeps=live.model.substeps)
+    solution = solve(whole, ReducedSpace())
+    print(
+        f"    batch: {len(solution.history)} sweeps, {time.process_time() - began_s:.0f} s, "
+        f"{peak_memory_mb():.0f} MB"
+    )
+    batch = uncertainty_at(solution.collocation, solution.z).estimates
+    for key, true in SOFT.items():
+        found = update.estimates[key]
+        known = batch[key]
+        error = known.statistical_std_error or np.nan
+        print(
+            f"    {key}: live {found.value:.6g} ± {found.statistical_std_error or np.nan:.2g}, "
+            f"batch {known.value:.6g} ± {error:.2g}, truth {true:g}: "
+            f"{abs(found.value - known.value) / error:.2f} standard errors apart"
+        )
+    print(f"    verdict: {update.trust.verdict} {update.trust.reasons}")
+
+
+def peak_memory_mb() -> float:
+    """Return the largest memory of this process so far [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 if __name__ == "__main__":

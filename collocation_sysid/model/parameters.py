@@ -364,19 +364,21 @@ class Parameters:
                 raise InputError(
                     "given twice, expected one value", None, where=name
                 )
-        scalars = {item.name for item in self.scalars}
-        for item in self.components:
-            rooted = [
-                other.name
-                for other in (
-                    self.scalars if item.name in scalars else self.components
-                )
-                if other.tied is None
-            ]
-            if item.tied is not None and item.tied.to not in rooted:
+        # A scalar cannot be tied to a component of a vector.
+        self._check_ties(self.scalars)
+        self._check_ties(self.components)
+
+    @staticmethod
+    def _check_ties(items: Iterable[Parameter]) -> None:
+        """Raise an InputError for a parameter of `items` that is tied to one that is not among
+        these, or is tied itself.
+        """
+        untied = {item.name: item for item in items if item.tied is None}
+        for item in items:
+            if item.tied is not None and item.tied.to not in untied:
                 raise InputError(
                     f"tied to {item.tied.to!r}, expected a parameter that is estimated or fixed: "
-                    f"{', '.join(rooted)}{hint_at(item.tied.to, rooted)}",
+                    f"{', '.join(untied)}{hint_at(item.tied.to, untied)}",
                     None,
                     where=item.name,
                 )
