@@ -598,7 +598,7 @@ OPTIONS = [
         options=settings("title.a=3"),
     ),
     bad(
-        "set-in-an-item-that-is-not-there", "--set", "found '4'", "0 to 0 or swing",
+        "set-in-an-item-that-is-not-there", "--set", "found '4'", "0 to 0, or its name swing",
         options=settings("experiment.4.start=undeformed"),
     ),
     bad(
