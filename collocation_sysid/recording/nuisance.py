@@ -952,5 +952,6 @@ def _check_custom_kind(row: NuisanceRow) -> None:
         )
     if (row.reading is None) == (row.clock is None):
         raise InputError(
-            f"{row.name} has to have a reading or a clock, one of both"
+            f"{row.name} has {'a reading and a clock' if row.reading else 'no reading or clock'}; "
+            "expected one of both"
         )
