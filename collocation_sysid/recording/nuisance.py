@@ -609,8 +609,8 @@ SENSOR_LAG = NuisanceRow(
     by="worst",
     label="lag of the sensor{which}",
     sentence="time constant of the sensor: {size}",
-    description="time constant of a first-order low-pass in the sensor; from zero to three "
-    "standard deviations",
+    description="time constant of a first-order low-pass in the sensor; between zero and "
+    "three standard deviations of its prior",
 )
 TOOL_MASS = NuisanceRow(
     "tool_kg",
@@ -816,8 +816,8 @@ class Nuisance:
     sensor_time_s : float or None
         Delay of the measured wrenches; at most three standard deviations.
     sensor_lag_s : float or None
-        Time constant of a first-order low-pass in the sensor; from zero to three standard
-        deviations.
+        Time constant of a first-order low-pass in the sensor; between zero and three
+        standard deviations of its prior.
     tool_kg : float or None
         Mass of the tool between a sensor and the body.
     tool_m : float or None
