@@ -401,7 +401,10 @@ class MotionRecord:
         stored["part_names"] = [str(part) for part in arrays[names_key]]
         parts = stored["surface_parts"]
         if len(stored["marker_names"]) != len(stored["marker_places_m"]):
-            raise ValueError(f"{len(stored['marker_names'])} marker_names")
+            raise ValueError(
+                f"marker_names has {len(stored['marker_names'])} names for "
+                f"{len(stored['marker_places_m'])} markers"
+            )
         if parts.min() < 0 or parts.max() >= len(stored["part_names"]):
             raise ValueError("surface_parts contains parts that do not exist")
         return cls(name=name, **stored)

@@ -623,7 +623,8 @@ class FrameReader:
         }
         if unknown := [name for name in columns if name not in known]:
             raise InputError(
-                f"a column {reprlib.repr(unknown[0])}; expected {', '.join(sorted(known))}"
+                f"found a column {reprlib.repr(unknown[0])}; expected some of "
+                f"{', '.join(sorted(known))}"
             )
         return columns
 
