@@ -708,7 +708,7 @@ def test_a_slip_is_explained_and_nothing_is_written(tiny, edit, options, words):
             ),
             ("plot nowhere", "nowhere", "not a run folder", "result.json"),
             ("plot .", "not a run folder", "result.json"),
-            ("new .", "problem.toml", "there already"),
+            ("new .", "problem.toml", "exists already"),
             ("new problem.toml/mine", "problem.toml", "is a file"),
         ]
     ],
