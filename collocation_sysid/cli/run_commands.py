@@ -112,10 +112,11 @@ class ExportCommand(RunFolderOptions):
 def export(options: ExportCommand) -> None:
     """Write the identified body for another simulator: mesh, material, damping, grasp.
 
-    Properties that the target cannot represent are printed. A file of --to gets the format of its
-    suffix; the poses and identified.json are written beside it, with its name before theirs. A
-    format writes a folder of files, export-FORMAT in the run folder by default. A folder whose name
-    is a format, such as out/mujoco, is a destination too.
+    Properties that the target cannot represent are printed. If --to names a file, the format
+    follows from its suffix; the poses and identified.json are written beside it, with the name of
+    the file as prefix. If --to names a format, a folder of files is written, by default export-
+    FORMAT in the run folder. A folder whose name is a format, such as out/mujoco, is a destination
+    too.
 
     The format rerun is a recording of the motion, of all experiments or one, for the Rerun viewer.
     """

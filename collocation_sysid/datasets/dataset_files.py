@@ -123,7 +123,9 @@ def copy_dataset(name: str, folder: Path) -> list[Path]:
     schema = [] if url else [folder / SCHEMA_FILE]
     for copy in (*copies.values(), *schema):
         if copy.exists():
-            raise InputError("it is there already; choose another name", copy)
+            raise InputError(
+                "this file exists already; choose another folder", copy
+            )
     for file, copy in copies.items():
         _copy_file(file, copy, schema=url or SCHEMA_FILE)
     for file in schema:

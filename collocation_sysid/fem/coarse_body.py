@@ -264,7 +264,8 @@ def _coarse_field(
         return None
     if type(modes) is not FieldModes:
         raise InputError(
-            f"the field of {source.field_name} has a value of its own in each element"
+            f"the field of {source.field_name} has a value of its own in each element, so that it "
+            "cannot be taken over to a coarse mesh"
         )
     centres_m = body.mesh.centres_m[source.cells]
     _, nearest = KDTree(centres_m).query(coarse.mesh.centres_m[part.cells])

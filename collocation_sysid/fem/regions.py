@@ -573,7 +573,7 @@ class ConstantsModel:
         for name in list(self.constants)[len(theta) :]:
             if name not in values:
                 raise InputError(
-                    "no value is given of this constant of a force or friction",
+                    "this constant of a force or friction has no value; expected one in [parameters]",
                     None,
                     where=name,
                 )

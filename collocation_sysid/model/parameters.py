@@ -288,8 +288,8 @@ def complete_parameter(
     if scale == "linear" and typical == 0:
         statement = "no guess" if user_statement.guess is None else "guess = 0"
         raise InputError(
-            f"{statement} of a linear parameter does not determine its scale; expected typical, "
-            "the size of its changes in a step",
+            f"a linear parameter with {statement} has no scale; expected typical, the size of its "
+            "usual changes",
             None,
             where=name,
         )

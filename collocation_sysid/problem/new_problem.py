@@ -55,7 +55,9 @@ def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
     schema = [] if url else [folder / SCHEMA_FILE]
     for each in (file, *(folder / each.name for each in data), *schema):
         if each.exists():
-            raise InputError("it is there already; choose another name", each)
+            raise InputError(
+                "this file exists already; choose another folder", each
+            )
     title = json.dumps(
         folder.resolve().name, ensure_ascii=False
     )  # quoted as TOML quotes

@@ -345,8 +345,8 @@ class SensorTimePrior(NuisancePriorSection):
 
 
 class SensorLagPrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: time constant of a first-order low-pass in the sensor; from
-    zero to three standard deviations.
+    """Prior of a nuisance parameter: time constant of a first-order low-pass in the sensor;
+    between zero and three standard deviations.
 
     Attributes
     ----------

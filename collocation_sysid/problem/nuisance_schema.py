@@ -127,8 +127,8 @@ class NuisanceSection(Section):
     sensor_time : SensorTimePrior or "none", optional
         Delay of the measured wrenches; at most three standard deviations: prior_s, 5 ms by default.
     sensor_lag : SensorLagPrior or "none", optional
-        Time constant of a first-order low-pass in the sensor; from zero to three standard
-        deviations: prior_s.
+        Time constant of a first-order low-pass in the sensor; between zero and three
+        standard deviations of its prior: prior_s.
     tool : ToolPrior or "none", optional
         Mass of the tool between a sensor and the body: prior_kg. Centre of the tool relative to the
         sensor's point; in the world's frame, relative to that of the grasped nodes: prior_m.

@@ -296,9 +296,11 @@ def _item_key(place: Any, part: str, key: str) -> str | int:
         return names.index(part)
     if part.isascii() and part.isdecimal() and int(part) < len(place):
         return int(part)
-    expected = f"a number from 0 to {len(place) - 1}"
-    expected += "".join(f" or {name}" for name in names if name)
-    raise InputError(f"found {part!r} in {key}; expected {expected}")
+    expected = f"its number, from 0 to {len(place) - 1}"
+    expected += "".join(f", or its name {name}" for name in names if name)
+    raise InputError(
+        f"found {part!r} for a table of the list in {key}; expected {expected}"
+    )
 
 
 def _parse_value(text: str, key: str) -> Any:

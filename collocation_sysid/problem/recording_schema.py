@@ -128,11 +128,12 @@ class DisplacementSection(TableSection):
 
 
 class WrenchSection(TableSection):
-    """The measured force and torque that the grasp exerts on the body.
+    """The measured force and torque that the grasp or the obstacle exerts on the body.
 
-    Columns t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, in these or other units, at their
-    own rate; or a machine's force, or engineering stress with an area. Blank cells are missing. For
-    a sensor that reports the reaction, the wrench of the body on the grasp, set sign = -1.
+    The table has the column t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, in these or
+    other units; its rate may differ from that of the poses and markers. Or it has the force of a
+    testing machine, or an engineering stress, with area_m2. Blank cells are missing. For a sensor
+    that reports the reaction, the wrench of the body on the grasp or obstacle, set sign = -1.
 
     Attributes
     ----------

@@ -266,8 +266,8 @@ class ObjectSection(Section):
             require_one(self, *SHAPES)
         if self.has_shape and self.mesh is None and self.edge_length_m is None:
             raise ValueError(
-                "edge_length_m is missing; expected the length of the elements' edges beside "
-                "surface, cylinder or box_m"
+                "edge_length_m is missing; expected the length of the elements' edges "
+                "together with surface, cylinder or box_m"
             )
         if self.mesh is not None and self.edge_length_m is not None:
             raise ValueError(

@@ -119,7 +119,7 @@ class Gauge:
         vars(self).update(t_s=times, points_m=points)
         if fault := first_unordered_time(times):
             raise InputError(
-                f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}"
+                f"{fault[1]} in t_s of {where}", where=f"row {fault[0] + 1}"
             )
         if (self.grasp is None) == (not len(points)):
             both = (

@@ -722,7 +722,7 @@ class Experiment:
         if placed not in (own, n):
             raise InputError(
                 f"the markers were associated with a body of {placed} nodes, but this body has "
-                f"{own}"
+                f"{own}; expected an association with this body"
             )
 
     def _check_obstacles(self) -> None:

@@ -609,8 +609,8 @@ SENSOR_LAG = NuisanceRow(
     by="worst",
     label="lag of the sensor{which}",
     sentence="time constant of the sensor: {size}",
-    description="time constant of a first-order low-pass in the sensor; from zero to three "
-    "standard deviations",
+    description="time constant of a first-order low-pass in the sensor; between zero and "
+    "three standard deviations of its prior",
 )
 TOOL_MASS = NuisanceRow(
     "tool_kg",
@@ -816,8 +816,8 @@ class Nuisance:
     sensor_time_s : float or None
         Delay of the measured wrenches; at most three standard deviations.
     sensor_lag_s : float or None
-        Time constant of a first-order low-pass in the sensor; from zero to three standard
-        deviations.
+        Time constant of a first-order low-pass in the sensor; between zero and three
+        standard deviations of its prior.
     tool_kg : float or None
         Mass of the tool between a sensor and the body.
     tool_m : float or None
@@ -952,5 +952,6 @@ def _check_custom_kind(row: NuisanceRow) -> None:
         )
     if (row.reading is None) == (row.clock is None):
         raise InputError(
-            f"{row.name} has to have a reading or a clock, one of both"
+            f"{row.name} has {'a reading and a clock' if row.reading else 'no reading or clock'}; "
+            "expected one of both"
         )

@@ -182,13 +182,11 @@ class Specimen:
         of = f"a {self.test} test"
         if (self.second_strain is None) == bool(self.deformation.second):
             fault = (
-                f"{of} needs"
+                f"{of} needs a second strain, along its second axis"
                 if self.second_strain is None
-                else f"{of} does not have"
+                else f"{of} does not have a second strain; leave it out"
             )
-            raise InputError(
-                f"{fault} a second strain", None, where="second_strain"
-            )
+            raise InputError(fault, None, where="second_strain")
         if (
             self.second_stress_pa is not None
             and not self.deformation.second_stress

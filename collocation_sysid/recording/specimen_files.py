@@ -179,7 +179,8 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
     """
     if layout.test == "simple-shear" and "stretch" in layout.columns:
         raise InputError(
-            "a simple-shear test has a strain and no stretch", where="columns"
+            "found a column for the stretch of a simple-shear test; expected one for its strain",
+            where="columns",
         )
     table = read_columns(
         path,

@@ -217,7 +217,10 @@ def experiment_named(
     """
     available = {replay.name: replay for replay in replays if replay.has_shapes}
     if not available:
-        raise InputError("no experiment of this run has a trajectory", run)
+        raise InputError(
+            "no experiment of this run has a stored motion of a body; expected one with a mesh",
+            run,
+        )
     if experiment is None:
         return next(iter(available.values()))
     require_among(

@@ -72,6 +72,8 @@ ARRAY_LAYOUT = {
     "pressures_pa": ("f", "TF"),
     "strain": ("f", "T"),
 }
+# Words for the kinds of numbers in `ARRAY_LAYOUT`.
+KINDS_TEXT = {"f": "floats", "iu": "whole numbers", "b": "booleans"}
 # Side of the square that represents a plane, over the body's largest extent.
 PLANE_SIZE_RATIO = 1.4
 # Arrays that may have NaN or infinity.
@@ -399,7 +401,10 @@ class MotionRecord:
         stored["part_names"] = [str(part) for part in arrays[names_key]]
         parts = stored["surface_parts"]
         if len(stored["marker_names"]) != len(stored["marker_places_m"]):
-            raise ValueError(f"{len(stored['marker_names'])} marker_names")
+            raise ValueError(
+                f"marker_names has {len(stored['marker_names'])} names for "
+                f"{len(stored['marker_places_m'])} markers"
+            )
         if parts.min() < 0 or parts.max() >= len(stored["part_names"]):
             raise ValueError("surface_parts contains parts that do not exist")
         return cls(name=name, **stored)
@@ -485,7 +490,10 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
             if x not in "Mk"
         )
         if array.dtype.kind not in kinds or array.ndim != len(letters) or empty:
-            raise ValueError(f"{key} is {array.dtype} of shape {here}")
+            raise ValueError(
+                f"{key} is {array.dtype} of shape {here}; expected {KINDS_TEXT[kinds]} with "
+                f"{len(letters)} axes, none of length 0"
+            )
         if any(
             size not in (None, size_here)
             for size, size_here in zip(expected, here, strict=True)
@@ -515,13 +523,17 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
         "fields": lambda shape: shape == (elements, 4),
         "visible_points": lambda shape: shape[1:] == (8,),
     }
+    shape_texts = {
+        "readings": "(samples, 1 + 3 k) with k > 0",
+        "fields": f"({elements}, 4)",
+        "visible_points": "(points, 8)",
+    }
     for group, front in GROUP_PREFIXES.items():
-        for name, expected_shape in arrays[group].items():
-            if expected_shape.dtype.kind != "f" or not fits[group](
-                expected_shape.shape
-            ):
+        for name, array in arrays[group].items():
+            if array.dtype.kind != "f" or not fits[group](array.shape):
                 raise ValueError(
-                    f"{front}{name} is {expected_shape.dtype} of shape {expected_shape.shape}"
+                    f"{front}{name} is {array.dtype} of shape {array.shape}; expected floats of "
+                    f"shape {shape_texts[group]}"
                 )
     for key in ("tetrahedra", "surface", "surface_nodes"):
         if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:

@@ -837,10 +837,12 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
         shape = (len(t_s), len(markers), 3)
         residuals_m = arrays[key]
         largest = float(np.nanmax(np.abs(residuals_m), initial=0.0))
-        if residuals_m.shape != shape or largest > LARGEST_NUMBER:
+        if residuals_m.shape != shape:
             raise ValueError(
-                f"the shape of {key} does not match its times and markers"
+                f"{key} has the shape {residuals_m.shape}; its times and markers need {shape}"
             )
+        if largest > LARGEST_NUMBER:
+            raise ValueError(f"{key} contains numbers above {LARGEST_NUMBER:g}")
         errors = np.nan_to_num(np.linalg.norm(residuals_m, axis=2))
         for _ in range(SHOWN_ERRORS if errors.size else 0):
             t, m = np.unravel_index(int(errors.argmax()), errors.shape)

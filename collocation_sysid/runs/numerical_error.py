@@ -244,8 +244,9 @@ def _solve_refined_problem(
     )
     if not solution.unless_interrupted().status.converged:
         raise InputError(
-            f"the problem with the {what} was not solved ({solution.status.value}: "
-            f"{solution.message}); solve it separately to find the cause"
+            f"the refinement with the {what} was not solved ({solution.status.value}: "
+            f"{solution.message}); solve the problem with more transcription.substeps or a finer "
+            "mesh yourself to find the cause"
         )
     return solution
 

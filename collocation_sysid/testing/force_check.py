@@ -116,7 +116,7 @@ def check_force(
     values = usual_constants(made.constants, constants)
     if energy is not None and made.on != "nodes":
         raise InputError(
-            f"force {made.name!r} is on faces; expected no energy, or one on nodes"
+            f"force {made.name!r} is on faces, where an energy cannot be checked; leave out the energy"
         )
     law = ForceLaw(made, np.array([*values.values()]))
     states = [

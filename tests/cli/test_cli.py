@@ -848,7 +848,7 @@ def test_a_new_problem_leaves_the_data_that_are_there(tmp_path, monkeypatch):
     own.write_text("measured")
     outcome = run_command("new", "mine", "--kind", "swing")
     assert outcome.code == 2
-    assert "markers.csv: it is there already" in outcome.err
+    assert "markers.csv: this file exists already" in outcome.err
     assert [*own.parent.iterdir()] == [own]
     assert own.read_text() == "measured"
 

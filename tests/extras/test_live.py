@@ -832,7 +832,7 @@ def test_tables_of_frames_have_readings_in_their_columns():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ('{"chip": 1}', "a reading 'chip'; expected accelerometer, foil"),
+        ('{"chip": 1}', "found a reading 'chip'; expected accelerometer, foil"),
         (
             '{"foil": [1, 2]}',
             "the reading 'foil': found 2 numbers; expected 1 numbers",

@@ -324,7 +324,11 @@ def test_tables_of_frames_have_wrenches_in_their_columns():
             {"t_s": 1},
             "a sample of the wrench of grasp 1 has 't_s'; expected t_s and values",
         ),
-        (1, {"2": SIX}, "a wrench of grasp '2'; expected 1"),
+        (
+            1,
+            {"2": SIX},
+            "found a wrench of grasp '2'; expected the number of a grasp with a sensor, 1",
+        ),
         (
             2,
             SIX,

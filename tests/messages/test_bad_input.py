@@ -598,7 +598,7 @@ OPTIONS = [
         options=settings("title.a=3"),
     ),
     bad(
-        "set-in-an-item-that-is-not-there", "--set", "found '4'", "0 to 0 or swing",
+        "set-in-an-item-that-is-not-there", "--set", "found '4'", "0 to 0, or its name swing",
         options=settings("experiment.4.start=undeformed"),
     ),
     bad(
@@ -708,7 +708,7 @@ def test_a_slip_is_explained_and_nothing_is_written(tiny, edit, options, words):
             ),
             ("plot nowhere", "nowhere", "not a run folder", "result.json"),
             ("plot .", "not a run folder", "result.json"),
-            ("new .", "problem.toml", "there already"),
+            ("new .", "problem.toml", "exists already"),
             ("new problem.toml/mine", "problem.toml", "is a file"),
         ]
     ],

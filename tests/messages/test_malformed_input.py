@@ -129,7 +129,7 @@ def test_only_digits_of_ascii_are_digits(tiny: Path, file: str, number: str):
 
 def test_nor_are_others_places_in_a_list_or_counts(tiny: Path):
     words = settings("experiment.٠.start=undeformed")
-    assert "expected a number from 0" in refused(
+    assert "expected its number, from 0" in refused(
         "check", "problem.toml", *words
     )
     assert "whole numbers" in refused(

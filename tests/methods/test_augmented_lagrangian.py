@@ -119,7 +119,7 @@ def test_an_interruption_keeps_the_last_iterate():
         ),
         (
             {"rho_max": 1.0},
-            r"rho_max: found 1 with rho = 100000; expected no less than rho",
+            r"rho_max: found 1, which is less than rho = 100000; expected rho or more",
         ),
     ],
 )

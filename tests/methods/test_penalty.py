@@ -270,7 +270,7 @@ def test_nuisance_parameters_may_be_estimated_by_gradients_alone():
         ),
         (
             {"rho": 1e9},
-            r"rho_max: found 1e\+08 with rho = 1e\+09; expected no less than rho",
+            r"rho_max: found 1e\+08, which is less than rho = 1e\+09; expected rho or more",
         ),
         (
             {"violation": -1.0},

@@ -116,7 +116,7 @@ def test_without_it_the_answer_is_wrong():
     [
         (
             {"reading": None},
-            "extra has to have a reading or a clock, one of both",
+            "extra has no reading or clock; expected one of both",
         ),
         (
             {"sigma": None},

@@ -117,7 +117,7 @@ def test_a_copy_of_measured_data_has_source_licence_and_schema(tmp_path):
             in text
         )
     assert not (tmp_path / "kawabata_1981" / "calendering.csv").exists()
-    with pytest.raises(cs.InputError, match="it is there already"):
+    with pytest.raises(cs.InputError, match="this file exists already"):
         copy_dataset("diani", tmp_path / "diani")
 
 

@@ -122,7 +122,7 @@ def test_a_schema_of_others_is_left_alone(tmp_path):
     own.write_text("mine")
     outcome = run_command("new", tmp_path / "mine")
     assert outcome.code == 2
-    assert f"{own}: it is there already" in outcome.err
+    assert f"{own}: this file exists already" in outcome.err
     assert [*own.parent.iterdir()] == [own]
 
 

@@ -122,7 +122,8 @@ def test_a_fault_is_one_sentence(force, options: dict, sentence: str):
 
 def test_an_energy_of_a_force_on_faces_is_refused():
     with pytest.raises(
-        cs.InputError, match="'suction' is on faces; expected no energy"
+        cs.InputError,
+        match="'suction' is on faces, where an energy cannot be checked",
     ):
         check_force(
             cs.NodeForce.from_law(suction, on="faces"), energy=bed_energy

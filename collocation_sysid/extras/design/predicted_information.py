@@ -464,8 +464,8 @@ class FutureRecording:
         rate_hz = 1 / self.template.timestep_s
         if (limits.frequency_hz or 0.0) > rate_hz / 2:
             raise InputError(
-                f"found {limits.frequency_hz:g}; expected at most {rate_hz / 2:g}, half the rate "
-                "of the samples",
+                f"found {limits.frequency_hz:g} Hz as the highest frequency of the motion; "
+                f"expected at most {rate_hz / 2:g} Hz, half the sampling rate",
                 None,
                 where="frequency_hz",
             )

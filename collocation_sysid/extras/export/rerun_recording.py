@@ -80,7 +80,10 @@ def write_rerun(
         replays = [experiment_named(replays, experiment, run=run)]
     replays = [replay for replay in replays if replay.has_shapes]
     if not replays:
-        raise InputError("no experiment of this run has a trajectory", run)
+        raise InputError(
+            "no experiment of this run has a stored motion of a body; expected one with a mesh",
+            run,
+        )
     stresses = [_stress_on_faces(run, replay) for replay in replays]
     with replaced_folder(
         folder, marker_file=RECORDING_FILE, content_word="recording"

@@ -69,7 +69,8 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         )
     if (body.is_prescribed.any(axis=1) != body.is_node_prescribed).any():
         raise InputError(
-            "a grasp holds single axes, which the scene for SOFA does not support"
+            "a grasp holds single axes, which the scene for SOFA does not support: export to "
+            "calculix or json"
         )
     region = body.regions[0]
     limits = [*CAPABILITIES.limitations(body)]

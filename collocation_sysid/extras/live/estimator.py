@@ -1406,7 +1406,7 @@ class LiveEstimator:
             )
             self._rejected = 0
             if was_search:
-                notes.append("restarted with another stiffness")
+                notes.append("continued from another initial stiffness")
             self.scatter = CombinedPasses.from_passes(
                 second_pass, None
             ).scatter(second_pass.sweep.transformed)

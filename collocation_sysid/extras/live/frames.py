@@ -93,7 +93,8 @@ def parse_pose(
         known = [str(number) for number in grasp_numbers]
         if unknown := [name for name in pose if name not in known]:
             raise InputError(
-                f"a pose of grasp {reprlib.repr(unknown[0])}; expected {', '.join(known)}"
+                f"found a pose of grasp {reprlib.repr(unknown[0])}; expected the number of a grasp, "
+                f"{', '.join(known)}"
             )
         each = [pose.get(name) for name in known]
     elif len(grasp_numbers) == 1:
@@ -179,7 +180,7 @@ def parse_markers(
         for name, place in markers.items():
             if name not in names:
                 raise InputError(
-                    f"a marker {reprlib.repr(name)}; expected {', '.join(names)}"
+                    f"found a marker {reprlib.repr(name)}; expected one of {', '.join(names)}"
                 )
             if place is not None:
                 tracks[list(names).index(name)] = _parse_array(place, (3,))
@@ -223,7 +224,7 @@ def parse_custom_readings(
         if name not in names:
             known = ", ".join(names) or "none, as the problem has none"
             raise InputError(
-                f"a reading {reprlib.repr(name)}; expected {known}"
+                f"found a reading {reprlib.repr(name)}; expected {known}"
             )
         number = names.index(name)
         count = gauges[number].measured_values.shape[1]
@@ -281,7 +282,8 @@ def parse_wrenches(
     if unknown := [name for name in wrench_data if name not in known]:
         expected = ", ".join(known)
         raise InputError(
-            f"a wrench of grasp {reprlib.repr(unknown[0])}; expected {expected}"
+            f"found a wrench of grasp {reprlib.repr(unknown[0])}; expected the number of a grasp "
+            f"with a sensor, {expected}"
         )
     collected = []
     for name, samples in wrench_data.items():
@@ -627,7 +629,8 @@ class FrameReader:
         }
         if unknown := [name for name in columns if name not in known]:
             raise InputError(
-                f"a column {reprlib.repr(unknown[0])}; expected {', '.join(sorted(known))}"
+                f"found a column {reprlib.repr(unknown[0])}; expected some of "
+                f"{', '.join(sorted(known))}"
             )
         return columns
 

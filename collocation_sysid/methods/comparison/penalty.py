@@ -147,9 +147,11 @@ class PenaltyOptions(Options):
         """Raise an `InputError` if an option is invalid, or the last ρ is below the first."""
         super().__post_init__()
         if self.last_rho < self.rho:
-            finding = f"found {self.rho_max:g} with rho = {self.rho:g}"
             raise InputError(
-                f"{finding}; expected no less than rho", None, where="rho_max"
+                f"found {self.rho_max:g}, which is less than rho = {self.rho:g}; expected rho or "
+                "more",
+                None,
+                where="rho_max",
             )
 
     def __call__(

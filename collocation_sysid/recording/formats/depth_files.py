@@ -289,7 +289,9 @@ def _read_folder(
             t_s = times_in_column(read_table(decode(read_bytes(times))), 0)
         if len(t_s) != len(files):
             raise InputError(
-                f"has {len(t_s)} times for {len(files)} files", times
+                f"has {len(t_s)} times for {len(files)} files of the folder; expected one for "
+                "each",
+                times,
             )
     images = [image for part in parts for image in part.images_m]
     return DepthFileContent(

@@ -674,7 +674,8 @@ def _poses_through_frames(
     times = max((t[(t >= first) & (t <= last)] for t in moving), key=len)
     if not len(times):
         raise InputError(
-            f"the transforms between {parent} and {child} have no common time span"
+            f"the transforms between {parent} and {child} have no common time span; expected a "
+            "log in which all of them are recorded at the same time, or poses in a table"
         )
     manager = Manager(check=False)
     for edge in path:
@@ -749,7 +750,10 @@ def frame_path(
         for each, frame in ((ours, child), (theirs, parent))
     }
     if not path or len(roots) > 1:
-        raise InputError(f"no chain of frames leads from {parent} to {child}")
+        raise InputError(
+            f"no chain of frames leads from {parent} to {child}; expected a transform (tf or "
+            "tf_static) between each frame and the next"
+        )
     return path
 
 
@@ -812,7 +816,11 @@ def _poses_from_joints(
     }
     if not limits:
         joints = ", ".join(columns)
-        raise InputError(f"has none of the joints {joints}", address.robot)
+        raise InputError(
+            f"has none of the joints {joints} of the log; expected the description of the recorded "
+            "robot",
+            address.robot,
+        )
     poses = np.empty((len(values), 7))
     for row, position in enumerate(values):
         for name, value in zip(columns, position, strict=True):

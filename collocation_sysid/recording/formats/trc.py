@@ -28,7 +28,8 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     rows = [row for row in tab_rows(text) if any(row.cells)]
     if len(rows) < 5:
         raise InputError(
-            "ends within the header of a TRC file",
+            "the file ends within its TRC header; expected five header rows and the frames: "
+            "export it again",
             where=f"line {rows[-1].line}",
         )
     _, keys, values, names, axes, *frames = rows

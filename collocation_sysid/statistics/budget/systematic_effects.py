@@ -1139,8 +1139,8 @@ class Assumptions(Options):
     sensor_time_s
         Delay of the measured wrenches; at most three standard deviations [s].
     sensor_lag_s
-        Time constant of a first-order low-pass in the sensor; from zero to three standard
-        deviations [s].
+        Time constant of a first-order low-pass in the sensor; between zero and three
+        standard deviations of its prior [s].
     tool_kg
         Mass of the tool between a sensor and the body [kg].
     tool_m
