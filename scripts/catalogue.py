@@ -243,8 +243,8 @@ def _section(entry: CatalogueEntry) -> str:
         + (f"; damping: {', '.join(entry.damping)}" if entry.damping else "")
         + f". Recordings: {', '.join(entry.recordings)}. Problem: `{entry.problem}`.\n",
         _table(shown, rows) + "\n",
-        f"- Stretch {stretch.low:.4g} to {stretch.high:.4g}, extremes {stretch.minimum:.4g} and "
-        f"{stretch.maximum:.4g}.",
+        f"- Stretch: 5 % and 95 % quantiles {stretch.low:.4g} and {stretch.high:.4g}, smallest and "
+        f"largest value {stretch.minimum:.4g} and {stretch.maximum:.4g}.",
         _rate_sentence(entry.strain_rate_1_s),
         f"- Verdict: **{entry.verdict}**"
         + (f", because {'; '.join(entry.reasons)}." if entry.reasons else "."),

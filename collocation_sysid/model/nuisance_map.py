@@ -272,22 +272,20 @@ class NuisanceMap:
         y = ca.SX.sym("y", 3)
         t_s = ca.SX.sym("t_s")
         values = ca.SX.sym("values", max(1, len(row.axes.split())))
-        what = "reading" if row.reading else "clock"
+        kind = "reading" if row.reading else "clock"
+        what = f"{kind} of the nuisance parameter {row.name!r}"
         try:
             expression: Any = row.reading and row.reading(y, values, t_s, self)
             expression = ca.SX(
                 row.clock(values, t_s, self) if row.clock else expression
             )
         except Exception as error:
-            raise InputError(
-                f"the {what} of {row.name} failed: {reason(error)}"
-            ) from error
+            raise InputError(f"the {what} failed: {reason(error)}") from error
         expected = (3, 1) if row.reading else (1, 1)
         if expression.shape != expected:
-            problem = (
-                f"the {what} of {row.name} has the shape {expression.shape}"
+            raise InputError(
+                f"the {what} has the shape {expression.shape}; expected {expected}"
             )
-            raise InputError(f"{problem}; expected {expected}")
         slopes = ca.Function(
             "slopes",
             [y, values, t_s],
@@ -296,7 +294,9 @@ class NuisanceMap:
         evaluated = slopes([0.1, 0.2, 0.3], 0.0, self.interval_s)
         if not all(np.isfinite(part.full()).all() for part in evaluated):
             raise InputError(
-                f"the {what} of {row.name} or its derivatives are not finite at zero"
+                f"the {what}, or its derivative with respect to the parameter, is not finite "
+                "where the parameter is zero; expected a formula that is smooth there, which "
+                "√s, log(s) and 1/s of a parameter s are not"
             )
 
     @property

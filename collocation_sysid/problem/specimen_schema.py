@@ -105,7 +105,8 @@ class SpecimenSection(NamedSection):
         require_one(self, "sigma_pa", "sigma_n")
         if self.sigma_n is not None and self.area_m2 is None:
             raise ValueError(
-                "found sigma_n without area_m2, which divides it; expected both"
+                "found sigma_n without area_m2; expected area_m2 too, because the noise of the "
+                "stress is sigma_n / area_m2, or sigma_pa instead of sigma_n"
             )
         if (
             self.window_s is not None

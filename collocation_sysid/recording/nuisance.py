@@ -901,7 +901,8 @@ class Nuisance:
             value = self.sigma(row)
             if value is not None and not value > 0:
                 raise InputError(
-                    f"{row.name} is {value:g}; expected a standard deviation above 0"
+                    f"the standard deviation of the nuisance parameter {row.name!r} is {value:g}; "
+                    "expected a value above 0"
                 )
         names = [row.name for row in self.kinds]
         for name, word in self.scope.items():
@@ -944,14 +945,17 @@ def _check_custom_kind(row: NuisanceRow) -> None:
     """
     if row.of not in ("recording", "marker"):
         raise InputError(
-            f"{row.name} is of a {row.of}; expected of = 'recording' or 'marker'"
+            f"the nuisance parameter {row.name!r} has of = {row.of!r}; expected 'recording' or "
+            "'marker'"
         )
     if row.sigma is None:
         raise InputError(
-            f"{row.name} has no sigma; expected the standard deviation of its prior"
+            f"the nuisance parameter {row.name!r} has no sigma; expected the standard deviation "
+            "of its prior"
         )
     if (row.reading is None) == (row.clock is None):
         raise InputError(
-            f"{row.name} has {'a reading and a clock' if row.reading else 'no reading or clock'}; "
-            "expected one of both"
+            f"the nuisance parameter {row.name!r} has "
+            f"{'a reading and a clock' if row.reading else 'neither a reading nor a clock'}; "
+            "expected exactly one of them"
         )

@@ -183,7 +183,7 @@ def test_without_gravity_there_is_no_tilt():
 def test_deviations_must_be_positive():
     with pytest.raises(
         InputError,
-        match=r"time_shift_s is 0; expected a standard deviation above 0",
+        match=r"'time_shift_s' is 0; expected a value above 0",
     ):
         Nuisance(time_shift_s=0.0)
 

@@ -116,17 +116,17 @@ def test_without_it_the_answer_is_wrong():
     [
         (
             {"reading": None},
-            "extra has no reading or clock; expected one of both",
+            "'extra' has neither a reading nor a clock; expected exactly one",
         ),
         (
             {"sigma": None},
-            "extra has no sigma; expected the standard deviation of its prior",
+            "'extra' has no sigma; expected the standard deviation of its prior",
         ),
-        ({"sigma": 0.0}, "extra is 0; expected a standard deviation above 0"),
+        ({"sigma": 0.0}, "'extra' is 0; expected a value above 0"),
         ({"name": "tare"}, "two nuisance parameters are named 'tare'"),
         (
             {"of": "load"},
-            "extra is of a load; expected of = 'recording' or 'marker'",
+            "'extra' has of = 'load'; expected 'recording' or 'marker'",
         ),
         (
             {"reading": lambda y, v, t_s, data: y[:2]},
@@ -134,15 +134,15 @@ def test_without_it_the_answer_is_wrong():
         ),
         (
             {"reading": lambda y, v, t_s, data: y + v.nothing},
-            "the reading of extra failed",
+            "the reading of the nuisance parameter 'extra' failed",
         ),
         (
             {"reading": lambda y, v, t_s, data: y + ca.sqrt(v)},
-            "the reading of extra or its derivatives are not finite at zero",
+            "the reading of the nuisance parameter 'extra', or its derivative .* is not finite",
         ),
         (
             {"reading": None, "clock": lambda v, t_s, data: ca.vertcat(v, v)},
-            r"the clock of extra has the shape \(2, 1\); expected \(1, 1\)",
+            r"the clock of the nuisance parameter 'extra' has the shape \(2, 1\); expected \(1, 1\)",
         ),
     ],
 )

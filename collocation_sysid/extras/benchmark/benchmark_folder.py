@@ -190,7 +190,8 @@ def _parameter_values(
         value = identified.get(item.name, item.guess if item.is_fixed else None)
         if value is None:
             raise InputError(
-                "has no value in the catalogue and is not fixed; expected one of both",
+                f"is neither fixed nor in the entry {entry.name!r} of the catalogue; expected "
+                "one of both",
                 problem.path,
                 where=f"parameters.{item.name}",
             )

@@ -872,7 +872,8 @@ class LiveEstimator:
             return []
         self._start_anew()
         notes.append(
-            "the motion begins after a rest: frames at rest are left out, except the last ones"
+            "the motion begins after a long rest: the estimate starts again from the last frames "
+            "at rest, and earlier frames are left out"
         )
         rows: list[LoggedRow] = []
         for each in frames:
