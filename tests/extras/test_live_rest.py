@@ -56,7 +56,7 @@ def test_after_a_long_rest_the_estimate_is_that_of_a_stream_without_it(
     notes = [
         note for frame in frames for note in live.process_frame(frame).notes
     ]
-    (said,) = [note for note in notes if "after a rest" in note]
+    (said,) = [note for note in notes if "after a long rest" in note]
     # The first frame of the motion is still at rest, and the second one hardly moves.
     (start,) = [
         k

@@ -15,7 +15,7 @@ import numpy as np
 from ...common.array_types import Array
 from ...common.files import SCHEMA, safe_name, write_text_file
 from ...common.serialisation import as_json
-from ...errors import InputError
+from ...errors import InputError, listed
 from ...fem.meshes.mesh import TetMesh
 from ...fem.meshes.structured import box_mesh
 from ...problem import Problem
@@ -190,8 +190,8 @@ def _parameter_values(
         value = identified.get(item.name, item.guess if item.is_fixed else None)
         if value is None:
             raise InputError(
-                f"is neither fixed nor in the entry {entry.name!r} of the catalogue; expected "
-                "one of both",
+                "is neither fixed nor among the constants of the body's catalogue entry; expected "
+                f"a fixed value, or one of {listed(identified)}",
                 problem.path,
                 where=f"parameters.{item.name}",
             )
