@@ -61,6 +61,7 @@ from .body_check import (
 )
 from .cost import MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
 from .derivatives import derivative_errors, shortened_problem
+from .grasp_extent import grasp_extent_concerns
 from .measurements import (
     MarkerCheck,
     RecordingCheck,
@@ -542,6 +543,7 @@ def _concerns(
             for grasp_check in findings.holds
             for each in grasp_concerns(grasp_check)
         ),
+        *grasp_extent_concerns(problem),
         *(
             each
             for motion in findings.motions
