@@ -1,8 +1,9 @@
 """Check of a problem before it is solved: contents, cost, and likely mistakes.
 
 `check_problem` does everything, `quick_check` what takes no simulation. The modules contribute
-`body_check` (meshes and grasps), `measurements`, `modes_check` (natural modes and the time grid),
-`cost` and `derivatives`. Every warning is one sentence that ends with the remedy.
+`body_check` (meshes and grasps), `grasp_extent` (nodes that end before their box),
+`declared_simulation`, `measurements`, `modes_check` (natural modes and the time grid), `cost` and
+`derivatives`. Every warning is one sentence that ends with the remedy.
 """
 
 from __future__ import annotations
