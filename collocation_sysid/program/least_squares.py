@@ -122,9 +122,12 @@ class SquareRootInformation:
         return self.jacobian.T @ self.residual
 
     def loss(self, p: Array) -> float:
-        """Return the sum of squares ‖S p + r‖² at p (P,)."""
-        residual = self.triangle @ np.append(p, 1.0)
-        return float(residual @ residual)
+        """Return the sum of squares ‖S p + r‖² at p (P,); infinite for a trial step whose motion
+        diverges.
+        """
+        with np.errstate(over="ignore"):
+            residual = self.triangle @ np.append(p, 1.0)
+            return float(residual @ residual)
 
     def minimiser(self, lower: Array, upper: Array) -> Array:
         """Return the p (P,) with the least sum of squares between bounds.

@@ -15,9 +15,8 @@ from ..problem import Problem
 from ..statistics.budget.discretisation_error import Refinement
 from ..statistics.concerns import Concern
 from .check.body_check import LINEAR, bending_concerns, slenderness
+from .check.declared_simulation import is_declared_simulated
 
-# Assumption that is exact only in simulations: the damping law of a real body is never known.
-SIMULATION_ASSUMPTION = "damping_law"
 # Value of `RefinementLevel.refined` of a solve on a finer mesh.
 MESH = "mesh"
 
@@ -59,13 +58,6 @@ def mesh_resolution_notes(problem: Problem) -> list[str]:
         for concern in _coarse_mesh_concerns(problem)
         if is_simulated or concern.data["element"] != LINEAR
     ]
-
-
-def is_declared_simulated(problem: Problem) -> bool:
-    """Return whether the assumptions state that the damping law is exact, which declares that the
-    recordings were simulated.
-    """
-    return problem.uncertainty.considered.get(SIMULATION_ASSUMPTION) is None
 
 
 def _coarse_mesh_concerns(problem: Problem) -> Iterator[Concern]:

@@ -41,6 +41,7 @@ from ..statistics.probes.profile_likelihood import Profile
 from ..statistics.probes.relaxed_assumptions import Probe
 from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
 from ..statistics.uncertainty import MarkerPlace, Uncertainty, marker_places
+from .check.grasp_extent import grasp_extent_concerns, grasp_extent_notes
 from .check.modes_check import ModesCheck
 from .forward_simulation import ForwardSimulation
 from .mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
@@ -304,6 +305,7 @@ class SolvedProblem:
                     *numerical,
                     *vague,
                     *meshes,
+                    *grasp_extent_concerns(self.problem),
                 )
             )
         interrupted = Concern(
@@ -470,6 +472,7 @@ class SolvedProblem:
         notes = (
             *self.notes,
             *mesh_resolution_notes(self.problem),
+            *grasp_extent_notes(self.problem),
             *self.uncertainty.notes,
             *identifiability_sentences(self.uncertainty),
         )

@@ -95,8 +95,14 @@ TOPICS: Mapping[str, Topic] = {
             "grasp": "the box of the grasp of '{experiment}' selects {nodes} nodes, but "
             "{nearly_grasped} more if it is enlarged by a tenth of an element's edge, or "
             "{nearly_free} fewer if it is reduced by as much, and the estimated stiffness "
-            "depends on them; move the faces of the box grasp.nodes midway between layers of "
-            "nodes, or mesh the body with a layer of nodes where the fingers end",
+            "depends on them; mesh the body with a layer of nodes where the fingers end, and let "
+            "the box of grasp.nodes end slightly beyond it",
+            "grasp-extent": "the box of the grasp of '{experiment}' ends {gap_mm:.3g} mm beyond "
+            "the outermost nodes that it selects along {axis}, {percent:.2g} % of the free length "
+            "of {free_mm:.4g} mm: if the fingers end where the box does, the modelled body is too "
+            "long, and its stiffness is estimated too high, in bending by three to four times "
+            "this share; mesh the body with a layer of nodes where the fingers end "
+            "(object.edge_length_m), or let the box end at the nodes that are really held",
             "markers-exchanged": "the names of markers are exchanged: {names}; correct "
             "markers.labels or reference_m",
             "markers-exchanged/later": "the names of markers are exchanged {when}: {names}; "

@@ -122,3 +122,11 @@ def test_what_is_left_of_the_first_parameters_is_the_inverse_of_their_covariance
         found.minimiser(-wide, wide)[:2],
         atol=1e-10,
     )
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_loss_of_a_divergent_trial_step_is_infinite_without_a_warning(rng):
+    information = SquareRootInformation.empty(2).with_rows(
+        rng.normal(size=4), rng.normal(size=(4, 2)), np.zeros(2)
+    )
+    assert information.loss(np.full(2, 1e200)) == np.inf

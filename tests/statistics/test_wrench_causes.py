@@ -13,8 +13,12 @@ from wrong_twins import WRENCH_FAULTS
 
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
-from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.collocation import (
+    Collocation,
+    ExperimentIterate,
+)
 from collocation_sysid.recording import Nuisance, Wrench
+from collocation_sysid.recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.assessment import cause_concerns
@@ -22,6 +26,7 @@ from collocation_sysid.statistics.misspecification.misspecification_hypothesis i
     rank,
 )
 from collocation_sysid.statistics.misspecification.wrench_causes import (
+    wrench_causes,
     wrench_mistakes,
 )
 
@@ -67,6 +72,58 @@ def test_a_wrench_that_fits_has_no_cause():
     assert not find_misspecifications(
         ReducedSpace()(changed(lambda w: w)), budget=0
     )
+
+
+# Mass of the tool, more than that of the cube [kg], and its place beyond the grasp [m].
+TOOL_KG = 0.5
+TOOL_M = (0.01, 0.0, 0.03)
+# Factor by which the noise is stated too small, so that the misfit is large enough for a search.
+UNDERSTATED = 1.6
+
+
+def with_tool() -> Collocation:
+    """The swung cube whose sensor carries a heavy tool that is estimated."""
+    experiment = swung(nuisance=Nuisance.none())
+    allowed = replace(Nuisance.none(), tool_kg=1.0, tool_m=0.1)
+    given = replace(experiment, nuisance=allowed)
+    collocation = Collocation([given], GUESS)
+    (segment,) = collocation.transcriptions
+    (sensor,) = segment.sensors
+    solution = ReducedSpace()(Collocation([experiment], GUESS))
+    (part,) = solution.parts
+    phi = np.zeros(segment.nuisance.size)
+    tool = segment.nuisance.indices_of_rows(TOOL_MASS, TOOL_CENTRE)
+    phi[tool] = [TOOL_KG, *TOOL_M] / segment.nuisance.scales[tool]
+    iterate = ExperimentIterate(segment, part.q, phi=phi, x=part.x)
+    added = sensor.predict_reactions(
+        iterate.reactions, phi
+    ) - sensor.predict_reactions(iterate.reactions, 0 * phi)
+    (grasp,) = given.grasps
+    assert grasp.wrench is not None
+    carried = replace(
+        grasp.wrench,
+        values=grasp.wrench.values + added,
+        sigma_n=grasp.wrench.sigma_n / UNDERSTATED,
+        sigma_nm=grasp.wrench.sigma_nm / UNDERSTATED,
+    )
+    return Collocation(
+        [replace(given, grasps=[replace(grasp, wrench=carried)])], GUESS
+    )
+
+
+def test_a_wrench_with_an_estimated_tool_is_compared_with_the_tool():
+    solution = ReducedSpace()(with_tool())
+    (part,) = solution.parts
+    (mass,) = part.segment.nuisance.indices_of_rows(TOOL_MASS)
+    found_kg = part.phi[mass] * part.segment.nuisance.scales[mass]
+    assert found_kg == pytest.approx(TOOL_KG, rel=0.05)
+    assert not wrench_causes(solution)
+
+
+def test_nothing_is_concluded_from_a_wrench_with_an_unknown_tool_before_a_solve():
+    comparison = wrench_mistakes(with_tool())
+    assert not comparison.hypotheses
+    assert not comparison.predicted
 
 
 # Before solving -----------------------------------------------------------------------------------

@@ -268,9 +268,10 @@ class MarkerResidual(MeasurementResidual):
     def squared_distances_m2(self, x: Array, phi: Array) -> Array:
         """Return the squared distances [m²] of predictions at positions x (rows, 3n) and φ (k,)
         from the P samples that are compared, flat, time by time; samples after the last row are
-        omitted.
+        omitted. Infinite for a trial step whose motion diverges.
         """
         predicted = self.predict_positions(x, phi)
         tracks = self.markers.positions_m[: len(predicted)]
         present = self.is_present[: len(predicted)]
-        return np.sum((predicted - tracks) ** 2, axis=2)[present]
+        with np.errstate(over="ignore"):
+            return np.sum((predicted - tracks) ** 2, axis=2)[present]

@@ -1,8 +1,9 @@
 """Check of a problem before it is solved: contents, cost, and likely mistakes.
 
 `check_problem` does everything, `quick_check` what takes no simulation. The modules contribute
-`body_check` (meshes and grasps), `measurements`, `modes_check` (natural modes and the time grid),
-`cost` and `derivatives`. Every warning is one sentence that ends with the remedy.
+`body_check` (meshes and grasps), `grasp_extent` (nodes that end before their box),
+`declared_simulation`, `measurements`, `modes_check` (natural modes and the time grid), `cost` and
+`derivatives`. Every warning is one sentence that ends with the remedy.
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ from .body_check import (
 )
 from .cost import MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
 from .derivatives import derivative_errors, shortened_problem
+from .grasp_extent import grasp_extent_concerns
 from .measurements import (
     MarkerCheck,
     RecordingCheck,
@@ -542,6 +544,7 @@ def _concerns(
             for grasp_check in findings.holds
             for each in grasp_concerns(grasp_check)
         ),
+        *grasp_extent_concerns(problem),
         *(
             each
             for motion in findings.motions

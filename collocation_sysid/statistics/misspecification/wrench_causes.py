@@ -2,8 +2,11 @@
 
 A measured wrench is compared with the prediction of a fit to the markers alone, which a wrong
 wrench cannot distort. Each common mistake is corrected in turn. Tares are allowed for by their
-priors. Where neither a density nor a load is known, the predicted wrench is known up to one
-positive factor, which is estimated in each comparison.
+priors. A tool between sensor and body that is estimated has the values of the solve: it often
+weighs more than the body, and without it a correct wrench would seem to be wrong by a factor.
+Before a solve nothing is known of it, so that its sensor is not compared. Where neither a density
+nor a load is known, the predicted wrench is known up to one positive factor, which is estimated in
+each comparison.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from ...program.wrench.wrench_residual import (
     without_grasp_sensors,
 )
 from ...recording.measured_wrench import Frame, Wrench
+from ...recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from ..axes import OTHER_AXES
 from .misspecification_hypothesis import Hypothesis, HypothesisTest
 
@@ -48,6 +52,8 @@ CHECKED_TOLERANCE = 1e-2
 LATEST = 0.25
 # Number of intervals of the clock shifts that are tried.
 SHIFTS = 60
+# Nuisance parameters of a tool between sensor and body.
+TOOL = (TOOL_MASS, TOOL_CENTRE)
 # Columns of the forces.
 FORCES = slice(0, 3)
 # Columns of the torques.
@@ -113,12 +119,17 @@ def wrench_causes(solution: Solution) -> list[Hypothesis]:
         for s in solution.collocation.transcriptions
         if s.experiment.markers.sample_count
     ]
+    estimated = {part.segment.experiment.name: part for part in solution.parts}
+    parts = _from_markers(
+        solution.collocation,
+        with_markers,
+        method=ReducedSpace(max_iterations=MOST_SWEEPS),
+    )
     return _of_parts(
-        _from_markers(
-            solution.collocation,
-            with_markers,
-            method=ReducedSpace(max_iterations=MOST_SWEEPS),
-        )
+        [
+            _with_tools(part, estimated[part.segment.experiment.name])
+            for part in parts
+        ]
     )
 
 
@@ -142,13 +153,15 @@ def wrench_mistakes(collocation: Collocation) -> WrenchComparison:
     """Return hypotheses about wrongly described wrenches before any solve.
 
     The first samples of the experiments with markers and wrenches are fitted to their markers
-    alone. Experiments whose markers that fit does not explain are not compared. The collocation is
-    not modified.
+    alone. Experiments whose markers that fit does not explain, and those in which a tool is
+    estimated, are not compared. The collocation is not modified.
     """
     with_both = [
         s
         for s in collocation.transcriptions
-        if s.sensors and s.experiment.markers.sample_count
+        if s.sensors
+        and s.experiment.markers.sample_count
+        and not len(s.nuisance.indices_of_rows(*TOOL))
     ]
     shorter = [first_samples(s.experiment, CHECKED_SAMPLES) for s in with_both]
     if not shorter:
@@ -232,6 +245,16 @@ def _from_markers(
         )
         parts.append(ExperimentIterate(segment, part.q, phi=phi, x=part.x))
     return parts
+
+
+def _with_tools(
+    part: ExperimentIterate, estimated: ExperimentIterate
+) -> ExperimentIterate:
+    """Return an experiment with the masses and centres of the tools of another iterate of it."""
+    tools = part.segment.nuisance.indices_of_rows(*TOOL)
+    phi = np.array(part.phi)
+    phi[tools] = estimated.phi[tools]
+    return replace(part, phi=phi)
 
 
 def _of_parts(parts: Sequence[ExperimentIterate]) -> list[Hypothesis]:
@@ -354,11 +377,13 @@ class _OneSensor:
 
     def _predicted(self, wrench: Wrench) -> Array:
         """Return the predicted wrench (S, 6) [N, N m] at the times, in the frame and about the
-        point of a wrench, without tares and delays; cached. NaN where there is no prediction.
+        point of a wrench, with the tool, without tares and delays; cached. NaN where there is no prediction.
         """
         at = (wrench.t_s.tobytes(), wrench.frame, wrench.point_m.tobytes())
         if at not in self._known:
             phi = np.zeros(self.part.segment.nuisance.size)
+            tools = self.part.segment.nuisance.indices_of_rows(*TOOL)
+            phi[tools] = self.part.phi[tools]
             self._known[at] = self.sensor.with_wrench(wrench).predict_reactions(
                 self.forced, phi
             )
