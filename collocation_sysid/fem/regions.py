@@ -25,6 +25,7 @@ from .laws.constants import (
     MASS,
     Constant,
 )
+from .laws.damping_admissibility import require_admissible_damping
 from .laws.materials import (
     DampingLaw,
     Energy,
@@ -232,6 +233,7 @@ def parts_from_regions(
         density_kg_m3=densities[0],
         prony=branches,
     )
+    require_admissible_damping(remainder.damping, remainder.material)
     if field is not None and not rest.size:
         raise InputError(
             "the field applies to the cells outside all regions, but there are none; expected "
@@ -255,6 +257,7 @@ def parts_from_regions(
             memory = (
                 branches if region.prony is None else as_branches(region.prony)
             )
+            require_admissible_damping(region_damping, law)
             has_own = region.density_kg_m3 is not None
             part = BodyPart(
                 region.name,

@@ -26,9 +26,11 @@ from ..errors import InputError, hint_at
 from ..fem.body import Body
 from ..fem.laws.constants import (
     INSTANTANEOUS,
+    Constant,
     Scale,
     constant_named,
     is_density,
+    is_known_constant,
     is_modulus,
     usual_value,
     without_region,
@@ -239,7 +241,9 @@ FIRST_CONTRAST = 2.0
 
 
 def complete_parameter(
-    name: str, user_statement: Unknown | Tied | float
+    name: str,
+    user_statement: Unknown | Tied | float,
+    definition: Constant | None = None,
 ) -> Parameter:
     """Return the complete definition of a parameter, with defaults from its constant.
 
@@ -249,31 +253,41 @@ def complete_parameter(
     Parameters
     ----------
     name : str
-        Name with unit and, if it applies to one region only, region; a constant that is not known
-        has default properties.
+        Name with unit and, if it applies to one region only, region.
     user_statement : Unknown, Tied or float
         The user's statement; a number is a fixed value.
+    definition : Constant, optional
+        Definition of the constant in the body; by default the known constant of this name, or one
+        with default properties.
 
     Raises
     ------
     InputError
-        For a guess out of bounds, a linear parameter without a typical change, or a parameter
-        without guess, prior and usual value; see also `Parameter`.
+        For a guess out of bounds, a value that the constant does not admit, a linear parameter
+        without a typical change, or a parameter without guess, prior and usual value; see also
+        `Parameter`.
     """
-    constant = constant_named(name)
+    constant = constant_named(name) if definition is None else definition
     if isinstance(user_statement, Tied):
         return Parameter(name, 0.0, tied=user_statement)
+    is_known = is_known_constant(name)
     if not isinstance(user_statement, Unknown):
-        return Parameter(name, float(user_statement), is_fixed=True)
+        value = float(user_statement)
+        if is_known:
+            return Parameter(name, value, is_fixed=True)
+        _require_admissible(constant, value, f"{name}: fixed")
+        return Parameter(name, value, is_fixed=True, scale=constant.scale)
+    user_statement = _with_usual_guess(name, user_statement, constant)
     scale = user_statement.scale or constant.scale
     low, high = constant.bounds
     if scale == "linear" and constant.scale == "log":
         low = -high
     if scale == "log" and low <= 0:
         low = 1e-9 * high
+    prior = user_statement.prior or constant.prior
     if (
         user_statement.guess is None
-        and user_statement.prior is None
+        and prior is None
         and usual_value(name, 1.0) is None
     ):
         raise InputError(
@@ -285,6 +299,12 @@ def complete_parameter(
     size = np.nan if is_modulus(name) else 0.0
     size = size if user_statement.guess is None else abs(user_statement.guess)
     typical = user_statement.typical or constant.typical or size
+    for what, value in (
+        ("lower", user_statement.lower),
+        ("upper", user_statement.upper),
+    ):
+        if value is not None and not is_known:
+            _require_admissible(constant, float(value), f"{name}: {what}")
     if scale == "linear" and typical == 0:
         statement = "no guess" if user_statement.guess is None else "guess = 0"
         raise InputError(
@@ -305,7 +325,7 @@ def complete_parameter(
             upper=high
             if user_statement.upper is None
             else float(user_statement.upper),
-            prior=user_statement.prior or constant.prior,
+            prior=prior,
             scale=scale,
             unit=float(typical) if scale == "linear" else 1.0,
         )
@@ -317,6 +337,40 @@ def complete_parameter(
             raise
         message = f"{error.message}; where lower or upper is not given, these bounds are assumed"
         raise InputError(message, None, where=name) from error
+
+
+def _with_usual_guess(
+    name: str, user_statement: Unknown, constant: Constant
+) -> Unknown:
+    """Return a statement with the usual value of a user-defined constant as its guess, within the
+    bounds, if it states neither a guess nor a prior; the statement itself for known constants,
+    whose usual value follows from the name.
+    """
+    if (
+        is_known_constant(name)
+        or is_modulus(name)
+        or constant.usual is None
+        or user_statement.guess is not None
+        or (user_statement.prior or constant.prior) is not None
+    ):
+        return user_statement
+    lower, upper = constant.bounds
+    stated = user_statement.lower, user_statement.upper
+    guess = np.clip(
+        constant.usual,
+        lower if stated[0] is None else stated[0],
+        upper if stated[1] is None else stated[1],
+    )
+    return replace(user_statement, guess=float(guess))
+
+
+def _require_admissible(constant: Constant, value: float, what: str) -> None:
+    """Raise an `InputError` if a user-defined constant does not admit a value; `what` names it."""
+    least = constant.at_least if constant.scale == "linear" else -np.inf
+    if not value >= least or not value < constant.below:
+        raise InputError(
+            f"{what} = {value:g}, expected a number {least:g} <= value < {constant.below:g}"
+        )
 
 
 @dataclass(frozen=True)
@@ -388,21 +442,38 @@ class Parameters:
 
     @classmethod
     def from_mapping(
-        cls, statements: Mapping[str, Unknown | Tied | float]
+        cls,
+        statements: Mapping[str, Unknown | Tied | float],
+        *,
+        definitions: Mapping[str, Constant] | None = None,
     ) -> Parameters:
         """Return parameters from the user's statements by name, in their order; a number is a fixed
         value.
 
         All are scalars; `with_fields` combines the coefficients of a field to a vector.
 
+        Parameters
+        ----------
+        statements : mapping of name to Unknown, Tied or float
+        definitions : mapping of name to Constant, optional
+            Constants of the bodies, `Body.constants`, whose bounds, scales, priors and usual values
+            apply where a statement omits them. A `Problem` that is given a mapping of statements
+            uses those of its bodies. Names that are missing have the properties of the known
+            constant of that name, or default ones.
+
         Raises
         ------
         InputError
             See `complete_parameter` and `Parameters`.
         """
+        known = definitions or {}
+        # A parameter without the name of a region applies to all regions that have the constant.
+        shared = {without_region(name): known[name] for name in known}
         return cls(
             tuple(
-                complete_parameter(name, value)
+                complete_parameter(
+                    name, value, known.get(name) or shared.get(name)
+                )
                 for name, value in statements.items()
             )
         )
@@ -960,7 +1031,9 @@ def resolve_theta(
     if isinstance(values, Parameters):
         return body.theta_from_values(values.guesses)
     if isinstance(values, Mapping):
-        Parameters.from_mapping(values).require_constants_of([body])
+        Parameters.from_mapping(
+            values, definitions=body.constants
+        ).require_constants_of([body])
         return body.theta_from_values(values)
     if len(values) != len(body.constants):
         raise InputError(

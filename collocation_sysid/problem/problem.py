@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 
@@ -31,17 +31,28 @@ from ..statistics.scale_identifiability import scale_concerns, static_concerns
 from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 
 
-def _as_parameters(
+def _unconverted(
     parameters: Parameters | Mapping[str, Unknown | Tied | float],
 ) -> Parameters:
-    """Return parameters as they are; a mapping by name is converted by
-    `Parameters.from_mapping`.
+    """Return the argument; a mapping is converted when the bodies are known."""
+    return cast(Parameters, parameters)
+
+
+def _as_parameters(
+    parameters: Parameters | Mapping[str, Unknown | Tied | float],
+    bodies: Iterable[Body],
+) -> Parameters:
+    """Return parameters as they are; a mapping by name is converted by `Parameters.from_mapping`
+    with the definitions of the constants of the bodies.
     """
-    return (
-        parameters
-        if isinstance(parameters, Parameters)
-        else Parameters.from_mapping(parameters)
-    )
+    if isinstance(parameters, Parameters):
+        return parameters
+    definitions = {
+        name: constant
+        for body in bodies
+        for name, constant in body.constants.items()
+    }
+    return Parameters.from_mapping(parameters, definitions=definitions)
 
 
 @declaration
@@ -54,7 +65,8 @@ class Problem:
         Experiments with different names; those for validation are predicted, not fitted. Their
         bodies may differ.
     parameters : Parameters, or mapping of name to Unknown, Tied or a fixed number
-        Parameters of the bodies, estimated or fixed.
+        Parameters of the bodies, estimated or fixed. What a mapping omits (bounds, scale, prior)
+        follows from the `Constant` of the body.
     scheme : str or Scheme, default "midpoint"
         Time discretisation.
     substeps : int or "auto"
@@ -89,7 +101,7 @@ class Problem:
     """
 
     experiments: tuple[Experiment, ...] = key(converter=tuple[Experiment, ...])
-    parameters: Parameters = key(converter=_as_parameters)
+    parameters: Parameters = key(converter=_unconverted)
     _: KW_ONLY
     scheme: str | Scheme = "midpoint"
     substeps: int | Literal["auto"] = "auto"
@@ -109,6 +121,7 @@ class Problem:
         """Complete the bodies with free densities, the parameters with those of fields, and the
         notes; then validate the problem.
         """
+        vars(self)["parameters"] = _as_parameters(self.parameters, self.bodies)
         vars(self)["experiments"] = _with_free_densities(
             self.experiments, self.parameters
         )

@@ -331,9 +331,8 @@ def observed_points(
     """
     body = experiment.body
     points = np.asarray(sensor.points_m)
-    names = [f"{sensor.name} {k + 1}" for k in range(len(points))]
     placement = place_markers(
-        points, body.nodes.points_m, body=body, names=names
+        points, body.nodes.points_m, body=body, sensor=sensor.name
     )
     chart = MarkerAssociation.from_exact_places(
         body, placement, points_m=points

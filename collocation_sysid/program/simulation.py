@@ -430,9 +430,15 @@ def with_readings(
 
     Raises
     ------
-    ValueError
-        If the number of arrays is not that of the sensors.
+    InputError
+        If the number of arrays is not that of the sensors, or an array has the wrong shape.
     """
+    if len(values) != len(experiment.readings):
+        names = ", ".join(gauge.name for gauge in experiment.readings)
+        raise InputError(
+            f"the values of the readings are {len(values)} arrays; expected a list with one array "
+            f"for each sensor: {names or 'none'}"
+        )
     pairs = zip(experiment.readings, values, strict=True)
     return replace(
         experiment, readings=[replace(g, values=v) for g, v in pairs]

@@ -59,17 +59,21 @@ class Gauge:
     name : str
     expression : callable
         ``expression(at, **unknowns) -> numbers``, of `Look` and of the sensor's unknowns, in CasADi
-        operations; one number, or a column of m.
+        operations; one number, or a column of m. It must be smooth, as ``ca.tanh`` is in contrast
+        to ``ca.fmin``.
     t_s : (S,) array
-        Sample times, ascending, within those of the experiment, at any rate.
+        Sample times, ascending, at any rate; samples outside the times of the experiment are
+        ignored, and their predictions are NaN.
     values : (S,) or (S, m) array, or None
-        Measured values; NaN where missing. None before they are simulated.
+        Measured values; NaN where missing. None before they are measured or simulated: such a
+        sensor can be simulated, but a problem that contains it cannot be solved.
     sigma : float
         Standard deviation of the noise of each number, in its unit.
     points_m : (P, 3) array, optional
         Places [x, y, z] on the undeformed body whose motion the sensor measures.
     unknowns : mapping of name to float
-        Prior standard deviation of each unknown of the sensor, about zero, by the argument's name.
+        Prior standard deviation of each unknown of the sensor, about zero, by the argument's name;
+        none by default. Write an unknown factor as ``1 + gain``. In a simulation unknowns are zero.
     grasp : int, optional
         In place of points: the number of the grasp, counted from 1, whose force and torque the
         sensor measures; obstacles count after the grasps.
@@ -105,10 +109,11 @@ class Gauge:
     unit: str = key(str, default="")
 
     def __post_init__(self) -> None:
-        """Check the sensor and complete it in place: `values` become (S, m), and `columns` the name
-        of the sensor, with _1, _2, … if m > 1, where none are given.
+        """Check the sensor and complete it in place: `values` become (S, m) unless they are None, and
+        `columns` the name of the sensor, with _1, _2, … if m > 1, where none are given.
         """
         where = f"the reading '{self.name}'"
+        vars(self)["unknowns"] = self.unknowns or {}
         points = cast(Sequence[Any], self.points_m)
         times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
         points = read_only_floats(
@@ -137,16 +142,20 @@ class Gauge:
             else [self.name]
         )
         vars(self).update(
-            values=self._checked_values(count),
+            values=None
+            if self.values is None
+            else self._checked_values(self.values, count),
             columns=tuple(self.columns or names),
+            _value_count=count,
         )
 
-    def _checked_values(self, count: int) -> Array:
-        """Return the measured values as a read-only array (S, m); zeros if none were given. NaN
-        marks missing values.
+    def _checked_values(self, measured: ArrayLike, count: int) -> Array:
+        """Return the measured values as a read-only array (S, m), NaN where missing.
 
         Parameters
         ----------
+        measured : (S,) or (S, m) array
+            Measured values; NaN where missing.
         count : int
             Number m of values that the expression gives.
 
@@ -157,11 +166,7 @@ class Gauge:
         """
         where = f"the reading '{self.name}'"
         samples = len(self.sample_times_s)
-        if self.values is None:
-            return read_only_floats(
-                np.zeros((samples, count)), (None, None), name=where
-            )
-        columns = np.array(self.values, dtype=float)
+        columns = np.array(measured, dtype=float)
         columns = columns[:, None] if columns.ndim == 1 else columns
         values = read_only_floats(
             columns, (samples, None), name=f"values of {where}", finite=False
@@ -192,8 +197,17 @@ class Gauge:
         return np.asarray(self.t_s)
 
     @property
+    def has_values(self) -> bool:
+        """Whether measured values were given."""
+        return self.values is not None
+
+    @property
     def measured_values(self) -> Array:
-        """(S, m) measured values; NaN where missing."""
+        """(S, m) measured values, NaN where missing; zeros if none were given."""
+        if self.values is None:
+            return np.zeros(
+                (len(self.sample_times_s), vars(self)["_value_count"])
+            )
         return np.asarray(self.values)
 
     @property
@@ -228,6 +242,8 @@ class Gauge:
         read = self.expression(
             at, **dict(zip(self.unknowns, unknowns, strict=True))
         )
+        if read is None:
+            raise TypeError("the function returns None")
         return ca.vec(
             ca.SX(
                 ca.vertcat(*read) if isinstance(read, (list, tuple)) else read
@@ -267,7 +283,8 @@ class Gauge:
             raise InputError(
                 f"the reading '{self.name}' cannot be evaluated ({reason(error)}); expected a "
                 f"function of an argument `at` with the attributes t_s, {', '.join(names)}, and "
-                f"of its unknowns {', '.join(self.unknowns) or '(none)'}, in CasADi operations"
+                f"of its unknowns {', '.join(self.unknowns) or '(none)'}, in CasADi operations, such "
+                "as ca.if_else in place of if"
             ) from error
         u = ca.veccat(*observables, own)
         slopes = ca.Function("slopes", [t_s, u], [read, ca.jacobian(read, u)])

@@ -698,6 +698,15 @@ class Experiment:
             "there is no marker sample; check the marker file and window_s"
         )
 
+    def require_measured_values(self) -> None:
+        """Raise an `InputError` if a custom sensor has no measured values, as before a simulation."""
+        for gauge in self.readings:
+            if not gauge.has_values:
+                raise InputError(
+                    f"the reading '{gauge.name}' of experiment '{self.name}' has no values; "
+                    "expected measured ones, or simulated ones: with_readings(experiment, values)"
+                )
+
     def _check_nodes(self) -> None:
         """Raise an `InputError` if a grasp, point mass, force or placement refers to a node that
         the body does not have, or two grasps hold a dof at the same time.

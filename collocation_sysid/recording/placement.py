@@ -79,8 +79,10 @@ def place_markers(
     attach: AttachmentRule = "auto",
     max_distance_m: float | None = None,
     names: Sequence[str] | None = None,
+    *,
+    sensor: str | None = None,
 ) -> Placement:
-    """Return each marker's place on the body.
+    """Return the place of each marker, or of each point of a sensor, on the body.
 
     Parameters
     ----------
@@ -99,6 +101,8 @@ def place_markers(
         node; by default the mean edge length.
     names : sequence of str, optional
         Marker names for messages; indices from 0 by default.
+    sensor : str, optional
+        Name of the custom sensor to which the points belong, for messages; None for markers.
 
     Raises
     ------
@@ -152,11 +156,20 @@ def place_markers(
             weights[k] = located.weights
             distance[k] = located.distance_m
         if distance[k] > limit_m:
-            raise InputError(
-                f"marker '{labels[k]}' at {point_text(point)} m is "
-                f"{distance[k]:.4g} m away from the body, more than the {limit_m:.4g} m allowed; "
+            what = (
+                f"marker '{labels[k]}'"
+                if sensor is None
+                else f"point {k + 1} of the reading '{sensor}'"
+            )
+            remedy = (
                 "check length_unit, the frame of the poses and the marker's reference_m, "
                 "or raise max_distance_m"
+                if sensor is None
+                else "expected points_m on the undeformed body, in metres"
+            )
+            raise InputError(
+                f"{what} at {point_text(point)} m is {distance[k]:.4g} m away from the body, more "
+                f"than the {limit_m:.4g} m allowed; {remedy}"
             )
     return Placement(
         nodes, weights, distance_m=distance, node_count=len(nodes_m)

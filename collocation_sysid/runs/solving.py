@@ -94,14 +94,16 @@ def solve(
     Raises
     ------
     InputError
-        For an unknown method, a start that is no run or shares no parameter name, if no start is
-        found, if the machine lacks memory, for a scheduler that does not answer or a method that
-        cannot use it, for two-phase fields that cannot be searched, and when the solver refuses the
-        problem.
+        For a custom sensor without values, an unknown method, a start that is no run or shares no
+        parameter name, if no start is found, if the machine lacks memory, for a scheduler that does
+        not answer or a method that cannot use it, for two-phase fields that cannot be searched, and
+        when the solver refuses the problem.
     SimulationError
         If the equations of motion are singular at a solution with a field whose correlation
         length or phases are searched.
     """
+    for experiment in problem.experiments:
+        experiment.require_measured_values()
     solver = problem.solver(method)
     if scheduler is not None and not isinstance(solver, ReducedSpace):
         raise InputError(

@@ -10,6 +10,8 @@ import casadi as ca
 import numpy as np
 
 from ..common.array_types import Array
+from ..errors import InputError
+from ..fem.laws.damping_admissibility import viscous_stress
 from ..fem.laws.materials import (
     DampingLaw,
     Energy,
@@ -44,7 +46,8 @@ def check_damping(
 ) -> None:
     """Check a damping law: derivatives, dissipation, objectivity, compiled forces, pickling.
 
-    At random deformations the stress P_v is linear in the rate Ḟ, ∂P_v/∂Ḟ is symmetric, and a
+    The stress or potential can be evaluated, and its result has the right shape. At random
+    deformations the stress P_v is linear in the rate Ḟ, ∂P_v/∂Ḟ is symmetric, and a
     stated ∂P_v/∂F is the derivative of P_v by CasADi's automatic derivative and by central
     differences. The power P_v:Ḟ is not negative for any Ḟ, and a superposed spinning rotation
     only rotates P_v. The compiled forces of a small body with this law are checked as by
@@ -80,12 +83,11 @@ def check_damping(
     made = as_damping(law)
     known = as_material(material)
     check = PropertyCheck(f"damping law {made.name!r}")
-    if (made.stress is None) == (made.potential is None):
+    if made.stress is not None and made.potential is not None:
         check.fail(
-            "it has both or neither of a stress and a potential",
-            made,
-            expected="one of both",
+            "it has both a stress and a potential", made, expected="one of both"
         )
+    _check_evaluation(check, made, known)
     values = usual_constants((*known.constants, *made.constants), constants)
     stress = DampingStress(made, known, values=np.array([*values.values()]))
     for number, F in enumerate(
@@ -198,6 +200,23 @@ class DampingStress:
             by_F=outputs[2],
             by_rate=outputs[3],
         )
+
+
+def _check_evaluation(
+    check: PropertyCheck, law: DampingLaw, material: Material
+) -> None:
+    """Require that the functions of the law can be evaluated, with results of the right shapes."""
+    constants = (*material.constants, *law.constants)
+    try:
+        viscous_stress(
+            law,
+            material,
+            F=ca.SX.sym("F", 9),
+            rate=ca.SX.sym("rate", 9),
+            theta=ca.SX.sym("theta", len(constants)),
+        )
+    except InputError as error:
+        raise AssertionError(f"{check.subject}: {error}") from error
 
 
 def _check_derivatives(

@@ -40,6 +40,7 @@ from collocation_sysid.result.pictures.album import (
 )
 from collocation_sysid.result.pictures.over_time import sensor_picture
 from collocation_sysid.result.replay import read_run
+from collocation_sysid.runs.solving import solve
 
 
 def pull(at: Look, gain):
@@ -169,6 +170,11 @@ def test_error_bars_and_verdict_know_them():
             "not finite for .* at rest",
         ),
         ({"grasp": 0}, "has both points_m and grasp"),
+        (
+            {"expression": lambda at, bias_m_s2: None},
+            "the function returns None",
+        ),
+        ({"unknowns": None}, r"of its unknowns \(none\)"),
         ({"points_m": ()}, "has neither points_m nor grasp"),
         (
             {"sigma": "1e-3"},
@@ -208,8 +214,37 @@ def test_a_reading_of_another_time_or_place_is_refused():
     ):
         instrumented(cube, nobody)
     far = instrumented(cube, accelerometer(cube.t_s, points_m=[[1.0, 0, 0]]))
-    with pytest.raises(InputError, match="accelerometer 1"):
+    with pytest.raises(
+        InputError,
+        match=r"point 1 of the reading 'accelerometer' at .*expected points_m on",
+    ):
         simulate(far, TRUTH, "midpoint", substeps=1)
+
+
+def test_a_sensor_without_values_is_simulated_but_not_fitted():
+    cube = replace(hung_cube(9), nuisance=IDEAL)
+    empty = replace(accelerometer(cube.t_s), values=None)
+    assert not empty.has_values
+    assert not replace(empty, sigma=0.1).has_values
+    made = instrumented(cube, empty)
+    (read,) = simulate(made, TRUTH, "midpoint", substeps=1).custom_sensor_values
+    assert read.shape == (len(cube.t_s), 3)
+    assert np.isfinite(read).all()
+    words = "the reading 'accelerometer' of experiment .* has no values"
+    with pytest.raises(InputError, match=words):
+        solve(Problem([made], GUESS))
+    with pytest.raises(InputError, match=words):
+        run(Problem([made], GUESS))
+    assert with_readings(made, [read]).readings[0].has_values
+
+
+def test_the_number_of_values_is_that_of_the_sensors():
+    cube = hung_cube(9)
+    made = instrumented(cube, accelerometer(cube.t_s))
+    with pytest.raises(
+        InputError, match=r"are 9 arrays; expected a list .*: accelerometer"
+    ):
+        with_readings(made, np.zeros((9, 3)))
 
 
 # At a grasp ---------------------------------------------------------------------------------------
@@ -413,7 +448,10 @@ def blank_cell(folder: Path) -> None:
             "swing_reading_cell.csv: line 1: there is no column",
         ),
         (replace_text("ing_cell.csv", "ing_sell.csv"), "reading.1.file: "),
-        (replace_text("points_m = [[0.03,", "points_m = [[0.9,"), "chip 1"),
+        (
+            replace_text("points_m = [[0.03,", "points_m = [[0.9,"),
+            "point 1 of the reading 'chip'",
+        ),
         (blank_cell, "swing_reading_cell.csv: line 2: column pull_n holds"),
     ],
 )

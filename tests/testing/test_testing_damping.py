@@ -124,7 +124,18 @@ def curved_potential(psi, F, rate, gamma_r_s):
             {"potential": curved_potential},
             "P_v is not linear in the rate|∂P_v/∂Ḟ is not symmetric",
         ),
-        ({}, "it has both or neither of a stress and a potential"),
+        (
+            {"stress": negative, "potential": curved_potential},
+            "it has both a stress and a potential",
+        ),
+        (
+            {"stress": lambda psi, F, rate, gamma_r_s: gamma_r_s * rate},
+            "the stress of .* returns 1 expressions .* expected two",
+        ),
+        (
+            {"stress": lambda psi, F, rate, gamma: (rate, ca.SX(9, 9))},
+            "the stress of .* cannot be evaluated .*'gamma_r_s'",
+        ),
     ],
 )
 def test_a_fault_is_one_sentence(law: dict, sentence: str):

@@ -5,5 +5,6 @@
 - `invariants`, `power_traces`: invariants of C and traces of its powers.
 - `stress`, `memory`: stresses and viscoelastic memory at quadrature points; `mean_dilatation`:
   averaged dilatation of nearly incompressible elements.
+- `damping_admissibility`: refusal of user-defined damping laws.
 - `material_stability`: loss of ellipticity of an energy.
 """

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
+
+from ...errors import InputError
 
 Scale = Literal["log", "linear"]
 
@@ -53,6 +55,12 @@ class Constant:
         Smallest admissible value of a linear constant; not used for a logarithmic one.
     prior : (mean, deviation) or None
         Normal prior of an estimate if the problem states none; None for no prior.
+
+    Raises
+    ------
+    InputError
+        If the scale is unknown, the lower bound is not below the upper one, or the lower bound of
+        a logarithmic constant is not positive.
     """
 
     name: str
@@ -65,6 +73,25 @@ class Constant:
     below: float = float("inf")
     at_least: float = -float("inf")
     prior: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.scale not in get_args(Scale):
+            raise InputError(
+                f"scale of the constant {self.name!r} is {self.scale!r}; expected one of "
+                f"{', '.join(get_args(Scale))}"
+            )
+        lower, upper = self.bounds
+        if not lower < upper or (self.scale == "log" and lower <= 0):
+            zero = "0 < " if self.scale == "log" else ""
+            remedy = (
+                ', or scale = "linear" for a constant that may be zero or negative'
+                if zero
+                else ""
+            )
+            raise InputError(
+                f"bounds of the constant {self.name!r} are {lower:g} and {upper:g}; expected "
+                f"{zero}lower < upper{remedy}"
+            )
 
     @property
     def lower_limit(self) -> float:
@@ -327,6 +354,13 @@ def constant_named(name: str) -> Constant:
     if word == FIELD_COEFFICIENT.name and number.isdigit():
         return replace(FIELD_COEFFICIENT, name=bare_name)
     return KNOWN.get(bare_name, Constant(bare_name))
+
+
+def is_known_constant(name: str) -> bool:
+    """Return whether the package defines a constant of this name; the region is ignored. Others are
+    constants of user-defined laws, defined by their `Constant` alone.
+    """
+    return constant_named(name) != Constant(without_region(name))
 
 
 def field_coefficient(number: int) -> Constant:

@@ -425,6 +425,16 @@ class DampingLaw:
     accepts_symbols : bool
         Whether the potential only differentiates psi along (F, Ḟ) as a whole, so that further
         symbols of psi and their rates may follow those of F; false by default.
+
+    Raises
+    ------
+    InputError
+        If it has neither a potential nor a stress, or `constants` is not a tuple of `Constant`.
+
+    Notes
+    -----
+    A `Body` refuses a law that cannot be evaluated or is not linear in Ḟ, see
+    `damping_admissibility`.
     """
 
     name: str
@@ -432,6 +442,20 @@ class DampingLaw:
     potential: Potential | None = field(default=None, repr=False)
     stress: Stress | None = field(default=None, repr=False)
     accepts_symbols: bool = False
+
+    def __post_init__(self) -> None:
+        if self.potential is None and self.stress is None:
+            raise InputError(
+                f"the damping law {self.name!r} has neither a stress nor a potential; expected "
+                "stress=function or potential=function"
+            )
+        if not isinstance(self.constants, tuple) or not all(
+            isinstance(constant, Constant) for constant in self.constants
+        ):
+            raise InputError(
+                f"constants of the damping law {self.name!r} is no tuple of Constant; expected one, "
+                "such as (viscosity,)"
+            )
 
 
 def kelvin_voigt(
