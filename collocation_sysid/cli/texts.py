@@ -166,11 +166,12 @@ def log(options: LogCommand) -> None:
             each.type,
             f"{each.messages}",
             f"{each.rate_hz:.3g}" if each.rate_hz else "",
+            each.frame,
             each.serves,
         )
         for each in listed
     )
-    heads = ("topic", "type", "messages", "Hz", "use")
+    heads = ("topic", "type", "messages", "Hz", "frame", "use")
     # Several topics of points have their joint address in common.
     addresses = [
         f"  {address}"
@@ -181,7 +182,7 @@ def log(options: LogCommand) -> None:
     what = (
         ["", "In place of a file name write:", *addresses] if addresses else []
     )
-    print_result([Table("", heads, rows=rows, names=2, texts=1), *what])
+    print_result([Table("", heads, rows=rows, names=2, texts=2), *what])
 
 
 @dataclass(frozen=True, kw_only=True)

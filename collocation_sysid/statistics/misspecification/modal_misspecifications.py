@@ -128,12 +128,12 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
 
     if markers.sample_count:
         trial = HypothesisTest(
-            remaining_misfit(markers.positions_m),
+            remaining_misfit(markers.positions_at_samples_m),
             remaining_misfit,
             required_factor=LEAST_IMPROVEMENT,
         )
         yield from trial.accepted(
-            _axes(f"'{experiment.name}'", markers.positions_m)
+            _axes(f"'{experiment.name}'", markers.positions_at_samples_m)
         )
 
 
