@@ -187,6 +187,7 @@ class RecordingReader:
             )
             if frames_fault:
                 self._add_notes(frames_fault)
+                experiment = replace(experiment, frames_fault=frames_fault)
         return experiment
 
     @cached_property

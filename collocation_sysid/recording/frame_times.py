@@ -135,7 +135,7 @@ def evenly_sampled(table: MarkerTable) -> tuple[MarkerTable, list[str]]:
         return replace(table, t_s=evenly_spaced_s(t_s)), []
     assignment = assign_frames(t_s)
     if assignment is None:
-        raise InputError(_irregular_message(t_s))
+        raise _irregularity(t_s)
     rounding_s = printed_rounding_s(t_s)
     tolerance_s = STEP_TOLERANCE * assignment.interval_s + rounding_s
     is_jittered = bool(np.abs(assignment.offsets_s).max() > tolerance_s)
@@ -181,15 +181,16 @@ def _assignment_note(
     return "; ".join(parts)
 
 
-def _irregular_message(t_s: Array) -> str:
-    """Return a message on times (F,) [s] that are not those of one frame rate."""
+def _irregularity(t_s: Array) -> InputError:
+    """Return the error for times (F,) [s] that are not those of one frame rate."""
     steps_s = np.diff(t_s)
     typical_s = float(np.median(steps_s))
     row = int(np.argmax(np.abs(steps_s - typical_s)))
-    return (
+    return InputError(
         f"markers: the time jumps by {steps_s[row]:.6g} s from t_s = {t_s[row]:.9g} to "
         f"{t_s[row + 1]:.9g}, where other steps are {typical_s:.6g} s; the frames have no common "
         f"rate: expected frames within {LARGEST_OFFSET_SAMPLES:g} intervals of even times, at "
-        f"most {LARGEST_LOST_SHARE:.0%} of them lost; cut the recording by window_s, or set resample_hz = "
-        f"{1 / typical_s:.3g}"
+        f"most {LARGEST_LOST_SHARE:.0%} of them lost; cut the recording by window_s, or set "
+        f"resample_hz = {1 / typical_s:.3g}",
+        where=f"row {row + 2}",
     )
