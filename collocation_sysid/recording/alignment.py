@@ -107,14 +107,6 @@ def align(
         table, frame_notes = evenly_sampled(table)
         notes += frame_notes
         if frame_notes:
-            # The first or last sample may be earlier or later than its frame.
-            table, cut_notes = _cut_to_poses(
-                table,
-                poses,
-                grasp_intervals_s=grasp_intervals_s,
-                fewest=_FEWEST_SAMPLES,
-            )
-            notes += cut_notes
             t_s = table.t_s
     if every > 1:
         table = at_times(table, slice(None, None, every))

@@ -23,8 +23,8 @@ from .sample_times import (
     sample_interval_s,
 )
 
-# Largest distance of a frame from its sample, in samples: near 0.5 the sample is ambiguous.
-LARGEST_OFFSET_SAMPLES = 0.4
+# Largest deviation of a frame from even times, in samples: near 0.5 its sample is ambiguous.
+LARGEST_JITTER_SAMPLES = 0.4
 # Largest share of lost frames: beyond it the rate of the recording is not known.
 LARGEST_LOST_SHARE = 0.3
 # Repetitions of the assignment: the first fit of the times corrects the interval by less than 1 %.
@@ -42,12 +42,15 @@ class FrameAssignment:
     samples : (F,) array of int
         Index, from 0, of the sample of each frame, increasing.
     offsets_s : (F,) array
-        Time of each frame less that of its sample [s].
+        Time of each frame less that of its sample [s]; 0 for the first and the last frame.
+    jitter_s : (F,) array
+        Deviation of the times of the frames from the line fitted to them [s].
     """
 
     t_s: Array
     samples: Index
     offsets_s: Array
+    jitter_s: Array
 
     @property
     def lost_count(self) -> int:
@@ -76,14 +79,15 @@ class FrameAssignment:
 def assign_frames(t_s: Array) -> FrameAssignment | None:
     """Assign frames at the times `t_s` (F,) [s], increasing, to evenly spaced samples.
 
-    The first and the last sample have a frame. The interval is the mean of the steps without lost
-    frames, recognised by the median; a fit of the times by a line refines it.
+    The first and the last sample have the times of the first and the last frame, so that no sample
+    is outside of the recording. The numbers of the samples follow from the mean of the steps
+    without lost frames, recognised by the median; a fit of the times by a line refines them.
 
     Returns
     -------
     FrameAssignment or None
-        None if two frames have the same sample, a frame is more than `LARGEST_OFFSET_SAMPLES` from
-        its sample, or more than `LARGEST_LOST_SHARE` of the samples have no frame.
+        None if two frames have the same sample, a frame is more than `LARGEST_JITTER_SAMPLES` from
+        the line, or more than `LARGEST_LOST_SHARE` of the samples have no frame.
     """
     steps_s = np.diff(t_s)
     single = steps_s < LARGEST_GAP_INTERVALS * np.median(steps_s)
@@ -96,18 +100,18 @@ def assign_frames(t_s: Array) -> FrameAssignment | None:
         interval_s, start_s = np.polyfit(samples, t_s - t_s[0], deg=1)
         samples = np.rint((t_s - t_s[0] - start_s) / interval_s)
         samples -= samples[0]
-    offsets_s = t_s - t_s[0] - start_s - interval_s * samples
+    jitter_s = t_s - t_s[0] - start_s - interval_s * samples
     count = int(samples[-1]) + 1
     if (
         (np.diff(samples) < 1).any()
-        or np.abs(offsets_s).max() > LARGEST_OFFSET_SAMPLES * interval_s
+        or np.abs(jitter_s).max() > LARGEST_JITTER_SAMPLES * interval_s
         or count - len(t_s) > LARGEST_LOST_SHARE * count
     ):
         return None
+    indices = samples.astype(np.int64)
+    grid_s = np.linspace(t_s[0], t_s[-1], count)
     return FrameAssignment(
-        t_s=t_s[0] + start_s + interval_s * np.arange(count),
-        samples=samples.astype(np.int64),
-        offsets_s=offsets_s,
+        grid_s, indices, offsets_s=t_s - grid_s[indices], jitter_s=jitter_s
     )
 
 
@@ -170,10 +174,10 @@ def _assignment_note(
             "missing samples"
         )
     if is_jittered:
-        offsets_ms = 1e3 * assignment.offsets_s
+        jitter_ms = 1e3 * assignment.jitter_s
         parts.append(
-            f"the times of the frames deviate by {np.std(offsets_ms):.2g} ms RMS, at most "
-            f"{np.abs(offsets_ms).max():.2g} ms, from samples at "
+            f"the times of the frames deviate by {np.std(jitter_ms):.2g} ms RMS, at most "
+            f"{np.abs(jitter_ms).max():.2g} ms, from an even "
             f"{1 / assignment.interval_s:.6g} Hz"
             + has_markers
             * ": the model is evaluated at the time of each frame"
@@ -189,7 +193,7 @@ def _irregularity(t_s: Array) -> InputError:
     return InputError(
         f"markers: the time jumps by {steps_s[row]:.6g} s from t_s = {t_s[row]:.9g} to "
         f"{t_s[row + 1]:.9g}, where other steps are {typical_s:.6g} s; the frames have no common "
-        f"rate: expected frames within {LARGEST_OFFSET_SAMPLES:g} intervals of even times, at "
+        f"rate: expected frames within {LARGEST_JITTER_SAMPLES:g} intervals of even times, at "
         f"most {LARGEST_LOST_SHARE:.0%} of them lost; cut the recording by window_s, or set "
         f"resample_hz = {1 / typical_s:.3g}",
         where=f"row {row + 2}",

@@ -291,21 +291,20 @@ class Markers:
         """(T, M, 3) positions interpolated from the measured times to `t_s` [m], for descriptions
         of a motion; NaN where missing.
 
-        A position is moved by the mean velocity between the samples before and after it, and stays
-        where one of these is missing. Estimates use `positions_m` instead.
+        A position is moved by the mean velocity to the samples before and after it, that to one of
+        them if the other is missing, and stays if both are. Estimates use `positions_m` instead.
         """
-        if self.offsets_s is None or len(self.t_s) < 3:
+        if self.offsets_s is None or len(self.t_s) < 2:
             return self.positions_m
-        times_s = self.t_s + self.offsets_s
-        velocities_m_s = np.zeros_like(self.positions_m)
-        velocities_m_s[1:-1] = (
-            self.positions_m[2:] - self.positions_m[:-2]
-        ) / (times_s[2:] - times_s[:-2])[:, None, None]
-        velocities_m_s[0] = velocities_m_s[1]
-        velocities_m_s[-1] = velocities_m_s[-2]
-        return self.positions_m - self.offsets_s[:, None, None] * np.nan_to_num(
-            velocities_m_s
-        )
+        steps_s = np.diff(self.t_s + self.offsets_s)[:, None, None]
+        velocities_m_s = np.diff(self.positions_m, axis=0) / steps_s
+        unknown = np.full_like(velocities_m_s[:1], np.nan)
+        before = np.concatenate([unknown, velocities_m_s])
+        after = np.concatenate([velocities_m_s, unknown])
+        before = np.where(np.isnan(before), after, before)
+        after = np.where(np.isnan(after), before, after)
+        mean_m_s = np.nan_to_num((before + after) / 2)
+        return self.positions_m - self.offsets_s[:, None, None] * mean_m_s
 
     def predict_positions(self, node_positions_m: ArrayLike) -> Array:
         """Return predicted marker positions (..., M, 3) from node positions (..., n, 3), by the
