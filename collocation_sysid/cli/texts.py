@@ -16,7 +16,7 @@ from ..common.console import PlainConsole
 from ..common.display import Shown, Table
 from ..common.pages import page_files, page_text, page_title
 from ..common.serialisation import as_json
-from ..errors import InputError, located, require_among
+from ..errors import InputError, hint_at, located
 from .command_options import AsJson, command
 from .common import error_console, print_result
 
@@ -93,7 +93,7 @@ class ExplainCommand:
     Attributes
     ----------
     topics : TOPIC
-        Topics of the pages to show.
+        Topics of the pages to show, or keys of the problem file.
     """
 
     topics: Annotated[list[str] | None, typer.Argument()] = None
@@ -104,10 +104,11 @@ class ExplainCommand:
     "explain",
     "explain verdict",
     "explain trust scheme",
+    "explain resample_hz",
     "explain theory | less",
 )
 def explain(options: ExplainCommand) -> None:
-    """Show pages of the documentation, or list their topics.
+    """Show pages of the documentation, or list their topics; describe keys of the problem file.
 
     Pages are part of the installation; no network is needed. If the output is not a terminal, they
     are printed as Markdown.
@@ -123,10 +124,12 @@ def explain(options: ExplainCommand) -> None:
         )
         return
     for topic in options.topics:
-        require_among(topic, page_files(), where="TOPIC")
+        _require_topic(topic)
     console = PlainConsole()
     for topic in options.topics:
-        if console.is_terminal:
+        if topic not in page_files():
+            print_result(_key_table(topic))
+        elif console.is_terminal:
             from .markdown import TerminalPage
 
             console.print(
@@ -134,6 +137,35 @@ def explain(options: ExplainCommand) -> None:
             )
         else:
             typer.echo(page_text(topic))
+
+
+def _require_topic(topic: str) -> None:
+    """Raise an `InputError` unless a page or a key of the problem file has this name."""
+    from ..problem.key_descriptions import all_keys, find_keys
+
+    if topic in page_files() or find_keys(topic):
+        return
+    names = [each.path.rpartition(".")[2] for each in all_keys()]
+    known = [*page_files(), *dict.fromkeys(names)]
+    raise InputError(
+        f"found {topic!r}; expected one of {', '.join(page_files())}, or a key of the problem "
+        f"file{hint_at(topic, known)}",
+        where="TOPIC",
+    )
+
+
+def _key_table(name: str) -> Table:
+    """Return the table of the keys of the problem file with a name or path: path, values, default
+    and description.
+    """
+    from ..problem.key_descriptions import find_keys
+
+    rows = tuple(
+        (each.path, each.form, each.default, each.description)
+        for each in find_keys(name)
+    )
+    heads = ("key", "values", "default", "meaning")
+    return Table("", heads, rows=rows, names=3, texts=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,11 +198,12 @@ def log(options: LogCommand) -> None:
             each.type,
             f"{each.messages}",
             f"{each.rate_hz:.3g}" if each.rate_hz else "",
+            each.frame,
             each.serves,
         )
         for each in listed
     )
-    heads = ("topic", "type", "messages", "Hz", "use")
+    heads = ("topic", "type", "messages", "Hz", "frame", "use")
     # Several topics of points have their joint address in common.
     addresses = [
         f"  {address}"
@@ -181,7 +214,7 @@ def log(options: LogCommand) -> None:
     what = (
         ["", "In place of a file name write:", *addresses] if addresses else []
     )
-    print_result([Table("", heads, rows=rows, names=2, texts=1), *what])
+    print_result([Table("", heads, rows=rows, names=2, texts=2), *what])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,6 +43,7 @@ from ..recording.depth_camera import points_from_image, samples_with_outlines
 from ..recording.formats.depth_files import DepthFileContent, read_depth
 from ..recording.formats.logs import stored_files
 from ..recording.formats.units import METRES_PER_UNIT
+from ..recording.gap_interpolation import interpolation_error
 from ..recording.poses import require_determined_motion
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.time_tables import is_within_experiment, read_custom_sensor
@@ -78,6 +79,9 @@ LEAST_SPAN = 0.005
 LARGEST_SPAN = 10.0
 # Largest distance of a marker from its rigidly moved position, over the body's size.
 LARGEST_MISS = 3.0
+# Estimated error of interpolated markers, in their sigma_m, from which on it is noted: residuals are
+# 4 % larger.
+LARGEST_INTERPOLATION_SIGMAS = 0.3
 
 
 @dataclass
@@ -183,6 +187,7 @@ class RecordingReader:
             )
             if frames_fault:
                 self._add_notes(frames_fault)
+                experiment = replace(experiment, frames_fault=frames_fault)
         return experiment
 
     @cached_property
@@ -903,6 +908,9 @@ class RecordingReader:
                 error.message, where=" and ".join(files)
             ) from error
         self._add_notes(*aligned.notes)
+        if rate_hz and not static and self._marker_tracks is not None:
+            note = self._resampling_note(aligned.t_s, table)
+            self._add_notes(*([note] if note else []))
         if rate_hz and rate_hz > 1.01 / np.median(np.diff(table.t_s)):
             self._add_notes(
                 "resample_hz is above the markers' own rate; interpolated samples are treated as "
@@ -956,7 +964,33 @@ class RecordingReader:
             places_sigma_m=None
             if known_m is None
             else _by_marker(known_m, names, default=np.nan),
+            offsets_s=table.offsets_s,
             **arguments,
+        )
+
+    def _resampling_note(self, t_s: Array, table: MarkerTable) -> str:
+        """Return a note on markers whose error of interpolation to the times `t_s` (T,) [s] is
+        above `LARGEST_INTERPOLATION_SIGMAS`, estimated from their curved tracks; else "".
+
+        Parameters
+        ----------
+        t_s : (T,) array
+            Times of the samples after resampling [s].
+        table : MarkerTable
+            Tracks as recorded.
+        """
+        stated = self.section.markers.sigma_m
+        sigma_m = _by_marker(stated, table.names, default=np.nan)
+        error_m = interpolation_error(t_s, table.t_s, table.positions_m)
+        errors = np.nan_to_num(error_m / sigma_m)
+        if not errors.size or errors.max() < LARGEST_INTERPOLATION_SIGMAS:
+            return ""
+        k = int(errors.argmax())
+        return (
+            f"resample_hz = {self.section.resample_hz:g} interpolates the markers between frames: "
+            f"the estimated error of {table.names[k]} is {1e3 * error_m[k]:.2g} mm RMS, "
+            f"{errors[k]:.2g} sigma_m, and enters the residuals; without resample_hz the model is "
+            "evaluated at the time of each frame, also of lost or uneven ones"
         )
 
 

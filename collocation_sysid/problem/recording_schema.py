@@ -652,7 +652,8 @@ class ExperimentSection(NamedSection):
     window_s : list, optional
         First and last time to use [start, end].
     resample_hz : float, optional
-        Resample the markers at this rate; their own times by default.
+        Interpolate the markers linearly to this rate [Hz]. By default samples have the frame rate,
+        lost frames are missing samples, and the model is evaluated at the time of each frame.
     every : int
         Use every n-th sample of the markers.
     reading : list of ReadingSection

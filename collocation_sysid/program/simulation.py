@@ -446,8 +446,8 @@ def with_readings(
 
 
 def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:
-    """Return the experiment with other marker tracks (T, M, 3) [m]; raise InputError for
-    another shape.
+    """Return the experiment with other marker tracks (T, M, 3) [m] at its samples; raise InputError
+    for another shape.
     """
     tracks = np.asarray(positions_m, dtype=float)
     if tracks.shape != experiment.markers.positions_m.shape:
@@ -455,6 +455,7 @@ def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:
             f"marker tracks have shape {tracks.shape}, "
             f"expected {experiment.markers.positions_m.shape}"
         )
+    markers = experiment.markers
     return replace(
-        experiment, markers=replace(experiment.markers, positions_m=tracks)
+        experiment, markers=markers.with_samples(markers.t_s, tracks)
     )

@@ -314,10 +314,8 @@ class StreamingModel:
         """
         neighbours = self.neighbouring_samples
         markers = self.segment.experiment.markers
-        origin = replace(
-            markers,
-            t_s=markers.t_s[:1],
-            positions_m=np.zeros((1, len(markers.names), 3)),
+        origin = markers.with_samples(
+            markers.t_s[:1], np.zeros((1, len(markers.names), 3))
         )
         rows = np.arange(2 * neighbours + 1)
         segment = self.segment
@@ -557,7 +555,7 @@ def _still_experiment(
             )
             for grasp in _grasps_at(experiment, _first_poses(experiment))
         ],
-        markers=replace(markers, t_s=t_s, positions_m=tracks),
+        markers=markers.with_samples(t_s, tracks),
         readings=gauges,
     )
 

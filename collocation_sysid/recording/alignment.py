@@ -10,6 +10,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.time_dependence import at_times
 from ..errors import InputError
+from .frame_times import evenly_sampled
 from .gap_interpolation import (
     SAME_TIME_INTERVALS,
     interpolate_without_gaps,
@@ -19,9 +20,7 @@ from .marker_files import MarkerTable
 from .poses import PoseSequence
 from .sample_times import (
     STEP_TOLERANCE,
-    evenly_spaced_s,
     printed_rounding_s,
-    sample_interval_s,
     unrounded_s,
 )
 
@@ -62,11 +61,12 @@ def align(
 ) -> AlignedRecording:
     """Put poses and markers on one evenly spaced time grid over the time that they share.
 
-    Without `resample_hz` the grid is the markers' own time and no measurement is changed. With it,
-    markers are interpolated to that rate, linearly and only between two present neighbours. Poses
-    keep their samples: if these agree with the grid up to the rounding of either file, they are
-    moved onto it; otherwise `PoseSequence.interpolation` gives the poses at the grid. A single pose
-    goes with any time.
+    Without `resample_hz` the grid has the markers' own rate and no measurement is changed: lost
+    frames become missing samples, and jittered frames keep their times as `offsets_s` of the table.
+    With it, markers are interpolated to that rate, linearly and only between two present
+    neighbours. Poses keep their samples: if these agree with the grid up to the rounding of either
+    file, they are moved onto it; otherwise `PoseSequence.interpolation` gives the poses at the
+    grid. A single pose goes with any time.
 
     Parameters
     ----------
@@ -79,8 +79,8 @@ def align(
     resample_hz : float, optional
         Rate of the new grid, which starts at the first sample that is kept.
     every : int
-        Use every n-th of the marker samples that are kept, from the first on, before any
-        resampling; 1 for all.
+        Use every n-th of the marker samples that are kept, lost ones included, from the first on,
+        before any resampling; 1 for all.
     grasp_intervals_s : sequence of (float, float), optional
         First and last time at which each grasp holds; its poses need not cover other times. The
         whole recording by default.
@@ -91,8 +91,8 @@ def align(
     Raises
     ------
     InputError
-        If the window is empty, the markers' time is uneven, the rate is not positive or leaves one
-        sample, or a cut to the time of the poses leaves fewer than three samples.
+        If the window is empty, the markers' frames have no common rate, the rate is not positive or
+        leaves one sample, or a cut to the time of the poses leaves fewer than three samples.
     """
     table = table if window_s is None else _cut_to_window(table, window_s)
     grasp_intervals_s = grasp_intervals_s or [(-np.inf, np.inf)] * len(poses)
@@ -102,16 +102,17 @@ def align(
         grasp_intervals_s=grasp_intervals_s,
         fewest=1 if static else _FEWEST_SAMPLES,
     )
+    t_s = table.t_s
+    if resample_hz is None and not static:
+        table, frame_notes = evenly_sampled(table)
+        notes += frame_notes
+        if frame_notes:
+            t_s = table.t_s
     if every > 1:
         table = at_times(table, slice(None, None, every))
-    if static:
-        t_s = grid = table.t_s
-    elif resample_hz is None:
-        sample_interval_s(table.t_s, "markers")
-        t_s = table.t_s
-        grid = evenly_spaced_s(table.t_s)
-        table = MarkerTable(grid, table.names, positions_m=table.positions_m)
-    else:
+        t_s = t_s[::every]
+    grid = table.t_s
+    if resample_hz is not None and not static:
         t_s = grid = _even_grid(table.t_s, resample_hz)
         table = MarkerTable(
             grid,

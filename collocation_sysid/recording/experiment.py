@@ -92,6 +92,9 @@ class Experiment:
         relaxed completely.
     validation : bool
         Whether the recording is only predicted, not fitted.
+    frames_fault : str
+        Contradiction between the coordinate frames that the files of poses and markers state, with
+        the remedy; "" if there is none, or files state no frames.
     masses : sequence of PointMass
         Point masses tied to the body.
     forces : sequence of Force
@@ -142,6 +145,7 @@ class Experiment:
     )
     loaded_since_s: float = key(NotNegative | None, default=np.inf)
     validation: bool = key(Flag, default=False)
+    frames_fault: str = ""
     masses: tuple[PointMass, ...] = key(converter=tuple, default=())
     forces: tuple[Force, ...] = key(converter=tuple, default=())
     tendons: tuple[Tendon, ...] = key(converter=tuple, default=())

@@ -44,6 +44,8 @@ class MarkerTable:
         NaN where missing; a sample with one coordinate missing loses all three.
     notes : tuple of str
         What was missing or assumed in the file, a sentence each.
+    offsets_s : (T,) array, optional
+        Time of each measured frame less `t_s` [s]; None if they are the same.
     """
 
     t_s: Array = key(
@@ -53,6 +55,9 @@ class MarkerTable:
     names: tuple[str, ...] = key(converter=tuple[str, ...])
     positions_m: Array = key(converter=np.asarray, metadata=over_time())
     notes: tuple[str, ...] = key(converter=tuple[str, ...], default=())
+    offsets_s: Array | None = key(
+        converter=np.asarray, default=None, metadata=over_time()
+    )
 
     def __post_init__(self) -> None:
         """Check times and shapes, and mark incomplete samples as missing, in place; an `InputError`

@@ -67,6 +67,9 @@ class Markers:
         lies within 5 % of the mean edge length, otherwise "embedded".
     max_distance_m : float, optional
         Largest distance of a marker from the body; the mean edge length by default.
+    offsets_s : (T,) array, optional
+        Time at which each sample was measured less its time in `t_s` [s], for unevenly recorded
+        frames; the body is predicted at the sum. None: zero.
 
     Raises
     ------
@@ -90,6 +93,9 @@ class Markers:
     attach: AttachmentRule = key(AttachmentRule, default="auto")
     max_distance_m: float | None = key(
         Positive | None, converter=identity, default=None
+    )
+    offsets_s: Array | None = key(
+        converter=np.asarray, default=None, metadata=over_time()
     )
 
     def __post_init__(self) -> None:
@@ -124,6 +130,11 @@ class Markers:
                     f"sigma_m of marker '{name}' is {sigma:g}; expected > 0"
                 )
         vars(self).update(positions_m=tracks, sigma_m=sigma_m)
+        if self.offsets_s is not None:
+            offsets_s = read_only_floats(
+                self.offsets_s, (len(self.t_s),), name="offsets_s"
+            )
+            vars(self)["offsets_s"] = offsets_s
         self._check_places(m)
 
     def _check_places(self, m: int) -> None:
@@ -232,6 +243,12 @@ class Markers:
         )
         return replace(self, places_m=None, placement=placement)
 
+    def with_samples(self, t_s: ArrayLike, positions_m: ArrayLike) -> Markers:
+        """Return the markers with other tracks (T, M, 3) [m], measured at exactly the times `t_s`
+        (T,) [s].
+        """
+        return replace(self, t_s=t_s, positions_m=positions_m, offsets_s=None)
+
     @classmethod
     def none(cls, t_s: ArrayLike) -> Markers:
         """Return an empty set of markers at the times `t_s` (T,), for an experiment without
@@ -268,6 +285,26 @@ class Markers:
     def sample_count(self) -> int:
         """Number of present samples over all markers."""
         return int(self.is_present.sum())
+
+    @cached_property
+    def positions_at_samples_m(self) -> Array:
+        """(T, M, 3) positions interpolated from the measured times to `t_s` [m], for descriptions
+        of a motion; NaN where missing.
+
+        A position is moved by the mean velocity to the samples before and after it, that to one of
+        them if the other is missing, and stays if both are. Estimates use `positions_m` instead.
+        """
+        if self.offsets_s is None or len(self.t_s) < 2:
+            return self.positions_m
+        steps_s = np.diff(self.t_s + self.offsets_s)[:, None, None]
+        velocities_m_s = np.diff(self.positions_m, axis=0) / steps_s
+        unknown = np.full_like(velocities_m_s[:1], np.nan)
+        before = np.concatenate([unknown, velocities_m_s])
+        after = np.concatenate([velocities_m_s, unknown])
+        before = np.where(np.isnan(before), after, before)
+        after = np.where(np.isnan(after), before, after)
+        mean_m_s = np.nan_to_num((before + after) / 2)
+        return self.positions_m - self.offsets_s[:, None, None] * mean_m_s
 
     def predict_positions(self, node_positions_m: ArrayLike) -> Array:
         """Return predicted marker positions (..., M, 3) from node positions (..., n, 3), by the

@@ -54,11 +54,7 @@ def sample_interval_s(
             f"{what}: {fault[1]}", source, where=f"row {fault[0] + 1}"
         )
     steps = np.diff(times)
-    mean_s = float(times[-1] - times[0]) / len(steps)
-    uneven = np.abs(
-        steps - mean_s
-    ) > STEP_TOLERANCE * mean_s + printed_rounding_s(times)
-    if uneven.any():
+    if not has_even_steps(times):
         # A lost frame also shifts the mean, and with it every other step: name the worst.
         typical_s = float(np.median(steps))
         row = int(np.argmax(np.abs(steps - typical_s)))
@@ -69,7 +65,17 @@ def sample_interval_s(
             source,
             where=f"row {row + 2}",
         )
-    return mean_s
+    return float(times[-1] - times[0]) / len(steps)
+
+
+def has_even_steps(t_s: Array) -> bool:
+    """Whether the steps of at least two times (T,) differ from their mean by at most
+    `STEP_TOLERANCE` of it, and by the rounding of times to the decimals in the file; false for NaN.
+    """
+    steps_s = np.diff(t_s)
+    mean_s = float(t_s[-1] - t_s[0]) / len(steps_s)
+    tolerance_s = STEP_TOLERANCE * mean_s + printed_rounding_s(t_s)
+    return bool((np.abs(steps_s - mean_s) <= tolerance_s).all())
 
 
 def first_unordered_time(t_s: Array) -> tuple[int, str] | None:

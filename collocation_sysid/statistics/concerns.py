@@ -88,6 +88,7 @@ TOPICS: Mapping[str, Topic] = {
             "gripper's, or fit the poses by grasp.markers",
             "camera-frame": "the markers fit after one rigid motion of all of them: cameras and "
             "robot use different world frames; set markers.template_m and template_window_s",
+            "frames": "{fault}",
             "clock": "the markers' clock is {when} by about {by_ms:.3g} ms relative to that of the "
             "poses: {do} this to t_s of the poses, or estimate it with nuisance.time_shift",
             "grasp-layer": "the fit is better if the grasp holds one layer of nodes {deep}: "

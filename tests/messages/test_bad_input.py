@@ -447,9 +447,14 @@ MARKER_FILES = [
         edit=replace_cell(MARKERS, 4, 0, "0.01"),
     ),
     bad(
-        "lost-frame", "experiment 'swing'", MARKERS, "jumps by 0.02 s", "blank rows",
+        "lost-frames", "experiment 'swing'", MARKERS, "jumps by 0.05 s", "30% of them lost",
+        "resample_hz = 100",
         edit=lambda folder: (folder / MARKERS).write_text(
-            "".join((folder / MARKERS).read_text().splitlines(True)[k] for k in range(10) if k != 4)
+            "".join(
+                line
+                for k, line in enumerate((folder / MARKERS).read_text().splitlines(True))
+                if k not in range(4, 8)
+            )
         ),
     ),
     bad("nothing-seen", "there is no marker sample", "window_s", edit=blank_markers),

@@ -517,7 +517,7 @@ class FutureRecording:
             template,
             t_s=t_s,
             grasps=(moved_grasp(grasp, poses, t_s=t_s),),
-            markers=replace(template.markers, t_s=t_s, positions_m=nowhere),
+            markers=template.markers.with_samples(t_s, nowhere),
         )
 
     def simulate_motion(

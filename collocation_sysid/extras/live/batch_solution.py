@@ -62,7 +62,7 @@ def recording_from_log(
         smooth = grasps[number].poses.interpolation
         poses = PoseSequence.from_matrices(t_s, matrices, interpolation=smooth)
         grasps[number] = replace(grasps[number], poses=poses)
-    markers = replace(experiment.markers, t_s=t_s, positions_m=tracks_m)
+    markers = experiment.markers.with_samples(t_s, tracks_m)
     readings = []
     for number, gauge in enumerate((*experiment.readings, *model.wrenches), 1):
         samples = {

@@ -145,7 +145,7 @@ def frames_of_recording(
             for each, frame in zip(samples, frame_of, strict=True)
             if frame == k
         )
-        tracks_m = experiment.markers.positions_m[k]
+        tracks_m = experiment.markers.positions_at_samples_m[k]
         yield Frame(
             float(t_s),
             (positions_m, quaternions),

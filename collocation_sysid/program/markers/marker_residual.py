@@ -3,8 +3,9 @@
     y = R(a) (Σ_i ℓ_i(τ) h(x_i) − c) + c + d + b,
 
 with the place h(x_i) of the marker on the body at neighbouring samples, Lagrange weights ℓ of up to
-five samples at the time shifted by τ, a rotation R(a) about the pivot c, a translation d and an
-offset b; without φ it is h(x_t). See `observables` for h and `model.nuisance_map` for φ.
+five samples at the time of the frame shifted by τ, a rotation R(a) about the pivot c, a translation
+d and an offset b; without φ it is h(x_t) if frames have the times of the samples. See `observables`
+for h and `model.nuisance_map` for φ.
 """
 
 from __future__ import annotations
@@ -146,12 +147,20 @@ class MarkerResidual(MeasurementResidual):
 
     @cached_property
     def _neighbour_count(self) -> int:
-        """Number of samples that a marker is interpolated from; 1 if no clock is estimated."""
-        return (
-            min(NEIGHBOURS, self.observable.count)
-            if len(self.nuisance.clock_indices)
-            else 1
+        """Number of samples that a marker is interpolated from; 1 if no clock is estimated, and all
+        frames have the times of their samples.
+        """
+        is_shifted = (
+            len(self.nuisance.clock_indices) > 0
+            or self.markers.offsets_s is not None
         )
+        return min(NEIGHBOURS, self.observable.count) if is_shifted else 1
+
+    @cached_property
+    def _offsets_s(self) -> Array:
+        """Time (T,) of each frame less that of its sample [s]."""
+        offsets_s = self.markers.offsets_s
+        return np.zeros(len(self.t_s)) if offsets_s is None else offsets_s
 
     @cached_property
     def _first_neighbour(self) -> Index:
@@ -175,16 +184,16 @@ class MarkerResidual(MeasurementResidual):
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all samples; its data are the position of the sample among its neighbours, in
-        samples, and the sample's time [s], delay included.
+        """Stencil of all samples; its data are the position of the frame among its neighbours, in
+        samples, and the frame's time [s], delay included.
         """
         count = len(self.markers.names)
+        indices = self._sample_indices - self._first_neighbour
         place = np.array(
             [
-                self._sample_indices - self._first_neighbour,
-                self.t_s + self.delay_s,
-            ],
-            dtype=np.float64,
+                indices + self._offsets_s / self.nuisance.interval_s,
+                self.t_s + self._offsets_s + self.delay_s,
+            ]
         )
         places = (
             self._neighbour_indices[:, None] * count + np.arange(count)[:, None]
@@ -221,7 +230,7 @@ class MarkerResidual(MeasurementResidual):
         phi : SX
             Nuisance parameters of the marker, in prior standard deviations.
         data : (2,) SX
-            Position of the sample among the neighbours, in samples, and its time [s].
+            Position of the frame among the neighbours, in samples, and its time [s].
         """
         place, t_s = ca.vertsplit(data)
         own = (
@@ -230,7 +239,7 @@ class MarkerResidual(MeasurementResidual):
             else np.zeros(0, dtype=np.int64)
         )
         reading = values[:, 0]
-        if len(self.nuisance.clock_indices):
+        if self._neighbour_count > 1:
             late = (
                 self.nuisance.marker_delay_s(phi, own, t_s=t_s)
                 / self.nuisance.interval_s

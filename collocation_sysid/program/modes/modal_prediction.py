@@ -82,7 +82,7 @@ class DeclaredMotion:
             return None
         t_s = experiment.t_s[:MOST_SAMPLES]
         rotations, translations = grasp.poses.at(t_s)
-        tracks = experiment.markers.positions_m[:MOST_SAMPLES]
+        tracks = experiment.markers.positions_at_samples_m[:MOST_SAMPLES]
         name = f"'{experiment.name}'"
         gravity_m_s2 = experiment.gravity_m_s2
         return cls(

@@ -20,7 +20,7 @@ from .logs import Log, TopicAddress, open_log
 from .topics import (
     STATIC_TOPIC_SUFFIX,
     Edges,
-    first_list,
+    frame_of_message,
     frame_path,
     is_transforms,
     nested_field,
@@ -187,15 +187,5 @@ def topic_frames(path: str | Path) -> TopicFrames | None:
     transforms = nested_field(first, "transforms") or [first]
     if (edge := transform_frames(transforms[0])) is not None:
         return TopicFrames(*edge)
-    item = next(iter(first_list(first)), None)
-    return TopicFrames(
-        _frame(first, "header.frame_id") or _frame(item, "header.frame_id"),
-        _frame(first, "child_frame_id"),
-    )
-
-
-def _frame(message: object, field: str) -> str:
-    """Return the name of a frame in a field of a message, without a leading slash; empty if there
-    is none.
-    """
-    return str(nested_field(message, field) or "").lstrip("/")
+    child = nested_field(first, "child_frame_id")
+    return TopicFrames(frame_of_message(first), str(child or "").lstrip("/"))

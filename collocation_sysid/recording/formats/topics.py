@@ -80,6 +80,9 @@ class LogTopic:
         Possible uses in words; empty if the topic cannot be used.
     write : tuple of str
         Text to write in a problem file in place of a file, one for each way to read the topic.
+    frame : str
+        Frame in which the first message states its values; empty if it names none, and for
+        transforms.
     """
 
     name: str
@@ -88,6 +91,7 @@ class LogTopic:
     rate_hz: float | None
     serves: str
     write: tuple[str, ...]
+    frame: str = ""
 
 
 def list_topics(path: str | Path) -> list[LogTopic]:
@@ -185,15 +189,26 @@ def _marker_frames(log: Log) -> list[str]:
     for name in log.topics:
         for _, message in islice(log.messages(name), 1):
             is_other = is_transforms(message) or depth_kind(message)
-            frame = nested_field(message, "header.frame_id")
+            frame = frame_of_message(message)
             if (
                 frame
                 and not is_other
                 and _pose_of_message(message) is None
                 and _points_of_message(message, by_namespace=False)
             ):
-                frames.append(str(frame).lstrip("/"))
+                frames.append(frame)
     return list(dict.fromkeys(frames))
+
+
+def frame_of_message(message: Any) -> str:
+    """Return the name of the frame of a message, or of its first item, without a leading slash;
+    empty if neither names one.
+    """
+    first = next(iter(first_list(message)), None)
+    frame = nested_field(message, "header.frame_id") or nested_field(
+        first, "header.frame_id"
+    )
+    return str(frame or "").lstrip("/")
 
 
 def _describe_topic(
@@ -218,6 +233,8 @@ def _describe_topic(
     rate = 1e9 * (len(first) - 1) / span if span > 0 else None
     serves = ""
     write = [f"{path.name}#{name}"]
+    is_stated = bool(first) and not is_transforms(first[0][1])
+    frame = frame_of_message(first[0][1]) if is_stated else ""
     if first and is_transforms(first[0][1]):
         edges = _all_transforms(log, log.messages(name), topic=name)
         chains = moving_chains(edges)
@@ -256,6 +273,7 @@ def _describe_topic(
         rate_hz=rate,
         serves=serves,
         write=tuple(write if serves else ()),
+        frame=frame,
     )
 
 

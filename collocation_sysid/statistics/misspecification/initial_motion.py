@@ -75,12 +75,13 @@ def initial_motion(experiment: Experiment) -> InitialMotion | None:
     t_s = experiment.t_s
     most = int(LONGEST_SHARE * len(t_s))
     markers = experiment.markers
-    noise_m = np.maximum(markers.sigma_m, _typical_noise_m(markers.positions_m))
+    positions_m = markers.positions_at_samples_m
+    noise_m = np.maximum(markers.sigma_m, _typical_noise_m(positions_m))
     for count in range(FEWEST_SAMPLES, most + 1):
         is_complete = markers.is_present[:count].all(axis=0)
         if not is_complete.any():
             return None
-        tracks_m = markers.positions_m[:count, is_complete]
+        tracks_m = positions_m[:count, is_complete]
         differences = np.diff(tracks_m, n=3, axis=0)
         local_m = np.sqrt(np.mean(differences**2, axis=(0, 2)))
         deviation_m = NOISE_MARGIN * np.maximum(

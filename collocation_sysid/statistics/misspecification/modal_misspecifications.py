@@ -58,6 +58,18 @@ ONE_OF_MANY = 1.05
 DEFORMED = 0.1
 # Distance of the tracks over the body's diagonal from which on no stiffness explains them.
 LARGEST_MISFIT = 0.3
+# Hypotheses that fit better if the poses are in another frame than the markers.
+FRAME_CAUSES = (
+    "camera-frame",
+    "gripper-frame",
+    "gravity",
+    "length-unit",
+    "markers-axes",
+    "poses-inverted",
+    "quaternion-order",
+    "rotation-inverted",
+    "unlike",
+)
 
 
 def find_misspecifications_by_modes(
@@ -105,7 +117,29 @@ def find_misspecifications_by_modes(
         hypotheses += initial_motion_hypotheses(experiment)
     if comparison is not None and not hypotheses and not experiment.obstacles:
         hypotheses += comparison.unlike()
-    return rank(hypotheses)
+    return rank(_with_stated_frames(experiment, hypotheses))
+
+
+def _with_stated_frames(
+    experiment: Experiment, hypotheses: list[Hypothesis]
+) -> list[Hypothesis]:
+    """Return the hypotheses with those that another frame causes (`FRAME_CAUSES`) replaced by the
+    contradiction of the frames that the files state, with the largest strength; the hypotheses
+    unchanged if none is of these, or files do not contradict each other.
+    """
+    strengths = [
+        each.strength for each in hypotheses if each.code in FRAME_CAUSES
+    ]
+    if not experiment.frames_fault or not strengths:
+        return hypotheses
+    stated = Hypothesis(
+        "frames",
+        f"'{experiment.name}'",
+        data={"fault": experiment.frames_fault},
+        strength=max(strengths),
+    )
+    others = [each for each in hypotheses if each.code not in FRAME_CAUSES]
+    return [stated, *others]
 
 
 def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
@@ -128,12 +162,12 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
 
     if markers.sample_count:
         trial = HypothesisTest(
-            remaining_misfit(markers.positions_m),
+            remaining_misfit(markers.positions_at_samples_m),
             remaining_misfit,
             required_factor=LEAST_IMPROVEMENT,
         )
         yield from trial.accepted(
-            _axes(f"'{experiment.name}'", markers.positions_m)
+            _axes(f"'{experiment.name}'", markers.positions_at_samples_m)
         )
 
 

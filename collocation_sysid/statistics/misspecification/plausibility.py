@@ -229,7 +229,7 @@ def _common_jump(
     moved_m : (T, m, 3) array
         Points carried by the poses [m].
     """
-    tracks_m = experiment.markers.positions_m
+    tracks_m = experiment.markers.positions_at_samples_m
     sigma_m = experiment.markers.sigma_m
     complete = np.isfinite(tracks_m).all(axis=(1, 2))
     # A gap hides a step: samples around it are taken as neighbours.
@@ -352,7 +352,7 @@ def _pose_jump_hypotheses(
     """
     sizes = step_sizes(moved_m).max(axis=1)
     k = int(sizes.argmax())
-    markers = step_sizes(experiment.markers.positions_m)[k]
+    markers = step_sizes(experiment.markers.positions_at_samples_m)[k]
     moved = np.linalg.norm(np.diff(moved_m, 2, axis=0), axis=2).max(axis=1)
     sigma_m = float(np.median(experiment.markers.sigma_m))
     if np.isfinite(markers).any():
@@ -373,7 +373,8 @@ def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     others.
     """
     markers = experiment.markers
-    sizes = step_sizes(markers.positions_m)
+    tracks_m = markers.positions_at_samples_m
+    sizes = step_sizes(tracks_m)
     for m, name in enumerate(markers.names):
         if not np.isfinite(sizes[:, m]).any():
             continue
@@ -384,7 +385,7 @@ def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
         usual_m = max(
             _usual_change(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m])
         )
-        if _is_lasting(markers.positions_m, m, sample=k + 2, step_m=size_m):
+        if _is_lasting(tracks_m, m, sample=k + 2, step_m=size_m):
             yield from _step_hypothesis(
                 "marker-slip/alone",
                 experiment,
@@ -522,7 +523,7 @@ def _marker_identities(experiment: Experiment) -> tuple[Index, float]:
     """
     markers = experiment.markers
     grasp = carrying_grasp(experiment)
-    in_grasp_m = np.array(markers.positions_m)
+    in_grasp_m = np.array(markers.positions_at_samples_m)
     if grasp is not None:
         rotations, translations_m = grasp.poses.at(experiment.t_s)
         in_grasp_m = np.einsum(
