@@ -203,6 +203,19 @@ class Collocation:
             segments, [segment.association for segment in segments]
         )
 
+    def with_parameters(self, parameters: Parameters) -> Collocation:
+        """Return the program with other shared parameters, or other guesses of them, and the present
+        associations of the measurements, which are not computed again.
+        """
+        return replace(
+            self,
+            parameters=parameters,
+            associations={
+                each.experiment.name: each.association
+                for each in self.transcriptions
+            },
+        )
+
     @property
     def nq(self) -> int:
         """Number of shared parameters q."""

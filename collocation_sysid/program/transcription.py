@@ -170,10 +170,14 @@ class Transcription(MotionTranscription):
         markers, place_coordinates = self.association.markers.follow_estimates(
             np.append(phi, 0.0)[places]
         )
-        correspondences = [
-            depth.correspondences.updated(depth.surface_shapes(x, phi), phi)
-            for depth in self.depths
-        ]
+        correspondences = []
+        for depth, present in zip(
+            self.depths, self.association.correspondences, strict=True
+        ):
+            own = depth.correspondences
+            updated = own.updated(depth.surface_shapes(x, phi), phi)
+            # The measurement model has a copy, with its own camera model.
+            correspondences.append(present if updated is own else updated)
         association = self.association.updated(
             markers,
             float(shifts_s.sum()) / self.experiment.timestep_s,

@@ -119,7 +119,7 @@ def follow_starts(
     candidates: list[tuple[float, int, Solution]] = []
     for number in (scan.best, *scan.others):
         started = associated_at_guess(
-            replace(collocation, parameters=scan.starts[number])
+            collocation.with_parameters(scan.starts[number])
         )
         solution = solve(method, started)
         if solution.status is Status.INTERRUPTED:
@@ -140,7 +140,7 @@ def follow_starts(
     if max(each for each, _, _ in candidates) - loss > SAME_LOSS:
         note += ": there are local minima; the lowest one is reported"
     chosen = replace(scan, best=best, parameters=scan.starts[best])
-    started = replace(collocation, parameters=scan.starts[best])
+    started = collocation.with_parameters(scan.starts[best])
     return CompletedStart(
         started, chosen, solution=solution if is_own else None, note=note
     )

@@ -369,10 +369,11 @@ def _solve_once(
                 scan=scan,
                 solve=partial(solve_with_renewed_correspondences, watch=watch),
             )
-            collocation = associated_at_guess(scanned.collocation)
             scan = scanned.scan
             solution = scanned.solution
             comparison = scanned.note
+            if solution is None:
+                collocation = associated_at_guess(scanned.collocation)
         if solution is None:
             solution = solve_with_renewed_correspondences(
                 solver, collocation, watch=watch, start=variables
@@ -422,7 +423,7 @@ def _program_and_start(
     Returns
     -------
     collocation : Collocation
-        Program with measurements associated at the guess.
+        Program; its measurements are associated at the guess if there was no scan.
     scan : Scan or None
         Scan from which the guesses are; None if the problem has them.
     variables : (variables,) array or None
@@ -447,11 +448,13 @@ def _program_and_start(
     )
     if not has_guesses:  # the estimate evaluates the program at a guess
         require_memory(problem, collocation, method=solver)
-    collocation = associated_at_guess(collocation)
-    if warm_start is None or scan:
+    if scan is not None:
         return collocation, scan, None
+    collocation = associated_at_guess(collocation)
+    if warm_start is None:
+        return collocation, None, None
     collocation = warm_start.apply_to_places(collocation)
-    return collocation, scan, warm_start.simulated_variables(collocation)
+    return collocation, None, warm_start.simulated_variables(collocation)
 
 
 def _feature_notes(solution: Solution) -> list[str]:
@@ -508,7 +511,7 @@ def _solve_from_scan(
         if scan is None:
             return None, failed
         again = associated_at_guess(
-            replace(failed.collocation, parameters=scan.parameters)
+            failed.collocation.with_parameters(scan.parameters)
         )
         solution = solve_with_renewed_correspondences(
             solver, again, watch=watch
@@ -544,9 +547,7 @@ def best_of_second_start(
         other = second_start_parameters(first)
         if other is None:
             return first
-        again = associated_at_guess(
-            replace(first.collocation, parameters=other)
-        )
+        again = associated_at_guess(first.collocation.with_parameters(other))
         second = solve_with_renewed_correspondences(solver, again, watch=watch)
     except KeyboardInterrupt:
         return _as_interrupted(first)
