@@ -34,6 +34,15 @@ from .coarse_start import (
     undetermined_names,
 )
 from .several_starts import follow_starts
+from .thinned_start import (
+    NoThinnedStartError,
+    collocation_with_all_points,
+    interrupted_with_all_points,
+    point_counts,
+    require_determined,
+    thinned_problem,
+    thinned_start_note,
+)
 from .two_phases import solve_two_phases
 from .warm_start import WarmStart
 
@@ -310,8 +319,8 @@ def _solve_once(
 ) -> Solution:
     """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier solution.
 
-    A coarse start is tried first if the method asks for one and there is no earlier solution. If
-    the search from guesses fails, a scan follows; if it converges near ν = ½ in reduced space
+    A coarse start is tried first if the method asks for one and there is no earlier solution, then
+    a start with thinned clouds of depth cameras. If the search from guesses fails, a scan follows; if it converges near ν = ½ in reduced space
     and without an earlier solution, a second start is tried.
 
     Parameters
@@ -350,6 +359,14 @@ def _solve_once(
             notes.append(f"no coarse start: {reason}")
         if solution is not None:
             return solution
+        try:
+            solution = _solve_by_thinned_start(
+                problem, solver, watch=watch, workers=workers
+            )
+        except NoThinnedStartError as reason:
+            notes.append(f"no start with fewer depth points: {reason}")
+        if solution is not None:
+            return replace(solution, notes=(*notes, *solution.notes))
     warm_start = (
         WarmStart.read(start) if isinstance(start, (str, Path)) else start
     )
@@ -403,6 +420,65 @@ def _solve_once(
         solution,
         scan=scan or solution.scan,
         notes=(*notes, *solution.notes, *_feature_notes(solution)),
+    )
+
+
+def _solve_by_thinned_start(
+    problem: Problem,
+    solver: ReducedSpace,
+    watch: Watch | None,
+    workers: ExperimentExecutor | None,
+) -> Solution | None:
+    """Solve a problem with thinned clouds of its depth cameras first, and from there with all
+    points; None if no cloud has many points.
+
+    The result counts the sweeps with all points only, but the times of both searches. After an
+    interrupt of the first its point is returned, see `interrupted_with_all_points`. The arguments
+    are those of `_solve_once`.
+
+    Raises
+    ------
+    NoThinnedStartError
+        If one of the searches fails, or the thinned clouds do not determine all parameters.
+    InputError
+        If the machine lacks memory, or no start is found.
+    """
+    thinned = thinned_problem(problem)
+    if thinned is None:
+        return None
+    tolerance = max(solver.tolerance, COARSE_TOLERANCE)
+    with search_activity("search with fewer depth points"):
+        rough = _solve_once(
+            thinned,
+            None,
+            solver=replace(solver, tolerance=tolerance),
+            watch=watch,
+            workers=workers,
+        )
+    if rough.status is Status.INTERRUPTED:
+        return interrupted_with_all_points(problem, rough)
+    require_determined(rough)
+    collocation = collocation_with_all_points(problem, rough)
+    try:
+        require_memory(problem, collocation, method=solver)
+    except InputError as error:
+        raise error.located(problem.path) from error
+    solution = solve_with_renewed_correspondences(
+        with_workers(solver, workers), collocation, watch=watch, start=rough.z
+    )
+    if solution.status in FAILED_STATUSES:
+        raise NoThinnedStartError(
+            f"the search from the solution with {point_counts(rough.collocation)} ended with: "
+            f"{solution.message}"
+        )
+    own_notes = (*solution.notes, *_feature_notes(solution))
+    of_thinned_points = {*own_notes, *_feature_notes(rough)}
+    earlier = [note for note in rough.notes if note not in of_thinned_points]
+    return replace(
+        solution,
+        scan=rough.scan,
+        timing=solution.timing + rough.timing,
+        notes=(thinned_start_note(rough, solution), *earlier, *own_notes),
     )
 
 

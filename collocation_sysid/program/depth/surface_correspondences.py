@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 from ...common.array_types import Array, Index
 from ...fem.body import Body
 from ...model.nuisance_map import NuisanceMap
+from ...recording.depth_camera import Depth
 from ...recording.experiment import Experiment
 from .camera_alignment import align_camera, thinned
 from .depth_camera_model import DepthCameraModel
@@ -278,6 +279,30 @@ class SurfaceCorrespondences:
             phi=phi,
             gate_m=gate_m,
             settled=settled,
+        )
+
+    def with_depth(
+        self, depth: Depth, shapes_m: Array, phi: Array
+    ) -> SurfaceCorrespondences:
+        """Return the correspondences of other measured points of the same camera and images, such as
+        all points in place of thinned ones, with the present gate.
+
+        Parameters
+        ----------
+        depth : Depth
+            The camera with its other points.
+        shapes_m : (S, n, 3) array
+            Surface nodes at all S images [m].
+        phi : (k,) array
+            Nuisance parameters.
+        """
+        return SurfaceCorrespondences.from_shapes(
+            replace(self.camera, depth=depth),
+            self.body,
+            shapes_m=shapes_m,
+            phi=phi,
+            gate_m=self.gate_m,
+            settled=self.has_converged,
         )
 
     def distance_to_cloud_m(self, x: Array, phi: Array) -> Array:
