@@ -320,8 +320,9 @@ def _solve_once(
     """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier solution.
 
     A coarse start is tried first if the method asks for one and there is no earlier solution, then
-    a start with thinned clouds of depth cameras. If the search from guesses fails, a scan follows; if it converges near ν = ½ in reduced space
-    and without an earlier solution, a second start is tried.
+    a start with thinned clouds of depth cameras. If the search from guesses fails, a scan follows;
+    if it converges near ν = ½ in reduced space and without an earlier solution, a second start is
+    tried.
 
     Parameters
     ----------

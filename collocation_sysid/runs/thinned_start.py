@@ -181,11 +181,10 @@ def point_counts(collocation: Collocation) -> str:
 
 
 def thinned_start_note(thinned: Solution, solution: Solution) -> str:
-    """Return a note on the numbers of points, sweeps and the times [s] of a search with thinned
-    clouds and of the search with all points from there.
+    """Return a note on the numbers of points of a search with thinned clouds and of the search with
+    all points from there, and on the sweeps of the latter.
     """
     return (
-        f"searched with {point_counts(thinned.collocation)} first, which took "
-        f"{thinned.timing.total:.2g} s, then with {point_counts(solution.collocation)}, "
-        f"{solution.iterations} sweeps in {solution.timing.total:.2g} s"
+        f"searched with {point_counts(thinned.collocation)} first, then with "
+        f"{point_counts(solution.collocation)} in {solution.iterations} sweeps"
     )

@@ -36,6 +36,8 @@ INDEPENDENT = 10000
 TURNED = 0.2
 # Number of starts that are iterated further after the wider half of the gates.
 CONTINUED_STARTS = 2
+# Number of times, during the wider half of the gates, that starts close to each other are merged.
+CHOICES = 5
 # Largest displacement between two poses that count as one, relative to the gate: both would go on
 # to the same minimum.
 SAME_POSE = 0.1
@@ -135,11 +137,11 @@ def align_camera(
         iterate_alignments, camera, tree, places=places, normals=normals
     )
     wide_gates, narrow_gates = np.array_split(gates, 2)
-    for gate in wide_gates:
+    for some_gates in np.array_split(wide_gates, CHOICES):
         candidates = distinct_poses(
-            iterate(gates=np.array([gate]), starts=candidates),
+            iterate(gates=some_gates, starts=candidates),
             size_m=size_m,
-            same_m=SAME_POSE * gate,
+            same_m=SAME_POSE * some_gates[-1],
         )
     best = min(
         iterate(gates=narrow_gates, starts=candidates[:CONTINUED_STARTS]),

@@ -21,6 +21,7 @@ from ...fem.body import Body
 from ...model.nuisance_map import NuisanceMap
 from ...recording.depth_camera import Depth
 from ...recording.experiment import Experiment
+from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from .camera_alignment import align_camera, thinned
 from .depth_camera_model import DepthCameraModel
 from .depth_outline import Outline
@@ -103,6 +104,8 @@ class SurfaceCorrespondences:
     outline : Outline
         Outline of the body in these shapes and the edges in the images; without points if there are
         no images.
+    is_aligned : bool
+        Whether they are those after an alignment of the camera, see `from_alignment`.
     """
 
     camera: DepthCameraModel
@@ -121,6 +124,7 @@ class SurfaceCorrespondences:
     start_values: Mapping[str, float]
     has_converged: bool
     outline: Outline
+    is_aligned: bool = False
 
     @classmethod
     def from_shapes(
@@ -234,8 +238,29 @@ class SurfaceCorrespondences:
         gate_m = cls.from_shapes(
             thinned_view, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
         ).next_gate_m(shapes_m, phi)
-        return cls.from_shapes(
+        aligned = cls.from_shapes(
             camera, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
+        )
+        return replace(aligned, is_aligned=True)
+
+    def is_aligned_with(self, shapes_m: Array, phi: Array) -> bool:
+        """Return whether these are the correspondences after an alignment of the camera with shapes
+        (S, n, 3) [m] and with the errors of φ (k,) other than those of the pose, so that another
+        alignment would give the same.
+        """
+        view = self.camera
+        before = view.parameters_from(self.start_values)
+        others = np.setdiff1d(
+            view.parameter_indices,
+            view.nuisance.indices_of_rows(
+                DEPTH_TURN, DEPTH_SHIFT, component=view.camera_index
+            ),
+        )
+        moved_m = np.abs(shapes_m - self.shapes_m).max(initial=0.0)
+        return (
+            self.is_aligned
+            and moved_m < SAME * view.depth.sigma_m
+            and bool((before[others] == phi[others]).all())
         )
 
     def updated(self, shapes_m: Array, phi: Array) -> SurfaceCorrespondences:
