@@ -420,7 +420,10 @@ def _misfit(
     positions : sequence of (rows, 3n) array
         First rows of each trajectory [m].
     """
-    collocation, p = collocation.place_unknown_markers(p, positions)
+    # Depth cameras are compared by `rough_residuals`, which need no correspondences.
+    collocation, p = collocation.place_unknown_markers(
+        p, positions, only_poses=True
+    )
     parts = collocation.iterates_at(p, positions)
     return root_mean(np.concatenate([_residuals(part) for part in parts]) ** 2)
 

@@ -426,7 +426,10 @@ class Collocation:
         )
 
     def place_unknown_markers(
-        self, p: Array, positions: Sequence[Array]
+        self,
+        p: Array,
+        positions: Sequence[Array],
+        only_poses: bool = False,
     ) -> tuple[Collocation, Array]:
         """Return the program with unknown marker places and depth cameras initialised before a
         solve, and p in it; see `Transcription.place_unknown_markers`.
@@ -437,6 +440,8 @@ class Collocation:
             Parameters; not modified.
         positions : sequence of (rows, 3n) arrays
             First rows of each experiment [m].
+        only_poses : bool
+            Whether to keep the correspondences of depth cameras and align their poses alone.
 
         Returns
         -------
@@ -447,7 +452,9 @@ class Collocation:
         if not any(segment.rows_to_place for segment in self.transcriptions):
             return self, p
         updates = [
-            part.segment.place_unknown_markers(part.phi, part.x)
+            part.segment.place_unknown_markers(
+                part.phi, part.x, only_poses=only_poses
+            )
             for part in self.iterates_at(p, positions)
         ]
         return self._with_associations(

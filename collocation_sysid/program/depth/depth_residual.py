@@ -224,7 +224,7 @@ class DepthResidual(MeasurementResidual):
         return int(self._neighbour_times[0, -1])
 
     def aligned_correspondences(
-        self, x: Array, phi: Array
+        self, x: Array, phi: Array, only_pose: bool = False
     ) -> SurfaceCorrespondences:
         """Align the camera with the first rows of a motion and return the correspondences.
 
@@ -235,6 +235,8 @@ class DepthResidual(MeasurementResidual):
             Images that they do not reach keep their shapes.
         phi : (k,) array
             Nuisance parameters; not modified.
+        only_pose : bool
+            Whether to keep the present correspondences, with the new pose of the camera.
 
         Returns
         -------
@@ -250,6 +252,8 @@ class DepthResidual(MeasurementResidual):
         )
         if correspondences.is_aligned_with(all_shapes, phi):
             return correspondences
+        if only_pose:
+            return correspondences.with_aligned_pose(all_shapes, phi)
         return SurfaceCorrespondences.from_alignment(
             correspondences.camera,
             correspondences.body,

@@ -220,17 +220,8 @@ class SurfaceCorrespondences:
         phi : (k,) array
             Nuisance parameters, for those that the alignment does not estimate; not modified.
         """
-        first = camera.depth.first_sample_with_points
-        skin = VisibleSurface.from_body(body, camera.depth)
-        turn, shift_m = align_camera(
-            camera, skin, x=shapes_m[first], image=first
-        )
-        moved = camera.with_pose(phi, turn, shift_m=shift_m)
-        is_implausible = (
-            np.abs(moved[camera.parameter_indices]).max(initial=0.0) > FARTHEST
-        )
+        phi = _aligned_parameters(camera, body, shapes_m=shapes_m, phi=phi)
         gate_m = max(initial_gate_m(body.nodes_m), camera.depth.gate_m)
-        phi = phi if is_implausible else moved
         clouds = tuple(map(thinned, camera.depth.clouds))
         thinned_view = replace(
             camera, depth=replace(camera.depth, clouds=clouds, images_m=())
@@ -242,6 +233,21 @@ class SurfaceCorrespondences:
             camera, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
         )
         return replace(aligned, is_aligned=True)
+
+    def with_aligned_pose(
+        self, shapes_m: Array, phi: Array
+    ) -> SurfaceCorrespondences:
+        """Return the same correspondences with the camera's parameters after an alignment with the
+        shapes (S, n, 3) [m], see `from_alignment`, for comparisons that need the pose alone.
+        """
+        phi = _aligned_parameters(
+            self.camera, self.body, shapes_m=shapes_m, phi=phi
+        )
+        return replace(
+            self,
+            start_values=self.camera.parameter_values(phi),
+            is_aligned=False,
+        )
 
     def is_aligned_with(self, shapes_m: Array, phi: Array) -> bool:
         """Return whether these are the correspondences after an alignment of the camera with shapes
@@ -382,6 +388,23 @@ class SurfaceCorrespondences:
             behind_m = np.sum(self.normals[k] * (surface - measured), axis=1)
             distances_m[k] = np.where(self.is_compared[k], behind_m, np.nan)
         return distances_m
+
+
+def _aligned_parameters(
+    camera: DepthCameraModel, body: Body, shapes_m: Array, phi: Array
+) -> Array:
+    """Return φ (k,) with the pose of the camera that is aligned with the shape of the first image
+    that has points; φ itself if the pose would differ from the stated one by more than `FARTHEST`
+    prior standard deviations. The arguments are those of `SurfaceCorrespondences.from_alignment`.
+    """
+    first = camera.depth.first_sample_with_points
+    surface = VisibleSurface.from_body(body, camera.depth)
+    turn, shift_m = align_camera(
+        camera, surface, x=shapes_m[first], image=first
+    )
+    moved = camera.with_pose(phi, turn, shift_m=shift_m)
+    errors = np.abs(moved[camera.parameter_indices])
+    return phi if errors.max(initial=0.0) > FARTHEST else moved
 
 
 class _NearestPoints(NamedTuple):
