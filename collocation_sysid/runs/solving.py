@@ -472,14 +472,18 @@ def _solve_by_thinned_start(
             f"the search from the solution with {point_counts(rough.collocation)} ended with: "
             f"{solution.message}"
         )
-    own_notes = (*solution.notes, *_feature_notes(solution))
-    of_thinned_points = {*own_notes, *_feature_notes(rough)}
-    earlier = [note for note in rough.notes if note not in of_thinned_points]
+    fit_notes = _feature_notes(solution)
+    replaced_notes = [*solution.notes, *fit_notes, *_feature_notes(rough)]
     return replace(
         solution,
         scan=rough.scan,
         timing=solution.timing + rough.timing,
-        notes=(thinned_start_note(rough, solution), *earlier, *own_notes),
+        notes=(
+            thinned_start_note(rough, solution),
+            *(note for note in rough.notes if note not in replaced_notes),
+            *solution.notes,
+            *fit_notes,
+        ),
     )
 
 
