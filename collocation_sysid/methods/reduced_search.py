@@ -242,16 +242,12 @@ class ReducedSearch:
         if status is not None:
             return status, status.sentence
         status = Status.CONVERGED
-        solved_rows: list[int] = []
         for share in self.options.ladder:
             last = share == self.options.ladder[-1]
             rows = [
                 samples_in_share(segment.grid_times, share)
                 for segment in self.collocation.transcriptions
             ]
-            if rows == solved_rows and not last:
-                continue  # a short recording: the same problem once more
-            solved_rows = rows
             rung = self._horizon(rows, last)
             self._extend_to(rung)
             status = self._minimise(rung, last)
