@@ -149,10 +149,10 @@ def start_problem(
     unguessed = collocation.parameters.names_without_guess
     if any(is_modulus(name) for name in unguessed):
         result = scan_stiffness(collocation, is_complete=is_complete)
-        return replace(collocation, parameters=result.parameters), result
+        return collocation.with_parameters(result.parameters), result
     if unguessed:
         usual = typical_parameters(collocation.parameters, STIFFEST_PA)
-        collocation = replace(collocation, parameters=usual)
+        collocation = collocation.with_parameters(usual)
     if not _has_free_modulus(collocation):
         return collocation, None
     trial = TrialSimulation(collocation)
@@ -174,7 +174,7 @@ def start_problem(
             reason=f"{reason} (misfit {misfit:.3g} standard deviations at the guess, {best:.3g} at "
             "the initial values of the scan, which replace all guesses)",
         )
-    return replace(collocation, parameters=result.parameters), result
+    return collocation.with_parameters(result.parameters), result
 
 
 def rescue(
@@ -227,9 +227,7 @@ def scan_stiffness(
     """
     began = time.perf_counter()
     trial = TrialSimulation(
-        replace(
-            collocation, parameters=_with_units(collocation.parameters, 1.0)
-        )
+        collocation.with_parameters(_with_units(collocation.parameters, 1.0))
     )
     trials = ScanState(trial)
     step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
@@ -422,7 +420,10 @@ def _misfit(
     positions : sequence of (rows, 3n) array
         First rows of each trajectory [m].
     """
-    collocation, p = collocation.place_unknown_markers(p, positions)
+    # Depth cameras are compared by `rough_residuals`, which need no correspondences.
+    collocation, p = collocation.place_unknown_markers(
+        p, positions, only_poses=True
+    )
     parts = collocation.iterates_at(p, positions)
     return root_mean(np.concatenate([_residuals(part) for part in parts]) ** 2)
 

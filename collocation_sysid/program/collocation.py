@@ -203,6 +203,19 @@ class Collocation:
             segments, [segment.association for segment in segments]
         )
 
+    def with_parameters(self, parameters: Parameters) -> Collocation:
+        """Return the program with other shared parameters, or other guesses of them, and the present
+        associations of the measurements, which are not computed again.
+        """
+        return replace(
+            self,
+            parameters=parameters,
+            associations={
+                each.experiment.name: each.association
+                for each in self.transcriptions
+            },
+        )
+
     @property
     def nq(self) -> int:
         """Number of shared parameters q."""
@@ -413,7 +426,10 @@ class Collocation:
         )
 
     def place_unknown_markers(
-        self, p: Array, positions: Sequence[Array]
+        self,
+        p: Array,
+        positions: Sequence[Array],
+        only_poses: bool = False,
     ) -> tuple[Collocation, Array]:
         """Return the program with unknown marker places and depth cameras initialised before a
         solve, and p in it; see `Transcription.place_unknown_markers`.
@@ -424,6 +440,8 @@ class Collocation:
             Parameters; not modified.
         positions : sequence of (rows, 3n) arrays
             First rows of each experiment [m].
+        only_poses : bool
+            Whether to keep the correspondences of depth cameras and align their poses alone.
 
         Returns
         -------
@@ -434,7 +452,9 @@ class Collocation:
         if not any(segment.rows_to_place for segment in self.transcriptions):
             return self, p
         updates = [
-            part.segment.place_unknown_markers(part.phi, part.x)
+            part.segment.place_unknown_markers(
+                part.phi, part.x, only_poses=only_poses
+            )
             for part in self.iterates_at(p, positions)
         ]
         return self._with_associations(

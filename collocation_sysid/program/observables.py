@@ -195,6 +195,18 @@ class PointPositions:
         """Return the matrix H (3e, 3n) from positions to points at φ (k,); row 3 m + axis,
         column 3 node + axis.
         """
+        if self.is_linear:
+            return self._constant_operator
+        return self._operator_at(phi)
+
+    @cached_property
+    def _constant_operator(self) -> sp.csr_array:
+        """Matrix `operator` of points whose places are all stated."""
+        size = self.coordinate_parameters.max(initial=-1) + 1
+        return self._operator_at(np.zeros(size))
+
+    def _operator_at(self, phi: Array) -> sp.csr_array:
+        """Return the matrix `operator` at φ (k,)."""
         nodes, shape = self.shape_functions(phi)
         return interpolation_matrix(
             nodes, shape.weights, node_count=self.node_count

@@ -170,10 +170,14 @@ class Transcription(MotionTranscription):
         markers, place_coordinates = self.association.markers.follow_estimates(
             np.append(phi, 0.0)[places]
         )
-        correspondences = [
-            depth.correspondences.updated(depth.surface_shapes(x, phi), phi)
-            for depth in self.depths
-        ]
+        correspondences = []
+        for depth, present in zip(
+            self.depths, self.association.correspondences, strict=True
+        ):
+            own = depth.correspondences
+            updated = own.updated(depth.surface_shapes(x, phi), phi)
+            # The measurement model has a copy, with its own camera model.
+            correspondences.append(present if updated is own else updated)
         association = self.association.updated(
             markers,
             float(shifts_s.sum()) / self.experiment.timestep_s,
@@ -182,7 +186,7 @@ class Transcription(MotionTranscription):
         return association, self._with_marker_places(phi, place_coordinates)
 
     def place_unknown_markers(
-        self, phi: Array, x: Array
+        self, phi: Array, x: Array, only_poses: bool = False
     ) -> tuple[Association, Array]:
         """Return the association and φ with unknown marker places and depth cameras initialised
         from the first rows of a motion.
@@ -198,6 +202,8 @@ class Transcription(MotionTranscription):
             Nuisance parameters; they are not modified.
         x : (rows, 3n) array
             First rows of the motion [m], at least `rows_to_place`.
+        only_poses : bool
+            Whether to keep the correspondences of depth cameras and align their poses alone.
 
         Returns
         -------
@@ -207,7 +213,8 @@ class Transcription(MotionTranscription):
         """
         phi = phi.copy()
         sightings = tuple(
-            depth.aligned_correspondences(x, phi) for depth in self.depths
+            depth.aligned_correspondences(x, phi, only_pose=only_poses)
+            for depth in self.depths
         )
         for each in sightings:
             phi[each.camera.parameter_indices] = each.camera.parameters_from(

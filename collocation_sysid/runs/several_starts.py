@@ -2,25 +2,31 @@
 
 Points measured by a camera are associated with the nearest part of the surface: a body that is too
 soft, with the camera turned to match, can be a local minimum of the loss. So the scan's best
-stiffness and those next to it are all followed to convergence, and the solution with the lowest
-loss counts.
+stiffness and those next to it are all followed to convergence, or to a minimum that is already
+known, and the solution with the lowest loss counts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from ..common.array_types import Array
 from ..features.registry import FEATURES
 from ..methods.initial_trajectories import associated_at_guess
 from ..methods.reduced_space import ReducedSpace
-from ..methods.solution import Method, Solution, Status
+from ..methods.solution import Iteration, Method, Solution, Status, Watch
 from ..methods.stiffness_scan import Scan
 from ..program.collocation import Collocation
 
 # Difference of losses below which two solutions are the same minimum with other correspondences:
 # in simulated recordings they differ by up to 5.
 SAME_LOSS = 10.0
+# Relative difference of all parameters below which a search with such a loss is at the same minimum
+# and need not continue.
+SAME_PARAMETERS = 0.01
 Solve = Callable[[Method, Collocation], Solution]
 
 
@@ -77,6 +83,58 @@ def robust_loss(solution: Solution) -> float:
     )
 
 
+class _KnownMinimum(Exception):
+    """Arrival of a search at a minimum that is known.
+
+    Attributes
+    ----------
+    solution : Solution
+        Solution at that minimum.
+    """
+
+    def __init__(self, solution: Solution) -> None:
+        super().__init__()
+        self.solution = solution
+
+
+def _until_known(method: Method, known: Sequence[Solution]) -> Method:
+    """Return a method that raises `_KnownMinimum` as soon as an iterate with complete recordings has
+    the loss of a known solution, up to `SAME_LOSS`, and its parameters, up to `SAME_PARAMETERS`.
+    """
+
+    def solve(
+        collocation: Collocation,
+        watch: Watch | None = None,
+        start: Array | None = None,
+    ) -> Solution:
+        """Solve by the method; see `Method`."""
+
+        def watch_for_known(line: Iteration) -> None:
+            """Pass an entry of the history to `watch`, then compare it with the known solutions."""
+            if watch is not None:
+                watch(line)
+            for solution in known:
+                if _is_at(line, solution):
+                    raise _KnownMinimum(solution)
+
+        return method(collocation, watch_for_known, start)
+
+    return solve if known else method
+
+
+def _is_at(line: Iteration, solution: Solution) -> bool:
+    """Return whether an iterate is at the minimum of a solution, see `_until_known`."""
+    last = solution.history[-1]
+    return (
+        line.share == 1.0
+        and abs(line.loss - last.loss) <= SAME_LOSS
+        and all(
+            np.isclose(value, last.parameters[name], rtol=SAME_PARAMETERS)
+            for name, value in line.parameters.items()
+        )
+    )
+
+
 def follow_starts(
     solver: Method,
     collocation: Collocation,
@@ -119,9 +177,17 @@ def follow_starts(
     candidates: list[tuple[float, int, Solution]] = []
     for number in (scan.best, *scan.others):
         started = associated_at_guess(
-            replace(collocation, parameters=scan.starts[number])
+            collocation.with_parameters(scan.starts[number])
         )
-        solution = solve(method, started)
+        try:
+            solution = solve(
+                _until_known(method, [each for *_, each in candidates]), started
+            )
+        except _KnownMinimum as known:
+            candidates.append(
+                (robust_loss(known.solution), number, known.solution)
+            )
+            continue
         if solution.status is Status.INTERRUPTED:
             return first if not is_own else replace(first, solution=solution)
         if solution.status.converged:
@@ -134,13 +200,13 @@ def follow_starts(
         for each, number, _ in candidates
     )
     note = (
-        f"{len(candidates)} initial values of the scan were solved to the end, with the losses "
-        f"{losses}"
+        f"{len(candidates)} initial values of the scan were solved to the end, or to a minimum that "
+        f"another one had reached, with the losses {losses}"
     )
     if max(each for each, _, _ in candidates) - loss > SAME_LOSS:
         note += ": there are local minima; the lowest one is reported"
     chosen = replace(scan, best=best, parameters=scan.starts[best])
-    started = replace(collocation, parameters=scan.starts[best])
+    started = collocation.with_parameters(scan.starts[best])
     return CompletedStart(
         started, chosen, solution=solution if is_own else None, note=note
     )

@@ -34,6 +34,15 @@ from .coarse_start import (
     undetermined_names,
 )
 from .several_starts import follow_starts
+from .thinned_start import (
+    NoThinnedStartError,
+    collocation_with_all_points,
+    interrupted_with_all_points,
+    point_counts,
+    require_determined,
+    thinned_problem,
+    thinned_start_note,
+)
 from .two_phases import solve_two_phases
 from .warm_start import WarmStart
 
@@ -312,9 +321,10 @@ def _solve_once(
 ) -> Solution:
     """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier solution.
 
-    A coarse start is tried first if the method asks for one and there is no earlier solution. If
-    the search from guesses fails, a scan follows; if it converges near ν = ½ in reduced space
-    and without an earlier solution, a second start is tried.
+    A coarse start is tried first if the method asks for one and there is no earlier solution, then
+    a start with thinned clouds of depth cameras. If the search from guesses fails, a scan follows;
+    if it converges near ν = ½ in reduced space and without an earlier solution, a second start is
+    tried.
 
     Parameters
     ----------
@@ -352,6 +362,14 @@ def _solve_once(
             notes.append(f"no coarse start: {reason}")
         if solution is not None:
             return solution
+        try:
+            solution = _solve_by_thinned_start(
+                problem, solver, watch=watch, workers=workers
+            )
+        except NoThinnedStartError as reason:
+            notes.append(f"no start with fewer depth points: {reason}")
+        if solution is not None:
+            return replace(solution, notes=(*notes, *solution.notes))
     warm_start = (
         WarmStart.read(start) if isinstance(start, (str, Path)) else start
     )
@@ -371,10 +389,11 @@ def _solve_once(
                 scan=scan,
                 solve=partial(solve_with_renewed_correspondences, watch=watch),
             )
-            collocation = associated_at_guess(scanned.collocation)
             scan = scanned.scan
             solution = scanned.solution
             comparison = scanned.note
+            if solution is None:
+                collocation = associated_at_guess(scanned.collocation)
         if solution is None:
             solution = solve_with_renewed_correspondences(
                 solver, collocation, watch=watch, start=variables
@@ -407,6 +426,69 @@ def _solve_once(
     )
 
 
+def _solve_by_thinned_start(
+    problem: Problem,
+    solver: ReducedSpace,
+    watch: Watch | None,
+    workers: ExperimentExecutor | None,
+) -> Solution | None:
+    """Solve a problem with thinned clouds of its depth cameras first, and from there with all
+    points; None if no cloud has many points.
+
+    The result counts the sweeps with all points only, but the times of both searches. After an
+    interrupt of the first its point is returned, see `interrupted_with_all_points`. The arguments
+    are those of `_solve_once`.
+
+    Raises
+    ------
+    NoThinnedStartError
+        If one of the searches fails, or the thinned clouds do not determine all parameters.
+    InputError
+        If the machine lacks memory, or no start is found.
+    """
+    thinned = thinned_problem(problem)
+    if thinned is None:
+        return None
+    tolerance = max(solver.tolerance, COARSE_TOLERANCE)
+    with search_activity("search with fewer depth points"):
+        rough = _solve_once(
+            thinned,
+            None,
+            solver=replace(solver, tolerance=tolerance),
+            watch=watch,
+            workers=workers,
+        )
+    if rough.status is Status.INTERRUPTED:
+        return interrupted_with_all_points(problem, rough)
+    require_determined(rough)
+    collocation = collocation_with_all_points(problem, rough)
+    try:
+        require_memory(problem, collocation, method=solver)
+    except InputError as error:
+        raise error.located(problem.path) from error
+    solution = solve_with_renewed_correspondences(
+        with_workers(solver, workers), collocation, watch=watch, start=rough.z
+    )
+    if solution.status in FAILED_STATUSES:
+        raise NoThinnedStartError(
+            f"the search from the solution with {point_counts(rough.collocation)} ended with: "
+            f"{solution.message}"
+        )
+    fit_notes = _feature_notes(solution)
+    replaced_notes = [*solution.notes, *fit_notes, *_feature_notes(rough)]
+    return replace(
+        solution,
+        scan=rough.scan,
+        timing=solution.timing + rough.timing,
+        notes=(
+            thinned_start_note(rough, solution),
+            *(note for note in rough.notes if note not in replaced_notes),
+            *solution.notes,
+            *fit_notes,
+        ),
+    )
+
+
 def _program_and_start(
     problem: Problem, solver: Method, warm_start: WarmStart | None
 ) -> tuple[Collocation, Scan | None, Array | None]:
@@ -424,7 +506,7 @@ def _program_and_start(
     Returns
     -------
     collocation : Collocation
-        Program with measurements associated at the guess.
+        Program; its measurements are associated at the guess if there was no scan.
     scan : Scan or None
         Scan from which the guesses are; None if the problem has them.
     variables : (variables,) array or None
@@ -449,11 +531,13 @@ def _program_and_start(
     )
     if not has_guesses:  # the estimate evaluates the program at a guess
         require_memory(problem, collocation, method=solver)
-    collocation = associated_at_guess(collocation)
-    if warm_start is None or scan:
+    if scan is not None:
         return collocation, scan, None
+    collocation = associated_at_guess(collocation)
+    if warm_start is None:
+        return collocation, None, None
     collocation = warm_start.apply_to_places(collocation)
-    return collocation, scan, warm_start.simulated_variables(collocation)
+    return collocation, None, warm_start.simulated_variables(collocation)
 
 
 def _feature_notes(solution: Solution) -> list[str]:
@@ -510,7 +594,7 @@ def _solve_from_scan(
         if scan is None:
             return None, failed
         again = associated_at_guess(
-            replace(failed.collocation, parameters=scan.parameters)
+            failed.collocation.with_parameters(scan.parameters)
         )
         solution = solve_with_renewed_correspondences(
             solver, again, watch=watch
@@ -546,9 +630,7 @@ def best_of_second_start(
         other = second_start_parameters(first)
         if other is None:
             return first
-        again = associated_at_guess(
-            replace(first.collocation, parameters=other)
-        )
+        again = associated_at_guess(first.collocation.with_parameters(other))
         second = solve_with_renewed_correspondences(solver, again, watch=watch)
     except KeyboardInterrupt:
         return _as_interrupted(first)

@@ -1,14 +1,19 @@
 """Alignment of a depth camera: steps of several starts at once."""
 
 import numpy as np
+from kit.depth import MATRIX, POSE, hanging, hanging_m, image_m, moved
 from scipy.spatial.transform import Rotation
 
+import collocation_sysid as cs
+from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.depth import camera_alignment
 from collocation_sysid.program.depth.camera_alignment import (
     SLIDING,
     _alignment_steps,
     _MatchedSurface,
 )
+from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
+from collocation_sysid.program.depth.visible_surface import VisibleSurface
 
 
 def test_steps_are_those_of_linear_least_squares():
@@ -94,3 +99,53 @@ def test_starts_do_not_influence_each_other():
     np.testing.assert_allclose(
         together[0].rotation.as_rotvec(), [-0.05, 0.02, -0.03], atol=2e-3
     )
+
+
+def test_poses_that_hardly_differ_count_once():
+    def pose(turn, shift_m, mismatch):
+        return camera_alignment.AlignedPose(
+            Rotation.from_rotvec(turn), np.array(shift_m), mismatch=mismatch
+        )
+
+    best = pose([0.1, 0, 0], [0, 0, 0.01], 0.1)
+    near = pose([0.1, 0.002, 0], [0, 0, 0.0105], 0.2)
+    turned = pose([0.2, 0, 0], [0, 0, 0.01], 0.3)
+    beside = pose([0.1, 0, 0], [0.005, 0, 0.01], 0.4)
+    kept = camera_alignment.distinct_poses(
+        [beside, near, turned, best], size_m=0.1, same_m=0.002
+    )
+    assert kept == [best, turned, beside]
+
+
+def displacement_m(rng: np.random.Generator) -> float:
+    """RMS distance of the points of an image from their true places after an alignment of a camera
+    whose stated pose is off by some degrees and centimetres.
+    """
+    pose = moved(0.09 * rng.normal(size=3), 0.02 * rng.normal(size=3))
+    depth = cs.Depth.of_images(
+        "front", image_m(), cs.DepthCamera(MATRIX, pose=pose), 1e-4
+    )
+    experiment = hanging((depth,))
+    nuisance = NuisanceMap.from_experiment(experiment)
+    camera = DepthCameraModel.from_experiment(experiment, 0, nuisance=nuisance)
+    turn, shift_m = camera_alignment.align_camera(
+        camera,
+        VisibleSurface.from_body(experiment.body, depth),
+        x=hanging_m(),
+        image=0,
+    )
+    phi = camera.with_pose(np.zeros(nuisance.size), turn, shift_m=shift_m)
+    points_m = depth.points_m[0]
+    true_m = points_m @ POSE[:3, :3].T + POSE[:3, 3]
+    way_m = camera.world_points(phi, 0) - true_m
+    return float(np.sqrt(np.mean(np.sum(way_m**2, axis=1))))
+
+
+def test_merging_of_starts_leaves_alignments_as_accurate(monkeypatch):
+    """Poses slide along the bar, so that single alignments end elsewhere."""
+    seeds = range(10)
+    merged_m = [displacement_m(np.random.default_rng(k)) for k in seeds]
+    monkeypatch.setattr(camera_alignment, "SAME_POSE", 0.0)
+    every_m = [displacement_m(np.random.default_rng(k)) for k in seeds]
+    assert np.mean(merged_m) < 1.05 * np.mean(every_m)
+    assert np.max(merged_m) < 0.004

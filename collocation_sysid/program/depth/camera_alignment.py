@@ -9,6 +9,7 @@ Medioni 1992).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -33,8 +34,13 @@ SLIDING = 0.2
 INDEPENDENT = 10000
 # Rotations from which the search starts, about each axis in both directions [rad].
 TURNED = 0.2
-# Number of starts that are iterated further after each half of the gates.
+# Number of starts that are iterated further after the wider half of the gates.
 CONTINUED_STARTS = 2
+# Number of times, during the wider half of the gates, that starts close to each other are merged.
+CHOICES = 5
+# Largest displacement between two poses that count as one, relative to the gate: both would go on
+# to the same minimum.
+SAME_POSE = 0.1
 # Largest number of points of a cloud that are used, approximately; more only cost time.
 ENOUGH = 2000
 
@@ -73,8 +79,9 @@ def align_camera(
 
     The search starts from the stated pose, and from the pose that puts the cloud at the middle of
     the shape, each also rotated in both directions about each axis; the best result is returned.
-    Points of other things should be far away compared with the gate. Random points are the same in
-    each call.
+    Of starts that come close to each other the one with the smallest mismatch is continued. Points
+    of other things should be far away compared with the gate. Random points are the same in each
+    call.
 
     Parameters
     ----------
@@ -126,19 +133,50 @@ def align_camera(
         for turn in rotation_vectors
         for shift in shifts
     ]
-    for half in np.array_split(gates, 2):
-        candidates = iterate_alignments(
-            camera,
-            tree,
-            places=places,
-            normals=normals,
-            gates=half,
-            starts=candidates,
+    iterate = partial(
+        iterate_alignments, camera, tree, places=places, normals=normals
+    )
+    wide_gates, narrow_gates = np.array_split(gates, 2)
+    for some_gates in np.array_split(wide_gates, CHOICES):
+        candidates = distinct_poses(
+            iterate(gates=some_gates, starts=candidates),
+            size_m=size_m,
+            same_m=SAME_POSE * some_gates[-1],
         )
-        candidates.sort(key=lambda each: each.mismatch)
-        candidates = candidates[:CONTINUED_STARTS]
-    best = candidates[0]
+    best = min(
+        iterate(gates=narrow_gates, starts=candidates[:CONTINUED_STARTS]),
+        key=lambda each: each.mismatch,
+    )
     return best.rotation.as_rotvec(), best.translation_m
+
+
+def distinct_poses(
+    poses: Sequence[AlignedPose], size_m: float, same_m: float
+) -> list[AlignedPose]:
+    """Return the poses in ascending order of their mismatch, without those that hardly differ from
+    an earlier one.
+
+    Parameters
+    ----------
+    poses : sequence of AlignedPose
+        Poses of one iteration.
+    size_m : float
+        Length by which differences of rotation vectors [rad] become displacements [m].
+    same_m : float
+        Poses whose rotations and translations together move a point by less than this are the same
+        [m].
+    """
+    ranked = sorted(poses, key=lambda each: each.mismatch)
+    rotations = np.array([each.rotation.as_rotvec() for each in ranked])
+    translations_m = np.array([each.translation_m for each in ranked])
+    kept: list[int] = []
+    for k in range(len(ranked)):
+        apart_m = size_m * np.linalg.norm(
+            rotations[kept] - rotations[k], axis=1
+        ) + np.linalg.norm(translations_m[kept] - translations_m[k], axis=1)
+        if not len(kept) or apart_m.min() >= same_m:
+            kept.append(k)
+    return [ranked[k] for k in kept]
 
 
 def iterate_alignments(

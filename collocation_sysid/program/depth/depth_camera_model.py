@@ -93,6 +93,11 @@ class DepthCameraModel:
         return {}
 
     @cached_property
+    def surface_observables(self) -> dict[int, Any]:
+        """Cache of the surface's nodes as an observable, by the number of times; empty at first."""
+        return {}
+
+    @cached_property
     def outline_expressions(self) -> dict[tuple[int, int], Any]:
         """Cache of the generated functions of its outline residuals, shared by all copies of the
         measurement model; empty at first.

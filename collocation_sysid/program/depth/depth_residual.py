@@ -48,6 +48,33 @@ PATCHES = 60
 GROWING = 1.2
 
 
+def _surface_positions(
+    correspondences: SurfaceCorrespondences, times: int
+) -> PointPositions:
+    """Return the surface nodes of the body at a number of times as an observable, which is stored
+    with the camera's model, because it is the same for all correspondences.
+    """
+    stored = correspondences.camera.surface_observables
+    if times not in stored:
+        body = correspondences.body
+        nodes = correspondences.surface.nodes
+        count = len(nodes)
+        placement = Placement(
+            nodes[:, None],
+            np.ones((count, 1)),
+            distance_m=np.zeros(count),
+            node_count=len(body.nodes_m),
+        )
+        stored[times] = PointPositions(
+            np.arange(times),
+            MarkerAssociation.from_exact_places(
+                body, placement, points_m=body.nodes_m[nodes]
+            ),
+            coordinate_parameters=np.full((count, 3), -1),
+        )
+    return stored[times]
+
+
 @dataclass(frozen=True, eq=False)
 class DepthResidual(MeasurementResidual):
     """Measurement model of the points of a depth camera, with one number each: the distance from
@@ -94,26 +121,9 @@ class DepthResidual(MeasurementResidual):
             normal.
         """
         view = correspondences.camera
-        nodes = correspondences.surface.nodes
-        points_m = correspondences.body.nodes_m[nodes]
-        count = len(nodes)
-        none = np.zeros(len(nodes))
-        placement = Placement(
-            nodes[:, None],
-            np.ones((count, 1)),
-            distance_m=none,
-            node_count=len(correspondences.body.nodes_m),
-        )
-        chart = MarkerAssociation.from_exact_places(
-            correspondences.body, placement, points_m=points_m
-        )
         samples, points = correspondences.is_compared.shape
         return cls(
-            observable=PointPositions(
-                np.arange(len(at_s)),
-                chart,
-                coordinate_parameters=np.full((count, 3), -1),
-            ),
+            observable=_surface_positions(correspondences, len(at_s)),
             nuisance=nuisance,
             huber=HUBER if huber is None else huber,
             names=(view.depth.name,) * points,
@@ -214,7 +224,7 @@ class DepthResidual(MeasurementResidual):
         return int(self._neighbour_times[0, -1])
 
     def aligned_correspondences(
-        self, x: Array, phi: Array
+        self, x: Array, phi: Array, only_pose: bool = False
     ) -> SurfaceCorrespondences:
         """Align the camera with the first rows of a motion and return the correspondences.
 
@@ -225,6 +235,13 @@ class DepthResidual(MeasurementResidual):
             Images that they do not reach keep their shapes.
         phi : (k,) array
             Nuisance parameters; not modified.
+        only_pose : bool
+            Whether to keep the present correspondences, with the new pose of the camera.
+
+        Returns
+        -------
+        SurfaceCorrespondences
+            The present correspondences if they are those of an alignment with the same shapes.
         """
         correspondences = self.correspondences
         shapes = self.surface_shapes(x, phi)
@@ -233,6 +250,10 @@ class DepthResidual(MeasurementResidual):
         all_shapes = np.concatenate(
             [shapes, correspondences.shapes_m[len(shapes) :]]
         )
+        if correspondences.is_aligned_with(all_shapes, phi):
+            return correspondences
+        if only_pose:
+            return correspondences.with_aligned_pose(all_shapes, phi)
         return SurfaceCorrespondences.from_alignment(
             correspondences.camera,
             correspondences.body,

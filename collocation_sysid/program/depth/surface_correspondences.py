@@ -19,7 +19,9 @@ from scipy.spatial import KDTree
 from ...common.array_types import Array, Index
 from ...fem.body import Body
 from ...model.nuisance_map import NuisanceMap
+from ...recording.depth_camera import Depth
 from ...recording.experiment import Experiment
+from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from .camera_alignment import align_camera, thinned
 from .depth_camera_model import DepthCameraModel
 from .depth_outline import Outline
@@ -102,6 +104,8 @@ class SurfaceCorrespondences:
     outline : Outline
         Outline of the body in these shapes and the edges in the images; without points if there are
         no images.
+    is_aligned : bool
+        Whether they are those after an alignment of the camera, see `from_alignment`.
     """
 
     camera: DepthCameraModel
@@ -120,6 +124,7 @@ class SurfaceCorrespondences:
     start_values: Mapping[str, float]
     has_converged: bool
     outline: Outline
+    is_aligned: bool = False
 
     @classmethod
     def from_shapes(
@@ -215,17 +220,8 @@ class SurfaceCorrespondences:
         phi : (k,) array
             Nuisance parameters, for those that the alignment does not estimate; not modified.
         """
-        first = camera.depth.first_sample_with_points
-        skin = VisibleSurface.from_body(body, camera.depth)
-        turn, shift_m = align_camera(
-            camera, skin, x=shapes_m[first], image=first
-        )
-        moved = camera.with_pose(phi, turn, shift_m=shift_m)
-        is_implausible = (
-            np.abs(moved[camera.parameter_indices]).max(initial=0.0) > FARTHEST
-        )
+        phi = _aligned_parameters(camera, body, shapes_m=shapes_m, phi=phi)
         gate_m = max(initial_gate_m(body.nodes_m), camera.depth.gate_m)
-        phi = phi if is_implausible else moved
         clouds = tuple(map(thinned, camera.depth.clouds))
         thinned_view = replace(
             camera, depth=replace(camera.depth, clouds=clouds, images_m=())
@@ -233,8 +229,44 @@ class SurfaceCorrespondences:
         gate_m = cls.from_shapes(
             thinned_view, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
         ).next_gate_m(shapes_m, phi)
-        return cls.from_shapes(
+        aligned = cls.from_shapes(
             camera, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
+        )
+        return replace(aligned, is_aligned=True)
+
+    def with_aligned_pose(
+        self, shapes_m: Array, phi: Array
+    ) -> SurfaceCorrespondences:
+        """Return the same correspondences with the camera's parameters after an alignment with the
+        shapes (S, n, 3) [m], see `from_alignment`, for comparisons that need the pose alone.
+        """
+        phi = _aligned_parameters(
+            self.camera, self.body, shapes_m=shapes_m, phi=phi
+        )
+        return replace(
+            self,
+            start_values=self.camera.parameter_values(phi),
+            is_aligned=False,
+        )
+
+    def is_aligned_with(self, shapes_m: Array, phi: Array) -> bool:
+        """Return whether these are the correspondences after an alignment of the camera with shapes
+        (S, n, 3) [m] and with the errors of φ (k,) other than those of the pose, so that another
+        alignment would give the same.
+        """
+        view = self.camera
+        before = view.parameters_from(self.start_values)
+        others = np.setdiff1d(
+            view.parameter_indices,
+            view.nuisance.indices_of_rows(
+                DEPTH_TURN, DEPTH_SHIFT, component=view.camera_index
+            ),
+        )
+        moved_m = np.abs(shapes_m - self.shapes_m).max(initial=0.0)
+        return (
+            self.is_aligned
+            and moved_m < SAME * view.depth.sigma_m
+            and bool((before[others] == phi[others]).all())
         )
 
     def updated(self, shapes_m: Array, phi: Array) -> SurfaceCorrespondences:
@@ -278,6 +310,30 @@ class SurfaceCorrespondences:
             phi=phi,
             gate_m=gate_m,
             settled=settled,
+        )
+
+    def with_depth(
+        self, depth: Depth, shapes_m: Array, phi: Array
+    ) -> SurfaceCorrespondences:
+        """Return the correspondences of other measured points of the same camera and images, such as
+        all points in place of thinned ones, with the present gate.
+
+        Parameters
+        ----------
+        depth : Depth
+            The camera with its other points.
+        shapes_m : (S, n, 3) array
+            Surface nodes at all S images [m].
+        phi : (k,) array
+            Nuisance parameters.
+        """
+        return SurfaceCorrespondences.from_shapes(
+            replace(self.camera, depth=depth),
+            self.body,
+            shapes_m=shapes_m,
+            phi=phi,
+            gate_m=self.gate_m,
+            settled=self.has_converged,
         )
 
     def distance_to_cloud_m(self, x: Array, phi: Array) -> Array:
@@ -332,6 +388,23 @@ class SurfaceCorrespondences:
             behind_m = np.sum(self.normals[k] * (surface - measured), axis=1)
             distances_m[k] = np.where(self.is_compared[k], behind_m, np.nan)
         return distances_m
+
+
+def _aligned_parameters(
+    camera: DepthCameraModel, body: Body, shapes_m: Array, phi: Array
+) -> Array:
+    """Return φ (k,) with the pose of the camera that is aligned with the shape of the first image
+    that has points; φ itself if the pose would differ from the stated one by more than `FARTHEST`
+    prior standard deviations. The arguments are those of `SurfaceCorrespondences.from_alignment`.
+    """
+    first = camera.depth.first_sample_with_points
+    surface = VisibleSurface.from_body(body, camera.depth)
+    turn, shift_m = align_camera(
+        camera, surface, x=shapes_m[first], image=first
+    )
+    moved = camera.with_pose(phi, turn, shift_m=shift_m)
+    errors = np.abs(moved[camera.parameter_indices])
+    return phi if errors.max(initial=0.0) > FARTHEST else moved
 
 
 class _NearestPoints(NamedTuple):

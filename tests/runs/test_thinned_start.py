@@ -1,0 +1,246 @@
+"""Start with thinned clouds: selected points, same answer, all points fitted, fallback,
+interruption."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+import pytest
+from kit.depth import MATRIX, NOISE_M, TRUTH, hanging, moved, noisy
+
+import collocation_sysid as cs
+from collocation_sysid.methods.horizon import Horizon
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.solution import Status
+from collocation_sysid.program.depth.surface_correspondences import (
+    SurfaceCorrespondences,
+)
+from collocation_sysid.runs import several_starts, solving, thinned_start
+
+# Finer than the pixels, so that no point is left out.
+SPACING_M = 2e-4
+UNKNOWN = cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown()})
+
+
+@cache
+def depth() -> cs.Depth:
+    """An image of the bar by a camera whose stated pose is off by some degrees."""
+    pose = moved(
+        np.array([0.05, -0.03, 0.02]), np.array([0.004, 0.002, -0.003])
+    )
+    return cs.Depth.of_images(
+        "front",
+        noisy(np.random.default_rng(3)),
+        cs.DepthCamera(MATRIX, pose=pose),
+        NOISE_M,
+        spacing_m=SPACING_M,
+    )
+
+
+def problem() -> cs.Problem:
+    return cs.Problem([hanging((depth(),))], UNKNOWN)
+
+
+@pytest.fixture
+def many(monkeypatch):
+    """The points of the image count as many."""
+    monkeypatch.setattr(thinned_start, "MANY_POINTS", 1000)
+    monkeypatch.setattr(thinned_start, "THINNED_POINTS", 400)
+
+
+def compared(solution: cs.Solution) -> int:
+    """Number of points that are compared with the surface, or left out for a stated reason."""
+    (segment,) = solution.collocation.transcriptions
+    (correspondences,) = segment.association.correspondences
+    excluded = sum(correspondences.excluded_counts.values())
+    return int(correspondences.is_compared.sum()) + excluded
+
+
+def standard_error(solution: cs.Solution) -> float:
+    """Standard error of the logarithm of Young's modulus."""
+    collocation = solution.collocation
+    p, positions = collocation.unpack(solution.z)
+    rows = [each.grid_times for each in collocation.transcriptions]
+    fit = Horizon(collocation, rows).evaluate(p, positions).fit
+    return float(fit.standard_errors[0])
+
+
+def test_thinned_points_are_measured_ones_and_few(many):
+    thinned = thinned_start.thinned_depth(depth())
+    (cloud,) = thinned.clouds
+    (given,) = depth().clouds
+    assert len(given) > 1000
+    assert 100 < len(cloud) <= 400
+    rows = {row.tobytes() for row in given}
+    assert all(row.tobytes() in rows for row in cloud)
+    assert thinned.sigma_m == depth().sigma_m
+
+
+def test_few_points_are_not_thinned():
+    assert thinned_start.thinned_depth(depth()) is depth()
+    assert thinned_start.thinned_problem(problem()) is None
+
+
+def test_the_optimum_is_that_of_the_search_with_all_points(monkeypatch):
+    direct = cs.solve(problem())
+    assert not any("searched with" in note for note in direct.notes)
+    monkeypatch.setattr(thinned_start, "MANY_POINTS", 1000)
+    monkeypatch.setattr(thinned_start, "THINNED_POINTS", 400)
+    solution = cs.solve(problem())
+    (note,) = (each for each in solution.notes if "searched with" in each)
+    (given,) = depth().clouds
+    assert f"then with {len(given):,} depth points" in note
+    assert compared(solution) == compared(direct) == len(given)
+    assert solution.status.converged
+    assert solution.scan is not None
+    difference = np.log(
+        solution.parameters["young_pa"] / direct.parameters["young_pa"]
+    )
+    error = standard_error(direct)
+    assert abs(difference) < 0.02 * error
+    assert standard_error(solution) == pytest.approx(error, rel=1e-3)
+    assert solution.history[-1].loss == pytest.approx(
+        direct.history[-1].loss, abs=several_starts.SAME_LOSS / 4
+    )
+    # The note on the fit is that of all points, and the only one.
+    (fit,) = (
+        each for each in solution.notes if "deviate from the surf" in each
+    )
+    count = solution.collocation.transcriptions[0].association.correspondences
+    assert f" {int(count[0].is_compared.sum())} points of" in fit
+
+
+def test_a_thinned_start_that_fails_is_replaced_by_the_complete_search(
+    many, monkeypatch
+):
+    def fail(_):
+        raise thinned_start.NoThinnedStartError("300 depth points fail")
+
+    monkeypatch.setattr(solving, "require_determined", fail)
+    solution = cs.solve(problem())
+    assert "no start with fewer depth points: 300 depth points fail" in (
+        solution.notes
+    )
+    assert solution.status.converged
+    assert compared(solution) == len(depth().clouds[0])
+
+
+def test_thinned_points_that_do_not_determine_a_parameter_are_no_start(
+    many, monkeypatch
+):
+    rough = cs.solve(thinned_start.thinned_problem(problem()))
+    thinned_start.require_determined(rough)
+    monkeypatch.setattr(
+        thinned_start, "undetermined_names", lambda _: ("young_pa",)
+    )
+    with pytest.raises(thinned_start.NoThinnedStartError, match="determine E"):
+        thinned_start.require_determined(rough)
+
+
+def test_an_interrupt_keeps_the_point_and_compares_all_points(many):
+    lines = []
+
+    def interrupt(line):
+        lines.append(line)
+        if len(lines) == 2:
+            raise KeyboardInterrupt
+
+    guess = cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown(1.6e5)})
+    solution = cs.solve(
+        cs.Problem([hanging((depth(),))], guess), watch=interrupt
+    )
+    assert solution.status is Status.INTERRUPTED
+    assert compared(solution) == len(depth().clouds[0])
+    assert any("do not fit all points best" in each for each in solution.notes)
+    assert solution.parameters["young_pa"] == pytest.approx(
+        lines[-1].parameters["young_pa"]
+    )
+
+
+def test_unchanged_correspondences_end_the_search_after_one_solve():
+    calls = []
+
+    def counted(collocation, watch=None, start=None):
+        calls.append(start)
+        return ReducedSpace()(collocation, watch, start)
+
+    guess = cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown(1.6e5)})
+    solution = cs.solve(cs.Problem([hanging((depth(),))], guess), counted)
+    assert solution.status.converged
+    assert len(calls) == 1
+    p, positions = solution.collocation.unpack(solution.z)
+    again, _ = solution.collocation.follow_estimates(p, positions)
+    assert again is solution.collocation
+
+
+def test_associations_are_kept_with_other_guesses():
+    collocation = problem().collocation()
+    other = collocation.with_parameters(
+        collocation.parameters.with_guess({"young_pa": 2e5})
+    )
+    before = collocation.transcriptions[0].association
+    assert other.transcriptions[0].association is before
+    assert other.parameters.guesses["young_pa"] == pytest.approx(2e5)
+
+
+def test_an_alignment_with_the_same_shape_is_not_repeated():
+    guess = UNKNOWN.with_guess({"young_pa": 1.6e5})
+    collocation = cs.Problem([hanging((depth(),))], guess).collocation()
+    (segment,) = collocation.transcriptions
+    (reading,) = segment.depths
+    rest = segment.experiment.rigid_positions([0.0]).reshape(1, -1)
+    phi = np.zeros(segment.nuisance.size)
+    assert reading.aligned_correspondences(rest, phi) is reading.correspondences
+    sagging = rest + 0.5 * NOISE_M
+    moved_body = reading.aligned_correspondences(sagging, phi)
+    assert moved_body is not reading.correspondences
+    scaled = phi.copy()
+    scaled[reading.correspondences.camera.parameter_indices[-1]] = 0.5
+    again = reading.aligned_correspondences(rest, scaled)
+    assert again is not reading.correspondences
+    # Only the pose: the same correspondences, for the values of another alignment.
+    pose = reading.aligned_correspondences(sagging, phi, only_pose=True)
+    assert pose.nodes is reading.correspondences.nodes
+    assert pose.start_values == moved_body.start_values
+    assert not pose.is_aligned
+
+
+def test_a_search_at_a_known_minimum_ends():
+    known = cs.solve(
+        cs.Problem(
+            [hanging((depth(),))], UNKNOWN.with_guess({"young_pa": 1.6e5})
+        )
+    )
+    last = known.history[-1]
+    is_at = partial(several_starts._is_at, solution=known)
+    assert is_at(last)
+    assert not is_at(replace(last, share=0.5))
+    assert not is_at(replace(last, loss=last.loss + 11.0))
+    assert not is_at(
+        replace(
+            last, parameters={"young_pa": 1.02 * known.parameters["young_pa"]}
+        )
+    )
+
+
+def test_all_points_have_the_correspondences_of_the_thinned_solution(many):
+    thinned = cs.solve(thinned_start.thinned_problem(problem()))
+    collocation = thinned_start.collocation_with_all_points(problem(), thinned)
+    (segment,) = collocation.transcriptions
+    (found,) = segment.association.correspondences
+    assert isinstance(found, SurfaceCorrespondences)
+    assert found.camera.depth is depth()
+    (before,) = thinned.collocation.transcriptions[
+        0
+    ].association.correspondences
+    assert found.gate_m == before.gate_m
+    assert found.is_compared.sum() > 2 * before.is_compared.sum()
+    assert len(thinned.z) == collocation.variable_count
+    # All points fit the shape of the thinned ones up to the noise.
+    p, positions = collocation.unpack(thinned.z)
+    distances_m = found.signed_distances_m(
+        found.shapes_m, collocation.iterates_at(p, positions)[0].phi
+    )
+    assert np.sqrt(np.nanmean(distances_m**2)) < 1.5 * NOISE_M
