@@ -2,11 +2,11 @@
 
 1. The problem with a smooth field in place of the two phases is solved.
 2. At that solution the measurements are linearised in the logarithm of every element. Their
-total-variation estimate gives first phases, with which the problem is solved by the chosen method.
-3. Phases, contrast and parameters are sampled from their posterior, see `phase_posterior`, with
-linearised measurements that simulations of some samples correct. This is repeated at the mean of
-the samples until the contrast settles.
-4. The problem is solved with the phases that represent the samples.
+total-variation estimate gives first phases.
+3. From these on, phases, contrast and parameters are sampled from their posterior, see
+`phase_posterior`, with linearised measurements that simulations of some samples correct. This is
+repeated at the mean of the samples until the contrast settles.
+4. The problem is solved by the chosen method with the phases that represent the samples.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ SolveOnce = Callable[[Problem, str | Path | WarmStart | None], Solution]
 
 # Most elements of a two-phase field: the sampler stores two dense square matrices of this size.
 MOST_ELEMENTS = 4000
-# Most linearisations at the mean of the samples.
-MOST_ROUNDS = 4
-# Fewest of them: the first is at phases that are not samples.
+# Most linearisations.
+MOST_ROUNDS = 5
+# Fewest linearisations: the first is at the smooth field, not at the mean of samples.
 FEWEST_ROUNDS = 2
 # Change of the mean logarithm of the contrast in a round, over its standard deviation, below which
 # the samples are final.
@@ -140,9 +140,9 @@ def solve_two_phases(
     """Solve a problem with a two-phase field; the body of the solution has the phases and their
     samples.
 
-    If the smooth field or the first solve with phases does not converge, that solution is returned,
-    without samples. If the solve with the final phases does not converge, the solution is that with
-    the first phases. History, counts and times of the result are those of its own solve alone.
+    If the solve with the smooth field or that with phases does not converge, its solution is
+    returned, without samples. History, counts and times of the result are those of its own solve
+    alone.
 
     Parameters
     ----------
@@ -168,39 +168,24 @@ def solve_two_phases(
     if not solution.status.converged:
         return solution
     smooth = _smooth_fit(linearise_fit(solution.collocation, solution.z))
-    at_smooth = _linearise_at(problem, search, solution=solution, exponent=0.0)
-    first = _solve_with_phases(
-        problem,
-        search,
-        phase=initial_phases(
-            at_smooth.information(),
-            at_smooth.faces,
-            volumes_m3=search.modes.volumes_m3,
-        ),
-        warm_start=WarmStart.of(solution),
-        solve_once=solve_once,
+    sampled = _sample_posterior(
+        problem, search, solution=solution, smooth=smooth
     )
-    if not first.status.converged:
-        return first
-    sampled = _sample_posterior(problem, search, solution=first, smooth=smooth)
-    best = _solve_with_phases(
-        problem,
-        search,
-        phase=_representative_phases(
-            sampled.posterior.draws.probability, search.modes.volumes_m3
-        ),
-        warm_start=WarmStart.of(first),
-        solve_once=solve_once,
+    phase = _representative_phases(
+        sampled.posterior.draws.probability, search.modes.volumes_m3
+    )
+    best = solve_once(
+        problem.with_fields({search.name: replace(search.modes, phase=phase)}),
+        WarmStart.of(solution),
     )
     if not best.status.converged:
-        best = first
-    final = _phases_of_solution(best, search)
+        return best
     samples = _samples(sampled, search=search, solution=best)
     best = _with_samples(best, replace(samples, smooth_misfit=smooth.misfit))
     note = (
         f"two phases of {search.name}: started from a smooth field (χ² per measurement "
         f"{smooth.misfit:.3g}), {sampled.rounds} rounds of samples; the inclusion has "
-        f"{int(final.sum())} of {len(final)} elements; the posterior is tempered by "
+        f"{int(phase.sum())} of {len(phase)} elements; the posterior is tempered by "
         f"{sampled.temperature:.3g}, the lack of fit per shape of the smooth field"
     )
     return replace(best, notes=(note, *best.notes))
@@ -234,7 +219,7 @@ def _sample_posterior(
     solution: Solution,
     smooth: _SmoothFitQuality,
 ) -> _SampledPosterior:
-    """Sample the posterior of phases and parameters, from a solution with first phases on.
+    """Sample the posterior of phases and parameters, from the solution with a smooth field on.
 
     Each round linearises the measurements, samples, simulates a sample of each chain, and samples
     again with the linearised measurements corrected by these simulations.
@@ -245,18 +230,23 @@ def _sample_posterior(
     search : _PhaseSearch
         Its two-phase field.
     solution : Solution
-        Solution with first phases.
+        Solution with the smooth field.
     smooth : _SmoothFitQuality
-        Fit with the smooth field, for the lack of fit.
+        Quality of this solution, for the lack of fit.
 
     Raises
     ------
     SimulationError
         If the equations of motion are singular at the solution.
     """
-    surrogate = _linearise_at(problem, search, solution=solution)
-    least_chi_squared = surrogate.fit.chi_squared
-    phases = _phases_of_solution(solution, search)
+    in_logarithms = _linearise_at(problem, search, solution=solution)
+    phases = initial_phases(
+        in_logarithms.information(),
+        in_logarithms.faces,
+        volumes_m3=search.modes.volumes_m3,
+    )
+    surrogate = replace(in_logarithms, exponent=FIRST_EXPONENT)
+    least_chi_squared = np.inf
     last_mean = np.inf
     rounds = 0
     while True:
@@ -286,7 +276,9 @@ def _sample_posterior(
             surrogate = _linearise_at_mean(problem, search, posterior)
         except SimulationError:
             break
-    temperature = smooth.lack_of_fit(least_chi_squared)
+    temperature = 1.0
+    if np.isfinite(least_chi_squared):
+        temperature = smooth.lack_of_fit(least_chi_squared)
     if temperature > 1:
         posterior = PhasePosterior.sample(
             posterior.surrogate,
@@ -300,48 +292,12 @@ def _sample_posterior(
     )
 
 
-def _phases_of_solution(solution: Solution, search: _PhaseSearch) -> Array:
-    """Return the phases (E,) of the two-phase field in a solution, for the E elements of the part
-    that has the field: 1 in inclusions, 0 elsewhere.
-
-    It is the array of the field itself, not a copy.
-    """
-    modes = _two_phase_body(solution, search).parts[search.number].field
-    assert isinstance(modes, TwoPhaseModes)
-    return modes.phase
-
-
 def _two_phase_body(solution: Solution, search: _PhaseSearch) -> Body:
     """Return the body, among those of a solution, that has the two-phase field of `search`."""
     segments = solution.collocation.transcriptions
     return next(
         s.body for s in segments if search.name in s.body.field_lengths_m
     )
-
-
-def _solve_with_phases(
-    problem: Problem,
-    search: _PhaseSearch,
-    phase: Array,
-    warm_start: WarmStart,
-    solve_once: SolveOnce,
-) -> Solution:
-    """Return the solution of a problem with given phases, from the parameters of an earlier answer.
-
-    Parameters
-    ----------
-    problem : Problem
-    search : _PhaseSearch
-        Its two-phase field.
-    phase : (E,) array
-        Phases of the elements: 1 in inclusions, 0 elsewhere.
-    warm_start : WarmStart
-        Estimates to start from.
-    solve_once : callable
-        See `solve_two_phases`.
-    """
-    own = replace(search.modes, phase=phase)
-    return solve_once(problem.with_fields({search.name: own}), warm_start)
 
 
 def _two_phase_search(problem: Problem) -> _PhaseSearch:
@@ -404,10 +360,9 @@ def _linearise_at(
     problem: Problem,
     search: _PhaseSearch,
     solution: Solution,
-    exponent: float = FIRST_EXPONENT,
 ) -> ElementSurrogate:
-    """Return the measurements linearised at a solution by a power of the constant in every element,
-    instead of the shapes of the field.
+    """Return the measurements linearised at a solution by the logarithm of the constant in every
+    element, instead of the shapes of the field.
 
     Parameters
     ----------
@@ -416,8 +371,6 @@ def _linearise_at(
     search : _PhaseSearch
     solution : Solution
         Solution with a smooth field or with phases.
-    exponent : float
-        Exponent of the power; 0 for the logarithm.
 
     Raises
     ------
@@ -437,7 +390,12 @@ def _linearise_at(
     values = dict(
         zip((item.name for item in solved.parameters.free), p, strict=False)
     )
-    q = [values.get(item.name, 0.0) for item in collocation.parameters.free]
+    # Shapes of a smooth field have the names of elements.
+    elements = set(search.elements)
+    q = [
+        0.0 if item.name in elements else values[item.name]
+        for item in collocation.parameters.free
+    ]
     return ElementSurrogate.linearise(
         collocation,
         np.concatenate([q, p[solved.nq :]]),
@@ -445,7 +403,7 @@ def _linearise_at(
         base=base,
         faces=InternalFaces.from_mesh(body.mesh, part.cells),
         prior=_contrast_prior(problem, search),
-        exponent=exponent,
+        exponent=0.0,
         guess=positions,
     )
 

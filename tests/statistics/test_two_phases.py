@@ -25,7 +25,9 @@ from collocation_sysid.runs.phase_posterior import (
     ElementSurrogate,
 )
 from collocation_sysid.runs.two_phases import (
+    _linearise_at,
     _representative_phases,
+    _two_phase_search,
     solve_two_phases,
 )
 from collocation_sysid.statistics.field_estimates import (
@@ -33,6 +35,7 @@ from collocation_sysid.statistics.field_estimates import (
     field_estimates,
     phase_concerns,
 )
+from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.phase_sampling import (
     ElementInformation,
     InternalFaces,
@@ -343,6 +346,17 @@ def test_normal_equations_by_a_power_are_those_of_differences():
         chi_squared.append(residual @ residual)
     slope = (chi_squared[1] - chi_squared[0]) / (4 * step)
     assert information.score_z[element] == pytest.approx(slope, rel=1e-3)
+
+
+def test_elements_are_linearised_at_the_smooth_field():
+    search = _two_phase_search(problem(3.0))
+    smooth = cs.solve(
+        problem(3.0).with_fields({search.name: search.modes.smooth_field})
+    )
+    surrogate = _linearise_at(problem(3.0), search, solution=smooth)
+    fit = linearise_fit(smooth.collocation, smooth.z)
+    assert surrogate.fit.chi_squared == pytest.approx(fit.chi_squared, rel=1e-6)
+    assert np.abs(surrogate.base).max() > 0.1
 
 
 def test_representative_phases_have_the_mean_volume():
