@@ -49,7 +49,11 @@ class SamplerSettings:
     least_steps : int
         Fewest proposals of a chain.
     chains : int
-        Chains, which are computed together.
+        Chains, at least three, which are computed together.
+    dispersion : float
+        Largest ratio of the volume of the inclusion at the start of a chain to that of the estimate
+        from which chains start, and of this to the smallest. Inclusions of twice the volume and
+        about half the difference of the constants deform the body in nearly the same way.
     steps_per_draw : int
         Proposals between draws of the constants of the Potts prior.
     steps_per_sample : int
@@ -65,9 +69,10 @@ class SamplerSettings:
     """
 
     hyperprior: PottsHyperprior = field(default_factory=PottsHyperprior)
-    steps_per_element: int = 5
+    steps_per_element: int = 10
     least_steps: int = 4000
     chains: int = 8
+    dispersion: float = 2.0
     steps_per_draw: int = 400
     steps_per_sample: int = 20
     total_variation: float = 1.0
@@ -246,10 +251,13 @@ def initial_phases(
     volumes_m3: Array,
     settings: SamplerSettings = USUAL,
 ) -> Array:
-    """Return initial phases (E,) of 0 and 1 from the total-variation estimate of z, divided into
-    two classes.
+    """Return initial phases (C, E) of 0 and 1 for each chain, from the total-variation estimate of
+    z, divided into two classes by Otsu's threshold.
 
-    The class of smaller volume is the inclusion, phase 1.
+    The class of smaller volume is the inclusion, phase 1. That is the start of the first chain; the
+    inclusions of the others have from 1/`SamplerSettings.dispersion` to `dispersion` times its
+    volume: over-dispersed starts, so that differences between the chains show whether they have
+    converged.
 
     Parameters
     ----------
@@ -261,11 +269,31 @@ def initial_phases(
         Volumes of the elements [m³].
     settings : SamplerSettings
         Constants of the algorithm.
+    """
+    z = _total_variation_estimate(data, faces, settings)
+    above = z >= _class_threshold(z, volumes_m3)
+    total_m3 = volumes_m3.sum()
+    is_upper = bool(volumes_m3[above].sum() <= total_m3 / 2)
+    inclusion = above if is_upper else ~above
+    order = np.argsort(-z if is_upper else z, kind="stable")
+    enclosed_m3 = np.cumsum(volumes_m3[order])
+    factors = np.geomspace(
+        1 / settings.dispersion, settings.dispersion, settings.chains - 1
+    )
+    phases = np.zeros((settings.chains, len(z)))
+    phases[0] = inclusion
+    for phase, factor in zip(phases[1:], factors, strict=True):
+        volume_m3 = min(factor * volumes_m3[inclusion].sum(), total_m3 / 2)
+        count = max(1, int(np.searchsorted(enclosed_m3, volume_m3)))
+        phase[order[:count]] = 1.0
+    return phases
 
-    Notes
-    -----
-    The total variation is minimised by `SamplerSettings.sharpenings` reweighted least-squares
-    solves, with p eliminated.
+
+def _total_variation_estimate(
+    data: ElementInformation, faces: InternalFaces, settings: SamplerSettings
+) -> Array:
+    """Return the logarithms z (E,) of least squares and least total variation, with p eliminated, by
+    `SamplerSettings.sharpenings` reweighted least-squares solves.
     """
     normal, score = data.eliminated
     jumps = faces.jump_operator
@@ -279,10 +307,7 @@ def initial_phases(
             1e-9 * np.trace(prior) / len(prior)
         )
         z = np.linalg.solve(normal + prior, normal @ data.base - score)
-    above = z >= _class_threshold(z, volumes_m3)
-    return (
-        above if volumes_m3[above].sum() <= volumes_m3.sum() / 2 else ~above
-    ).astype(float)
+    return z
 
 
 def _class_threshold(values: Array, weights: Array) -> float:

@@ -383,8 +383,11 @@ def test_the_start_finds_a_block_in_values_that_are_measured_one_by_one(rng):
         base=np.zeros(count),
         deviation=1.0,
     )
-    found = initial_phases(data, faces, mesh.volumes_m3)
-    assert (found == block).mean() > 0.98
+    starts = initial_phases(data, faces, mesh.volumes_m3)
+    assert (starts[0] == block).mean() > 0.98
+    volumes_m3 = starts @ mesh.volumes_m3
+    assert volumes_m3[1] == pytest.approx(volumes_m3[0] / 2, rel=0.1)
+    assert volumes_m3[-1] == pytest.approx(2 * volumes_m3[0], rel=0.1)
 
 
 def test_constants_of_the_potts_prior_follow_from_the_phases(rng):
