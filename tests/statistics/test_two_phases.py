@@ -78,13 +78,13 @@ def swung(body: Body, steps: int = 12) -> cs.Experiment:
 
 
 @cache
-def problem(ratio: float) -> cs.Problem:
-    """A bar whose lower half is stiffer, which no description tells."""
+def problem(ratio: float, seed: int = 5) -> cs.Problem:
+    """A bar whose lower half is stiffer, which no description tells; noise by its seed."""
     values = {**KNOWN, "young_pa": YOUNG_PA, "stiff.young_pa": ratio * YOUNG_PA}
     tracks = cs.simulate(
         swung(bar(stiff=lower_half())), values, "midpoint", substeps=1
     ).markers_m
-    noise = SIGMA_M * np.random.default_rng(5).normal(size=tracks.shape)
+    noise = SIGMA_M * np.random.default_rng(seed).normal(size=tracks.shape)
     measured = cs.with_markers(swung(bar(TWO_PHASES)), tracks + noise)
     return cs.Problem(
         [measured],
@@ -132,6 +132,26 @@ def test_a_stiff_half_has_its_boundary_and_its_contrast():
         "two phases of young_pa: started from a smooth field" in n
         for n in solution.notes
     )
+
+
+@pytest.mark.long
+def test_intervals_of_several_recordings_contain_the_truth():
+    covered_inside = []
+    covered = []
+    contrasts = []
+    truth = np.log(YOUNG_PA * np.where(lower_half(), 3.0, 1.0))
+    for seed in range(4):
+        solution = cs.solve(problem(3.0, seed))
+        known = uncertainty_at(solution.collocation, solution.z)
+        low, high = known.estimates["contrast"].statistical95
+        contrasts.append(low < 3.0 < high)
+        lower, upper = np.log(field_of(solution).statistical95)
+        is_covered = (lower < truth) & (truth < upper)
+        covered_inside.append(is_covered[lower_half()].mean())
+        covered.append(is_covered.mean())
+    assert sum(contrasts) >= 3
+    assert np.mean(covered_inside) >= 0.9
+    assert np.mean(covered) >= 0.9
 
 
 @pytest.mark.long
