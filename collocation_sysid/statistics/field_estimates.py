@@ -47,8 +47,8 @@ WIDER = 1.1
 # By this factor χ² per measurement of two phases is above that of a smooth field, or of noise,
 # where two phases do not describe the body: chance moves it by a few per cent.
 WORSE = 1.1
-# Elements of the smaller phase from which on its intervals have been checked: the contrast
-# of an inclusion of 85 elements was found, that of 12 was half as large with a narrow interval.
+# Elements of the smaller phase below which its intervals have not been verified: the study has
+# inclusions of about 80 elements, and shapes of a few elements are coarse.
 FEWEST_ELEMENTS = 50
 # Potential scale reduction from which on chains of samples have not explored all phases: with it an
 # interval would become narrower by a third if the chains were continued.
