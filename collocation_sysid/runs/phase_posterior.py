@@ -68,8 +68,8 @@ class ContrastPrior:
 
 
 @dataclass(frozen=True, eq=False)
-class ErrorModel:
-    """Approximation error of linearised residuals: r_true ≈ r_linear + mean + roots ε, ε ~ N(0, I).
+class ApproximationError:
+    """Normal error of linearised residuals: r_true ≈ r_linear + mean + roots ε, ε ~ N(0, I).
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class ErrorModel:
     roots: Array
 
     @classmethod
-    def from_errors(cls, errors: Array) -> ErrorModel:
+    def from_errors(cls, errors: Array) -> ApproximationError:
         """Return the model of errors (K, n) of K samples; zero if there are fewer than
         `FEWEST_SIMULATED`.
         """
@@ -118,7 +118,7 @@ class ElementSurrogate:
         Prior of the logarithm of the contrast.
     exponent : float
         Exponent γ.
-    errors : ErrorModel
+    errors : ApproximationError
         Errors of the linearised residuals.
     """
 
@@ -131,7 +131,7 @@ class ElementSurrogate:
     faces: InternalFaces
     prior: ContrastPrior
     exponent: float
-    errors: ErrorModel
+    errors: ApproximationError
 
     @classmethod
     def linearise(
@@ -177,7 +177,7 @@ class ElementSurrogate:
             faces=faces,
             prior=prior,
             exponent=exponent,
-            errors=ErrorModel.from_errors(np.zeros((0, _size(fit)))),
+            errors=ApproximationError.from_errors(np.zeros((0, _size(fit)))),
         )
 
     @cached_property
@@ -340,7 +340,7 @@ class SimulatedSamples:
         return replace(
             self.surrogate,
             exponent=exponent,
-            errors=ErrorModel.from_errors(self.errors(exponent)),
+            errors=ApproximationError.from_errors(self.errors(exponent)),
         )
 
 
