@@ -213,7 +213,7 @@ class ElementSurrogate:
         the covariance of the errors, and the measurements divided by a temperature T.
 
         The prior of the contrast is that of its logarithm, linearised at the logarithm of largest
-        size at the expansion point.
+        size at the expansion point, or at the nearest limit of the prior.
         """
         root = np.sqrt(temperature)
         normal, score = self._normal
@@ -231,7 +231,8 @@ class ElementSurrogate:
         priors = self.fit.prior_jacobian[others]
         # Derivative of the logarithm by the power at the expansion point.
         slope = np.exp(-self.exponent * self.base)
-        typical = self.base[np.argmax(np.abs(self.base))]
+        largest = self.base[np.argmax(np.abs(self.base))]
+        typical = float(self.prior.limit(largest))
         stretch = np.exp(self.exponent * typical)
         return ElementInformation(
             of_p=normal[np.ix_(others, others)] + np.diag(priors**2),
@@ -242,7 +243,8 @@ class ElementSurrogate:
             base=self.to_power(self.base),
             deviation=stretch * self.prior.deviation,
             mean=float(
-                self.to_power(typical) + stretch * (self.prior.mean - typical)
+                self.to_power(np.array(typical))
+                + stretch * (self.prior.mean - typical)
             ),
         )
 

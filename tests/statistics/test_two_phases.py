@@ -155,6 +155,24 @@ def test_intervals_of_several_recordings_contain_the_truth():
 
 
 @pytest.mark.long
+def test_a_given_contrast_determines_the_phases():
+    given = cs.Problem(
+        problem(3.0).experiments,
+        {**KNOWN, "young_pa": cs.Unknown(0.7 * YOUNG_PA), "contrast": 3.0},
+        substeps=1,
+    )
+    solution = cs.solve(given)
+    assert solution.status.converged
+    field = field_of(solution)
+    assert field.phases is not None
+    np.testing.assert_allclose(field.phases.contrast, 3.0, rtol=1e-4)
+    assert (field.modes.phase == lower_half()).mean() >= 0.9
+    lower, upper = np.log(field.statistical95)
+    truth = np.log(YOUNG_PA * np.where(lower_half(), 3.0, 1.0))
+    assert np.mean((lower < truth) & (truth < upper)) >= 0.9
+
+
+@pytest.mark.long
 def test_an_even_body_shows_no_second_material():
     field = field_of(answer(1.0))
     assert "field/one-phase" in [concern.code for concern in field.concerns]
