@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
 from ..errors import InputError
@@ -36,12 +35,18 @@ class PhaseSamples:
     names : (p,)
         Names of the parameters of `deviations`.
     deviations : (p, p)
-        Covariance of the conditional means of these parameters given each sample of the phases, in
-        the solver's coordinates: the part of their covariance due to unknown phases.
+        Second moments, about the estimates, of the conditional means of these parameters given each
+        sample of the phases, in the solver's coordinates: the part of their covariance due to
+        unknown phases.
     misfit : float
         χ² per measurement of the solution, with the given standard deviations.
     smooth_misfit : float
         χ² per measurement of the smooth field with which the search for the phases started.
+    scale_reduction : float
+        Potential scale reduction of the contrast, see
+        `statistics.phase_sampling.PosteriorDraws.scale_reduction`.
+    is_simulated : bool
+        Whether the linearised measurements were corrected with simulations of samples.
     """
 
     logarithms: Array
@@ -51,6 +56,8 @@ class PhaseSamples:
     deviations: Array
     misfit: float
     smooth_misfit: float
+    scale_reduction: float = 1.0
+    is_simulated: bool = True
 
 
 @dataclass(frozen=True)
@@ -70,6 +77,10 @@ class PhaseSummary:
         χ² per measurement of the solution, and of the smooth field before it.
     elements : int
         Number of elements of the smaller phase.
+    scale_reduction : float
+        Potential scale reduction of the contrast, about 1 if all chains of samples agree.
+    is_simulated : bool
+        Whether the linearised measurements were corrected with simulations of samples.
     """
 
     contrast: tuple[float, float, float]
@@ -78,6 +89,8 @@ class PhaseSummary:
     misfit: float
     smooth_misfit: float
     elements: int
+    scale_reduction: float = 1.0
+    is_simulated: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,8 +254,3 @@ class ElementLogarithms(FieldModes):
     def logarithms(self, coefficients: Array) -> Array:
         """Return the base plus the coefficients, (E,)."""
         return self.base + coefficients
-
-
-def is_inclusion(phase: Array) -> NDArray[np.bool_]:
-    """Return a mask (E,) of the elements of inclusions: phases (E,) above 0.5."""
-    return phase > 0.5

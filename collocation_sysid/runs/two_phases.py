@@ -1,12 +1,12 @@
-"""Solving a problem with a two-phase field: a smooth field first, then phases and parameters in
-turn.
+"""Solving a problem with a two-phase field: a smooth field first, then phases and parameters.
 
 1. The problem with a smooth field in place of the two phases is solved.
-2. At that solution the measurements are linearised in the logarithm of every element, and phases
-are sampled from their posterior, see `statistics.phase_sampling`.
-3. With the more likely phase of every element the problem is solved for the contrast and all other
-parameters by the chosen method. Steps 2 and 3 repeat until only a small share of the volume changes
-its phase.
+2. At that solution the measurements are linearised in the logarithm of every element. Their
+total-variation estimate gives first phases.
+3. From these on, phases, contrast and parameters are sampled from their posterior, see
+`phase_posterior`, with linearised measurements that simulations of some samples correct. This is
+repeated at the mean of the samples until the contrast settles.
+4. The problem is solved by the chosen method with the phases that represent the samples.
 """
 
 from __future__ import annotations
@@ -17,15 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ..common.array_types import Array, Index
-from ..errors import InputError
+from ..common.array_types import Array
+from ..errors import InputError, SimulationError
 from ..fem.body import Body
 from ..fem.laws.constants import CONTRAST, field_coefficient
 from ..fem.two_phase import (
     ElementLogarithms,
     PhaseSamples,
     TwoPhaseModes,
-    is_inclusion,
 )
 from ..methods.solution import Solution
 from ..problem import Problem
@@ -40,11 +39,15 @@ from ..statistics.linearised import (
 )
 from ..statistics.phase_sampling import (
     USUAL,
-    ElementInformation,
     InternalFaces,
-    PosteriorDraws,
     initial_phases,
-    sample_phases,
+)
+from .phase_posterior import (
+    FEWEST_SIMULATED,
+    FIRST_EXPONENT,
+    ContrastPrior,
+    ElementSurrogate,
+    PhasePosterior,
 )
 from .warm_start import WarmStart
 
@@ -52,12 +55,17 @@ SolveOnce = Callable[[Problem, str | Path | WarmStart | None], Solution]
 
 # Most elements of a two-phase field: the sampler stores two dense square matrices of this size.
 MOST_ELEMENTS = 4000
-# Most rounds of phases and parameters.
-MOST_ROUNDS = 6
-# Share of the inclusion's volume that changes in a round, below which the phases are final.
-SETTLED_VOLUME_SHARE = 0.02
+# Most linearisations.
+MOST_ROUNDS = 5
+# Fewest linearisations: the first is at the smooth field, not at the mean of samples.
+FEWEST_ROUNDS = 2
+# Change of the mean logarithm of the contrast in a round, over its standard deviation, below which
+# the samples are final.
+SETTLED_DEVIATIONS = 0.5
 # Fewest elements of an inclusion: a single element is noise.
 FEWEST_ELEMENTS = 2
+# Standard deviation of the logarithm of a contrast that is given.
+GIVEN_DEVIATION = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,10 +140,9 @@ def solve_two_phases(
     """Solve a problem with a two-phase field; the body of the solution has the phases and their
     samples.
 
-    If the smooth field or the first solve with phases does not converge, that solution is returned,
-    without samples. A later round that does not converge or does not decrease χ² ends the rounds,
-    and the best solution counts. History, counts and times of the result are those of its own solve
-    alone, without the smooth field and the other rounds.
+    If the solve with the smooth field or that with phases does not converge, its solution is
+    returned, without samples. History, counts and times of the result are those of its own solve
+    alone.
 
     Parameters
     ----------
@@ -161,80 +168,128 @@ def solve_two_phases(
     if not solution.status.converged:
         return solution
     smooth = _smooth_fit(linearise_fit(solution.collocation, solution.z))
-    at_smooth = _linearise_in_elements(problem, search, solution=solution)
-    phase = initial_phases(
-        at_smooth.normal_equations(1.0),
-        at_smooth.faces,
-        volumes_m3=search.modes.volumes_m3,
+    sampled = _sample_posterior(
+        problem, search, solution=solution, smooth=smooth
     )
-    best: Solution | None = None
-    at_best = at_smooth
-    rounds = 0
-    for _ in range(MOST_ROUNDS):
-        candidate = _solve_with_phases(
-            problem,
-            search,
-            phase=phase,
-            warm_start=WarmStart.of(best or solution),
-            solve_once=solve_once,
-        )
-        if not candidate.status.converged and best is None:
-            return candidate
-        rounds += 1
-        if not candidate.status.converged:
-            break
-        at_candidate = _linearise_in_elements(
-            problem, search, solution=candidate
-        )
-        if (
-            best is not None
-            and at_candidate.fit.chi_squared >= at_best.fit.chi_squared
-        ):
-            break
-        best = candidate
-        at_best = at_candidate
-        draws = sample_phases(
-            at_best.normal_equations(1.0), at_best.faces, start=phase
-        )
-        next_phase = _likelier_phases(draws.probability)
-        volumes_m3 = search.modes.volumes_m3
-        if volumes_m3 @ np.abs(next_phase - phase) < SETTLED_VOLUME_SHARE * (
-            volumes_m3 @ phase
-        ):
-            break
-        phase = next_phase
-    assert best is not None
-    final = _phases_of_solution(best, search)
-    temperature = smooth.lack_of_fit(at_best.fit.chi_squared)
-    # The whole posterior is tempered, its prior too: with the data alone tempered the prior would
-    # shrink inclusions.
-    settings = replace(USUAL, face_nats=USUAL.face_nats / temperature)
-    draws = sample_phases(
-        at_best.normal_equations(temperature),
-        at_best.faces,
-        start=final,
-        settings=settings,
+    phase = _representative_phases(
+        sampled.posterior.draws.probability, search.modes.volumes_m3
     )
-    samples = _samples(draws, at_best.fit, search=search, solution=best)
+    best = solve_once(
+        problem.with_fields({search.name: replace(search.modes, phase=phase)}),
+        WarmStart.of(solution),
+    )
+    if not best.status.converged:
+        return best
+    samples = _samples(sampled, search=search, solution=best)
     best = _with_samples(best, replace(samples, smooth_misfit=smooth.misfit))
     note = (
         f"two phases of {search.name}: started from a smooth field (χ² per measurement "
-        f"{smooth.misfit:.3g}), {rounds} rounds of phases and parameters; the inclusion has "
-        f"{int(final.sum())} of {len(final)} elements; the posterior is tempered by "
-        f"{temperature:.3g}, the lack of fit per shape of the smooth field"
+        f"{smooth.misfit:.3g}), {sampled.rounds} rounds of samples; the inclusion has "
+        f"{int(phase.sum())} of {len(phase)} elements; the posterior is tempered by "
+        f"{sampled.temperature:.3g}, the lack of fit per shape of the smooth field"
     )
     return replace(best, notes=(note, *best.notes))
 
 
-def _phases_of_solution(solution: Solution, search: _PhaseSearch) -> Array:
-    """Return the phases (E,) of the two-phase field in a solution, for the E elements of the part
-    that has the field: 1 in inclusions, 0 elsewhere.
+@dataclass(frozen=True, eq=False)
+class _SampledPosterior:
+    """Samples of the posterior, and how they were found.
 
-    It is the array of the field itself, not a copy.
+    Attributes
+    ----------
+    posterior : PhasePosterior
+        Samples.
+    temperature : float
+        Lack of fit T by which the posterior is tempered.
+    rounds : int
+        Number of linearisations.
+    simulated : int
+        Number of samples that have been simulated at the last linearisation.
     """
-    modes = _two_phase_body(solution, search).parts[search.number].field
-    assert isinstance(modes, TwoPhaseModes)
-    return modes.phase
+
+    posterior: PhasePosterior
+    temperature: float
+    rounds: int
+    simulated: int
+
+
+def _sample_posterior(
+    problem: Problem,
+    search: _PhaseSearch,
+    solution: Solution,
+    smooth: _SmoothFitQuality,
+) -> _SampledPosterior:
+    """Sample the posterior of phases and parameters, from the solution with a smooth field on.
+
+    Each round linearises the measurements, samples, simulates a sample of each chain, and samples
+    again with the linearised measurements corrected by these simulations.
+
+    Parameters
+    ----------
+    problem : Problem
+    search : _PhaseSearch
+        Its two-phase field.
+    solution : Solution
+        Solution with the smooth field.
+    smooth : _SmoothFitQuality
+        Quality of this solution, for the lack of fit.
+
+    Raises
+    ------
+    SimulationError
+        If the equations of motion are singular at the solution.
+    """
+    in_logarithms = _linearise_at(problem, search, solution=solution)
+    phases = initial_phases(
+        in_logarithms.information(),
+        in_logarithms.faces,
+        volumes_m3=search.modes.volumes_m3,
+    )
+    surrogate = replace(in_logarithms, exponent=FIRST_EXPONENT)
+    least_chi_squared = np.inf
+    last_mean = np.inf
+    rounds = 0
+    while True:
+        rounds += 1
+        draft = PhasePosterior.sample(
+            surrogate, phases, settings=USUAL, seed=2 * rounds
+        )
+        simulated = draft.simulate()
+        least_chi_squared = min(least_chi_squared, simulated.least_chi_squared)
+        posterior = PhasePosterior.sample(
+            simulated.corrected_surrogate(),
+            draft.last_phases,
+            settings=USUAL,
+            seed=2 * rounds + 1,
+        )
+        phases = posterior.last_phases
+        mean = posterior.contrasts.mean()
+        change = abs(mean - last_mean) / max(
+            posterior.contrasts.std(), GIVEN_DEVIATION
+        )
+        last_mean = mean
+        if rounds >= MOST_ROUNDS or (
+            rounds >= FEWEST_ROUNDS and change < SETTLED_DEVIATIONS
+        ):
+            break
+        try:
+            surrogate = _linearise_at_mean(problem, search, posterior)
+        except SimulationError:
+            break
+    temperature = 1.0
+    if np.isfinite(least_chi_squared):
+        temperature = smooth.lack_of_fit(least_chi_squared)
+    if temperature > 1:
+        posterior = PhasePosterior.sample(
+            posterior.surrogate,
+            phases,
+            settings=USUAL,
+            seed=2 * rounds + 2,
+            temperature=temperature,
+        )
+    return _SampledPosterior(
+        posterior, temperature, rounds, simulated=len(simulated.p)
+    )
 
 
 def _two_phase_body(solution: Solution, search: _PhaseSearch) -> Body:
@@ -243,31 +298,6 @@ def _two_phase_body(solution: Solution, search: _PhaseSearch) -> Body:
     return next(
         s.body for s in segments if search.name in s.body.field_lengths_m
     )
-
-
-def _solve_with_phases(
-    problem: Problem,
-    search: _PhaseSearch,
-    phase: Array,
-    warm_start: WarmStart,
-    solve_once: SolveOnce,
-) -> Solution:
-    """Return the solution of a problem with given phases, from the parameters of an earlier answer.
-
-    Parameters
-    ----------
-    problem : Problem
-    search : _PhaseSearch
-        Its two-phase field.
-    phase : (E,) array
-        Phases of the elements: 1 in inclusions, 0 elsewhere.
-    warm_start : WarmStart
-        Estimates to start from.
-    solve_once : callable
-        See `solve_two_phases`.
-    """
-    own = replace(search.modes, phase=phase)
-    return solve_once(problem.with_fields({search.name: own}), warm_start)
 
 
 def _two_phase_search(problem: Problem) -> _PhaseSearch:
@@ -308,64 +338,31 @@ def _two_phase_search(problem: Problem) -> _PhaseSearch:
     )
 
 
-def _likelier_phases(probability: Array) -> Array:
-    """Return the likelier phase (E,) of every element, 1.0 for an inclusion and 0.0 otherwise, from
-    the probability (E,) of an inclusion.
+def _representative_phases(probability: Array, volumes_m3: Array) -> Array:
+    """Return phases (E,) that represent samples: the elements of highest probability (E,), whose
+    volume is the mean volume of the inclusion (Vorob'ev expectation of a random set).
 
-    Each phase has at least `FEWEST_ELEMENTS` elements: if necessary, those that are nearest to it
-    in probability are added.
+    The likelier phase of each element would give a smaller inclusion where the probability has
+    small values in many elements, and in exchange another contrast. Each phase has at least
+    `FEWEST_ELEMENTS` elements.
     """
-    phase = is_inclusion(probability).astype(float)
-    order = np.argsort(probability)
-    if phase.sum() < FEWEST_ELEMENTS:
-        phase[order[-FEWEST_ELEMENTS:]] = 1.0
-    elif phase.sum() > len(phase) - FEWEST_ELEMENTS:
-        phase[order[:FEWEST_ELEMENTS]] = 0.0
+    order = np.argsort(-probability, kind="stable")
+    mean_m3 = volumes_m3 @ probability
+    enclosed_m3 = np.cumsum(volumes_m3[order])
+    count = int(np.argmin(np.abs(enclosed_m3 - mean_m3))) + 1
+    count = min(max(count, FEWEST_ELEMENTS), len(order) - FEWEST_ELEMENTS)
+    phase = np.zeros(len(order))
+    phase[order[:count]] = 1.0
     return phase
 
 
-@dataclass(frozen=True, eq=False)
-class _LinearisedMeasurements:
-    """Measurements linearised in the logarithm of every element.
-
-    Attributes
-    ----------
-    fit : LinearisedFit
-        Fit with the elements' logarithms as further parameters.
-    columns : (E,) int array
-        Columns of the elements' logarithms in the fit.
-    base : (E,) array
-        Logarithms relative to the mean at which the measurements are linearised.
-    faces : InternalFaces
-        Faces between elements of the part.
-    deviation : float
-        Prior standard deviation of the logarithm of the contrast.
-    """
-
-    fit: LinearisedFit
-    columns: Index
-    base: Array
-    faces: InternalFaces
-    deviation: float
-
-    def normal_equations(self, temperature: float) -> ElementInformation:
-        """Return the normal equations, with those of the measurements divided by the
-        temperature T.
-        """
-        return _normal_equations(
-            self.fit,
-            self.columns,
-            base=self.base,
-            deviation=self.deviation,
-            temperature=temperature,
-        )
-
-
-def _linearise_in_elements(
-    problem: Problem, search: _PhaseSearch, solution: Solution
-) -> _LinearisedMeasurements:
-    """Return the measurements linearised at a solution with the logarithm of the constant in every
-    element as a parameter, instead of the shapes of the field.
+def _linearise_at(
+    problem: Problem,
+    search: _PhaseSearch,
+    solution: Solution,
+) -> ElementSurrogate:
+    """Return the measurements linearised at a solution by the logarithm of the constant in every
+    element, instead of the shapes of the field.
 
     Parameters
     ----------
@@ -380,179 +377,172 @@ def _linearise_in_elements(
     SimulationError
         If the equations of motion are singular at a solution.
     """
+    solved = solution.collocation
     body = _two_phase_body(solution, search)
     part = body.parts[search.number]
     assert part.field is not None
     theta = body.theta_from_values(solution.parameters)
     base = part.field.logarithms(theta[body.field_slices[search.number]])
-    elements = ElementLogarithms.relative_to(search.modes, base)
-    fit = _fit_with_elements(
-        problem.with_fields({search.name: elements}), solution, search=search
+    collocation = _collocation_with_elements(
+        problem, search, collocation=solved, base=base
     )
-    return _LinearisedMeasurements(
-        fit=fit,
-        columns=_columns(fit, search),
+    p, positions = solved.unpack(solution.z)
+    values = dict(
+        zip((item.name for item in solved.parameters.free), p, strict=False)
+    )
+    # Shapes of a smooth field have the names of elements.
+    elements = set(search.elements)
+    q = [
+        0.0 if item.name in elements else values[item.name]
+        for item in collocation.parameters.free
+    ]
+    return ElementSurrogate.linearise(
+        collocation,
+        np.concatenate([q, p[solved.nq :]]),
+        element_names=search.elements,
         base=base,
         faces=InternalFaces.from_mesh(body.mesh, part.cells),
-        deviation=search.modes.field.deviation,
+        prior=_contrast_prior(problem, search),
+        exponent=0.0,
+        guess=positions,
     )
 
 
-def _columns(fit: LinearisedFit, search: _PhaseSearch) -> Index:
-    """Return the column (E,) in a fit of the logarithm of each element of the part that has the
-    field.
+def _linearise_at_mean(
+    problem: Problem, search: _PhaseSearch, posterior: PhasePosterior
+) -> ElementSurrogate:
+    """Return the measurements linearised at the mean of samples, with the exponent of these.
 
     Raises
     ------
-    KeyError
-        If the fit does not have these parameters, as that of the two-phase field itself.
+    SimulationError
+        If the body cannot be simulated there.
     """
-    places = {name: k for k, name in enumerate(fit.names)}
-    return np.array([places[name] for name in search.elements])
+    before = posterior.surrogate
+    base = posterior.mean_logarithms
+    p = before.p.copy()
+    p[before.other_columns] += posterior.mean_changes.mean(axis=0)
+    return ElementSurrogate.linearise(
+        _collocation_with_elements(
+            problem, search, collocation=before.collocation, base=base
+        ),
+        p,
+        element_names=search.elements,
+        base=base,
+        faces=before.faces,
+        prior=before.prior,
+        exponent=before.exponent,
+        guess=before.positions,
+    )
+
+
+def _collocation_with_elements(
+    problem: Problem,
+    search: _PhaseSearch,
+    collocation: Collocation,
+    base: Array,
+) -> Collocation:
+    """Return the program of a problem with the logarithm of each element as a parameter, relative
+    to `base` (E,), with the associations of a program that has been solved.
+    """
+    elements = ElementLogarithms.relative_to(search.modes, base)
+    with_elements = problem.with_fields({search.name: elements})
+    return replace(
+        collocation,
+        experiments=with_elements.experiments,
+        parameters=with_elements.parameters,
+        associations=_associations(collocation, with_elements.experiments),
+    )
+
+
+def _contrast_prior(problem: Problem, search: _PhaseSearch) -> ContrastPrior:
+    """Return the prior of the logarithm of the contrast: that of the field, or that of the user, or
+    the value that the user has fixed.
+    """
+    (item,) = (
+        item
+        for item in problem.parameters.scalars
+        if item.name == search.contrast
+    )
+    if item.is_fixed:
+        assert item.guess is not None
+        return ContrastPrior(float(np.log(item.guess)), GIVEN_DEVIATION)
+    if item.prior is not None and item.scale == "log":
+        mean, deviation = item.prior
+        return ContrastPrior(float(np.log(mean)), deviation)
+    return ContrastPrior(0.0, search.modes.field.deviation)
 
 
 def _samples(
-    draws: PosteriorDraws,
-    fit: LinearisedFit,
-    search: _PhaseSearch,
-    solution: Solution,
+    sampled: _SampledPosterior, search: _PhaseSearch, solution: Solution
 ) -> PhaseSamples:
-    """Return draws of the phases as samples of the logarithms in the elements of the part with the
-    field.
+    """Return samples of the logarithms in the elements of the part with the field.
 
     Parameters
     ----------
-    draws : PosteriorDraws
-        Draws of phases and contrasts.
-    fit : LinearisedFit
-        Fit with the elements' logarithms as further parameters.
+    sampled : _SampledPosterior
+        Samples of phases, contrasts and parameters.
     search : _PhaseSearch
         The two-phase field.
     solution : Solution
-        Its estimates are the mean of the other parameters.
+        Solution whose estimates the second moments of the samples refer to.
 
     Returns
     -------
     PhaseSamples
         `smooth_misfit` is NaN: the caller sets it.
     """
-    others = np.delete(np.arange(len(fit.names)), _columns(fit, search))
-    shared = [int(k) for k in others if k < fit.shared_count]
-    names = tuple(fit.names[k] for k in shared)
+    posterior = sampled.posterior
+    surrogate = posterior.surrogate
+    others = surrogate.other_columns
+    is_shared = others < surrogate.fit.shared_count
+    shared = others[is_shared]
+    names = tuple(surrogate.fit.names[k] for k in shared)
+    parameters = solution.collocation.parameters
+    free = [item.name for item in parameters.free]
     mean, slopes = mean_logarithm(
         _two_phase_body(solution, search),
-        solution.collocation.parameters,
+        parameters,
         q=solution.q,
         part_index=search.number,
         names=names,
     )
-    by_parameters = draws.changes[:, : len(shared)] @ slopes
-    means = np.column_stack([draws.means[:, : len(shared)], draws.means[:, -1]])
+    at_solution = solution.q[[free.index(name) for name in names]]
+    shift = surrogate.p[shared] - at_solution
+    changes = shift + posterior.draw_changes(seed=0)[:, is_shared]
+    departures = np.column_stack(
+        [
+            shift + posterior.mean_changes[:, is_shared],
+            posterior.mean_contrasts
+            - np.log(_contrast_of_solution(solution, search)),
+        ]
+    )
+    fit = linearise_fit(solution.collocation, solution.z)
     return PhaseSamples(
         logarithms=mean
-        + by_parameters[:, None]
-        + draws.contrasts[:, None] * draws.phases,
-        contrasts=draws.contrasts,
-        volumes_m3=draws.phases @ search.modes.volumes_m3,
+        + (changes @ slopes)[:, None]
+        + posterior.contrasts[:, None] * posterior.phases,
+        contrasts=posterior.contrasts,
+        volumes_m3=posterior.phases @ search.modes.volumes_m3,
         names=(*names, search.contrast),
-        deviations=np.atleast_2d(np.cov(means, rowvar=False)),
+        deviations=departures.T @ departures / len(departures),
         misfit=_chi_squared_per_measurement(fit),
         smooth_misfit=np.nan,
+        scale_reduction=posterior.draws.scale_reduction,
+        is_simulated=sampled.simulated >= FEWEST_SIMULATED,
     )
 
 
-def _fit_with_elements(
-    problem: Problem, solution: Solution, search: _PhaseSearch
-) -> LinearisedFit:
-    """Return the linearised fit at a solution, with the elements' logarithms as further parameters,
-    whose values are zero.
-
-    Parameters
-    ----------
-    problem : Problem
-        Problem whose field is an `ElementLogarithms`.
-    solution : Solution
-        Solution that gives positions and all other parameters.
-    search : _PhaseSearch
-        Names of the elements' logarithms.
-
-    Raises
-    ------
-    SimulationError
-        If the equations of motion are singular at a solution.
-    """
-    solved = solution.collocation
-    elements = set(search.elements)
-    collocation = replace(
-        solved,
-        experiments=problem.experiments,
-        parameters=problem.parameters,
-        associations=_associations(solved, problem.experiments),
-    )
-    p, positions = solved.unpack(solution.z)
-    values = dict(
-        zip((item.name for item in solved.parameters.free), p, strict=False)
-    )
-    q = [
-        0.0 if item.name in elements else values[item.name]
-        for item in collocation.parameters.free
-    ]
-    both = np.concatenate([q, p[solved.nq :]])
-    return linearise_fit(collocation, collocation.pack(both, positions))
+def _contrast_of_solution(solution: Solution, search: _PhaseSearch) -> float:
+    """Return the contrast of a solution with phases, estimated or given."""
+    body = _two_phase_body(solution, search)
+    theta = body.theta_from_values(solution.parameters)
+    return float(theta[body.field_slices[search.number]][0])
 
 
 def _chi_squared_per_measurement(fit: LinearisedFit) -> float:
     """Return χ² per measurement of a linearised fit."""
     return fit.chi_squared / max(1, fit.measurement_count)
-
-
-def _normal_equations(
-    fit: LinearisedFit,
-    of_z: Index,
-    *,
-    base: Array,
-    deviation: float,
-    temperature: float,
-) -> ElementInformation:
-    """Return the blocks of the normal equations of a linearised fit, for the logarithms of the
-    elements and for all other parameters.
-
-    Nothing is eliminated. Priors of the other parameters are included; the prior of the elements is
-    not, but its deviation is copied to the result.
-
-    Parameters
-    ----------
-    fit : LinearisedFit
-    of_z : (E,) int array
-        Columns of the elements' logarithms.
-    base : (E,) array
-        Logarithms relative to the mean at which the fit is linearised.
-    deviation : float
-        Prior standard deviation of the logarithm of the contrast.
-    temperature : float
-        Divides the information of the measurements, not that of the priors.
-    """
-    size = len(fit.names)
-    normal = np.zeros((size, size))
-    score = np.zeros(size)
-    for block in fit.blocks:
-        residual, slope, _ = block.channels
-        matrix = slope.reshape(residual.size, size)
-        normal += matrix.T @ matrix
-        score += matrix.T @ residual.ravel()
-    normal /= temperature
-    score /= temperature
-    of_p = np.delete(np.arange(size), of_z)
-    priors = fit.prior_jacobian[of_p]
-    return ElementInformation(
-        of_p=normal[np.ix_(of_p, of_p)] + np.diag(priors**2),
-        mixed=normal[np.ix_(of_z, of_p)],
-        of_z=normal[np.ix_(of_z, of_z)],
-        score_p=score[of_p] + priors * fit.prior_residual[of_p],
-        score_z=score[of_z],
-        base=base,
-        deviation=deviation,
-    )
 
 
 def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:

@@ -466,12 +466,14 @@ TOPICS: Mapping[str, Topic] = {
             "one-phase": "the data do not show two materials: the contrast of {name} is "
             "{median:.3g} ({lower:.3g} to {upper:.3g}), which contains 1; use prior = 'smooth' "
             "or no field",
-            "narrow": "intervals of the two phases of {name} are often too narrow: in simulated "
-            "recordings those of the contrast contained the true ratio in 2 of 4 cases; if the "
-            "boundary is known, use regions",
-            "few": "the smaller phase of {name} has only {elements} elements: in tests with fewer "
-            "than {fewest}, the estimated contrast was too low and its interval too narrow; "
-            "refine the mesh there",
+            "narrow": "the samples of the two phases of {name} have not converged (potential scale "
+            "reduction of the contrast {reduction:.2g}): its intervals are inaccurate; measure "
+            "more deformation near the inclusion or, if the boundary is known, use regions",
+            "linear": "intervals of the two phases of {name} may be too narrow: they follow from "
+            "linearised measurements only, because their samples could not be simulated",
+            "few": "the smaller phase of {name} has only {elements} elements: its intervals have "
+            "been verified for inclusions of some 80 elements, not for fewer than {fewest}; refine "
+            "the mesh there",
             "phases": "two phases of {name} do not describe the body: χ² per measurement is "
             "{misfit:.3g}, with a smooth field {smooth:.3g}; there may be more than two "
             "materials, or a gradual change: use prior = 'smooth', or regions",

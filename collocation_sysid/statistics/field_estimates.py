@@ -47,9 +47,12 @@ WIDER = 1.1
 # By this factor χ² per measurement of two phases is above that of a smooth field, or of noise,
 # where two phases do not describe the body: chance moves it by a few per cent.
 WORSE = 1.1
-# Elements of the smaller phase from which on its intervals have been checked: the contrast
-# of an inclusion of 85 elements was found, that of 12 was half as large with a narrow interval.
+# Elements of the smaller phase below which its intervals have not been verified: the study has
+# inclusions of about 80 elements, and shapes of a few elements are coarse.
 FEWEST_ELEMENTS = 50
+# Potential scale reduction from which on chains of samples have not explored all phases: with it an
+# interval would become narrower by a third if the chains were continued.
+MOST_SCALE_REDUCTION = 1.5
 # Ends of a 95 % interval, as quantiles.
 ENDS = (0.025, 0.975)
 # Factors of the amplitude that are tried.
@@ -57,10 +60,13 @@ AMPLITUDES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 
 
 def phase_concerns(phases: PhaseSummary, name: str) -> list[Concern]:
-    """Return concerns about a two-phase field, all "check": always "field/narrow", because intervals
-    of two phases are often too narrow; "field/one-phase" if the interval of the contrast contains
-    1, "field/few" if the smaller phase has fewer than `FEWEST_ELEMENTS` elements, "field/phases" if
-    χ² per measurement exceeds `WORSE` times the larger of 1 and that of the smooth field.
+    """Return concerns about a two-phase field, all "check".
+
+    "field/linear" if samples could not be simulated, and "field/narrow" if the chains of samples
+    differ by more than `MOST_SCALE_REDUCTION`; "field/one-phase" if the interval of the contrast
+    contains 1, "field/few" if the smaller phase has fewer than `FEWEST_ELEMENTS` elements,
+    "field/phases" if χ² per measurement exceeds `WORSE` times the larger of 1 and that of the
+    smooth field.
 
     Parameters
     ----------
@@ -69,7 +75,12 @@ def phase_concerns(phases: PhaseSummary, name: str) -> list[Concern]:
     name : str
         Name of the constant, with its region in front.
     """
-    concerns = [Concern("field/narrow", data={"name": name})]
+    concerns = []
+    if not phases.is_simulated:
+        concerns.append(Concern("field/linear", data={"name": name}))
+    if phases.scale_reduction > MOST_SCALE_REDUCTION:
+        apart = {"name": name, "reduction": phases.scale_reduction}
+        concerns.append(Concern("field/narrow", data=apart))
     lower, median, upper = phases.contrast
     if lower <= 1 <= upper:
         ends = {"name": name, "lower": lower, "median": median, "upper": upper}
@@ -430,6 +441,8 @@ def _with_phases(
         misfit=samples.misfit,
         smooth_misfit=samples.smooth_misfit,
         elements=int(min(modes.phase.sum(), (1 - modes.phase).sum())),
+        scale_reduction=samples.scale_reduction,
+        is_simulated=samples.is_simulated,
     )
     return replace(
         estimate,

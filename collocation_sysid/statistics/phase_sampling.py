@@ -3,31 +3,37 @@
 With the residuals linear in parameters p and in the logarithm z_e of a constant in every element,
 and z_e = s h_e for phases h ∈ {0, 1}ᴱ and the logarithm s of the contrast, the posterior is
 
-    −2 ln π(h, s, p) = ‖r + S_p δp + S_z (s h − z₀)‖²/T + s²/A² + priors of p + 2 J Σ_f w_f |Δh|_f.
+    −2 ln π(h, s, p) = ‖r + S_p δp + S_z (s h − z₀)‖²/T + (s − m)²/A² + priors of p − 2 ln π(h),
 
-The last sum is over the faces f between two elements, w_f is the face's area over the mean area and
-|Δh|_f is one where the phases differ: the prior of Ising and Potts, a total variation of h. T is
-the lack of fit, at least one: by how much χ² exceeds that of the smooth field, per mode that the
-smooth field determines. It is one if two phases describe the body and the right ones are found;
-otherwise, and where the linearisation is inaccurate, it widens intervals.
+with the Potts prior π(h) of `potts_prior`, whose constants are sampled too. T is the lack of fit,
+at least one: by how much χ² exceeds that of the smooth field, per mode that the smooth field
+determines. It is one if two phases describe the body and the right ones are found.
 
-Phases start at a total-variation estimate of z, divided into two classes (Otsu 1979), and are drawn
-one element at a time by locally balanced proposals (Zanella 2020); given h, s and δp are normal and
-drawn together. A modal level set, ln c = s H(φ) with a smooth step H and a normal φ, was tried: its
-posterior mode has H near one half everywhere and several times the contrast (10 for 3).
+Given h, p and s are normal, so that both are integrated out: with N and c from the normal equations
+after the elimination of p,
+
+    −2 ln π(h) = −(hᵀc + m/A²)²/(hᵀN h + 1/A²) + ln(hᵀN h + 1/A²) − 2 ln π_Potts(h).
+
+Sampling s and h in turn instead would not move along the direction in which a smaller inclusion
+with a larger contrast fits as well: intervals would be several times too narrow. Phases start at a
+total-variation estimate of z, divided into two classes (Otsu 1979), and are changed one element at a
+time by locally balanced proposals (Zanella 2020). A modal level set, ln c = s H(φ) with a smooth
+step H and a normal φ, was tried: its posterior mode has H near one half everywhere and several
+times the contrast (10 for 3).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from ..common.array_types import Array, Index
 from ..fem.meshes.mesh import TetMesh
+from .potts_prior import PottsConstants, PottsHyperprior
 
 
 @dataclass(frozen=True)
@@ -36,18 +42,20 @@ class SamplerSettings:
 
     Attributes
     ----------
-    face_nats : float
-        Strength J of the prior. On twins with an inclusion of factor 3 of some 80 elements, 2 and 3
-        gave the same contrast; with 1 single elements flickered and the contrast was 6 % lower.
+    hyperprior : PottsHyperprior
+        Prior of the constants of the Potts prior.
     steps_per_element : int
         Proposals per element and chain; the first quarter is discarded.
     least_steps : int
         Fewest proposals of a chain.
     chains : int
-        Chains with independent random numbers. Their samples count equally, so that an interval
-        contains the optima that chains end in.
+        Chains, at least three, which are computed together.
+    dispersion : float
+        Largest ratio of the volume of the inclusion at the start of a chain to that of the estimate
+        from which chains start, and of this to the smallest. Inclusions of twice the volume and
+        about half the difference of the constants deform the body in nearly the same way.
     steps_per_draw : int
-        Proposals between draws of s and δp.
+        Proposals between draws of the constants of the Potts prior.
     steps_per_sample : int
         Proposals between stored samples.
     total_variation : float
@@ -60,11 +68,12 @@ class SamplerSettings:
         Limit of the exponents of the proposals' weights, against overflow.
     """
 
-    face_nats: float = 2.5
+    hyperprior: PottsHyperprior = field(default_factory=PottsHyperprior)
     steps_per_element: int = 10
     least_steps: int = 4000
-    chains: int = 3
-    steps_per_draw: int = 10
+    chains: int = 8
+    dispersion: float = 2.0
+    steps_per_draw: int = 400
     steps_per_sample: int = 20
     total_variation: float = 1.0
     smallest_jump: float = 0.02
@@ -166,6 +175,8 @@ class ElementInformation:
         Expansion point z₀.
     deviation : float
         Prior standard deviation A of s.
+    mean : float
+        Prior mean m of s.
     """
 
     of_p: Array
@@ -175,34 +186,63 @@ class ElementInformation:
     score_z: Array
     base: Array
     deviation: float
+    mean: float = 0.0
+
+    @cached_property
+    def covariance_p(self) -> Array:
+        """Pseudo-inverse (p, p) of the information about p at given z."""
+        return np.asarray(np.linalg.pinv(self.of_p, hermitian=True), float)
+
+    @cached_property
+    def eliminated(self) -> tuple[Array, Array]:
+        """Information N (E, E) about z after the elimination of p, and the score (E,) at z₀."""
+        normal = self.of_z - self.mixed @ self.covariance_p @ self.mixed.T
+        score = self.score_z - self.mixed @ (self.covariance_p @ self.score_p)
+        return normal, score
+
+    def mean_changes(self, logarithms: Array) -> Array:
+        """Return the means (K, p) of δp given logarithms z (K, E)."""
+        scores = self.score_p + (logarithms - self.base) @ self.mixed
+        return -scores @ self.covariance_p
 
 
 @dataclass(frozen=True, eq=False)
 class PosteriorDraws:
-    """Samples of one or several chains.
+    """Samples of C chains, k of each.
 
     Attributes
     ----------
-    phases : (K, E) array
+    phases : (k, C, E) array
         Phases, 0 or 1.
-    contrasts : (K,) array
+    contrasts : (k, C) array
         Logarithms s of the contrast.
-    changes : (K, p) array
-        Changes δp of the parameters.
-    means : (K, p + 1) array
-        Means of δp and s given the phases.
-    probability : (E,) array
-        Probability of phase 1 in each element.
+    means : (k, C) array
+        Means of s given the phases.
+    constants : PottsConstants
+        Constants of the Potts prior, (k, C) each.
     accepted : float
         Share of accepted proposals.
     """
 
     phases: NDArray[np.int8]
     contrasts: Array
-    changes: Array
     means: Array
-    probability: Array
+    constants: PottsConstants
     accepted: float
+
+    @property
+    def probability(self) -> Array:
+        """Probability (E,) of phase 1 in each element."""
+        return self.phases.mean(axis=(0, 1))
+
+    @property
+    def scale_reduction(self) -> float:
+        """Potential scale reduction of s (Gelman and Rubin 1992): about 1 if all chains sample the
+        same distribution; infinite if no chain moves.
+        """
+        within = self.contrasts.var(axis=0, ddof=1).mean()
+        between = self.contrasts.mean(axis=0).var(ddof=1)
+        return float(np.sqrt(1 + between / within)) if within > 0 else np.inf
 
 
 def initial_phases(
@@ -211,10 +251,13 @@ def initial_phases(
     volumes_m3: Array,
     settings: SamplerSettings = USUAL,
 ) -> Array:
-    """Return initial phases (E,) of 0 and 1 from the total-variation estimate of z, divided into
-    two classes.
+    """Return initial phases (C, E) of 0 and 1 for each chain, from the total-variation estimate of
+    z, divided into two classes by Otsu's threshold.
 
-    The class of smaller volume is the inclusion, phase 1.
+    The class of smaller volume is the inclusion, phase 1. That is the start of the first chain; the
+    inclusions of the others have from 1/`SamplerSettings.dispersion` to `dispersion` times its
+    volume: over-dispersed starts, so that differences between the chains show whether they have
+    converged.
 
     Parameters
     ----------
@@ -226,15 +269,33 @@ def initial_phases(
         Volumes of the elements [m³].
     settings : SamplerSettings
         Constants of the algorithm.
-
-    Notes
-    -----
-    The total variation is minimised by `SamplerSettings.sharpenings` reweighted least-squares
-    solves, with p eliminated.
     """
-    inverse = np.linalg.pinv(data.of_p, hermitian=True)
-    normal = data.of_z - data.mixed @ inverse @ data.mixed.T
-    score = data.score_z - data.mixed @ (inverse @ data.score_p)
+    z = _total_variation_estimate(data, faces, settings)
+    above = z >= _class_threshold(z, volumes_m3)
+    total_m3 = volumes_m3.sum()
+    is_upper = bool(volumes_m3[above].sum() <= total_m3 / 2)
+    inclusion = above if is_upper else ~above
+    order = np.argsort(-z if is_upper else z, kind="stable")
+    enclosed_m3 = np.cumsum(volumes_m3[order])
+    factors = np.geomspace(
+        1 / settings.dispersion, settings.dispersion, settings.chains - 1
+    )
+    phases = np.zeros((settings.chains, len(z)))
+    phases[0] = inclusion
+    for phase, factor in zip(phases[1:], factors, strict=True):
+        volume_m3 = min(factor * volumes_m3[inclusion].sum(), total_m3 / 2)
+        count = max(1, int(np.searchsorted(enclosed_m3, volume_m3)))
+        phase[order[:count]] = 1.0
+    return phases
+
+
+def _total_variation_estimate(
+    data: ElementInformation, faces: InternalFaces, settings: SamplerSettings
+) -> Array:
+    """Return the logarithms z (E,) of least squares and least total variation, with p eliminated, by
+    `SamplerSettings.sharpenings` reweighted least-squares solves.
+    """
+    normal, score = data.eliminated
     jumps = faces.jump_operator
     z = data.base
     for _ in range(settings.sharpenings):
@@ -246,10 +307,7 @@ def initial_phases(
             1e-9 * np.trace(prior) / len(prior)
         )
         z = np.linalg.solve(normal + prior, normal @ data.base - score)
-    above = z >= _class_threshold(z, volumes_m3)
-    return (
-        above if volumes_m3[above].sum() <= volumes_m3.sum() / 2 else ~above
-    ).astype(float)
+    return z
 
 
 def _class_threshold(values: Array, weights: Array) -> float:
@@ -281,10 +339,13 @@ def sample_phases(
     data: ElementInformation,
     faces: InternalFaces,
     start: Array,
+    *,
     settings: SamplerSettings = USUAL,
+    constants: PottsConstants | None = None,
+    seed: int = 0,
 ) -> PosteriorDraws:
-    """Draw phases, contrast and parameters from their posterior, by several chains, whose samples
-    are concatenated.
+    """Draw phases and contrast from their posterior, by several chains with the parameters p
+    integrated out.
 
     The same arguments give the same samples.
 
@@ -294,34 +355,60 @@ def sample_phases(
         Normal equations.
     faces : InternalFaces
         Faces between elements.
-    start : (E,) array
-        Initial phases, 0 or 1.
+    start : (E,) or (C, E) array
+        Initial phases, 0 or 1, of all chains or of each; not modified.
     settings : SamplerSettings
         Constants of the sampler.
+    constants : PottsConstants, optional
+        Given constants of the Potts prior, (C,) each; None samples them.
+    seed : int
+        Seed of the random numbers.
+
+    Notes
+    -----
+    Phases flip one at a time: element e is proposed with a probability proportional to the root of
+    the ratio of posteriors with and without the flip (locally balanced), and accepted by Metropolis
+    and Hastings.
     """
-    chains = [
-        _run_chain(data, faces, start=start, seed=seed, settings=settings)
-        for seed in range(settings.chains)
-    ]
-    phases = np.concatenate([chain.phases for chain in chains])
+    rng = np.random.default_rng(seed)
+    steps = max(
+        settings.least_steps, settings.steps_per_element * faces.element_count
+    )
+    chains = _Chains(
+        data,
+        faces,
+        start=np.broadcast_to(start, (settings.chains, faces.element_count)),
+        constants=constants,
+        largest_exponent=settings.largest_exponent,
+    )
+    phases: list[NDArray[np.int8]] = []
+    contrasts: list[Array] = []
+    means: list[Array] = []
+    strengths: list[PottsConstants] = []
+    accepted = 0.0
+    for step in range(steps):
+        if constants is None and step % settings.steps_per_draw == 0:
+            chains.draw_constants(settings.hyperprior, rng)
+        accepted += chains.propose(rng)
+        if step >= steps // 4 and step % settings.steps_per_sample == 0:
+            phases.append(chains.phases.astype(np.int8))
+            contrasts.append(chains.draw_contrasts(rng))
+            means.append(chains.mean_contrasts)
+            strengths.append(chains.constants)
     return PosteriorDraws(
-        phases=phases,
-        contrasts=np.concatenate([chain.contrasts for chain in chains]),
-        changes=np.concatenate([chain.changes for chain in chains]),
-        means=np.concatenate([chain.means for chain in chains]),
-        probability=phases.mean(axis=0),
-        accepted=float(np.mean([chain.accepted for chain in chains])),
+        phases=np.array(phases),
+        contrasts=np.array(contrasts),
+        means=np.array(means),
+        constants=PottsConstants(
+            np.array([each.face_nats for each in strengths]),
+            element_nats=np.array([each.element_nats for each in strengths]),
+        ),
+        accepted=accepted / steps,
     )
 
 
-def _run_chain(
-    data: ElementInformation,
-    faces: InternalFaces,
-    start: Array,
-    seed: int,
-    settings: SamplerSettings,
-) -> PosteriorDraws:
-    """Draw phases, contrast and parameters by one chain, whose first quarter is discarded.
+class _Chains:
+    """State of C chains: their phases, and what the energies of all flips follow from.
 
     Parameters
     ----------
@@ -329,101 +416,123 @@ def _run_chain(
         Normal equations.
     faces : InternalFaces
         Faces between elements.
-    start : (E,) array
-        Initial phases, 0 or 1; not modified.
-    seed : int
-        Seed of the random numbers.
-    settings : SamplerSettings
-        Constants of the sampler.
+    start : (C, E) array
+        Initial phases; copied.
+    constants : PottsConstants or None
+        Constants of the Potts prior; None starts with the means of the usual hyperprior.
+    largest_exponent : float
+        Limit of the exponents of the proposals' weights.
 
-    Notes
-    -----
-    Phases flip one at a time: element e is proposed with a probability proportional to the root of
-    the ratio of posteriors with and without the flip (locally balanced), and accepted by Metropolis
-    and Hastings. δp and s are drawn from their normal distribution every `steps_per_draw`
-    proposals.
+    Attributes
+    ----------
+    phases : (C, E) array
+        Present phases, 0.0 or 1.0.
+    constants : PottsConstants
+        Present constants of the Potts prior, (C,) each.
     """
-    rng = np.random.default_rng(seed)
-    count = len(start)
-    steps = max(settings.least_steps, settings.steps_per_element * count)
-    limit = settings.largest_exponent
-    neighbours = faces.adjacency
-    degrees = np.asarray(neighbours.sum(axis=1)).ravel()
-    diagonal = np.diag(data.of_z)
-    constant = data.score_z - data.of_z @ data.base
-    of_p = data.score_p - data.mixed.T @ data.base
 
-    phase = start.copy()
-    of_z_phase = data.of_z @ phase
-    neighbour_sums = neighbours @ phase
-
-    def conditional() -> tuple[Array, Array]:
-        """Return the mean (p + 1,) of (δp, s) given the present phases, and the lower triangular
-        factor L of their information L Lᵀ.
-        """
-        coupling = data.mixed.T @ phase
-        own = phase @ of_z_phase + 1 / data.deviation**2
-        information = np.block(
-            [[data.of_p, coupling[:, None]], [coupling, np.array([[own]])]]
+    def __init__(
+        self,
+        data: ElementInformation,
+        faces: InternalFaces,
+        *,
+        start: Array,
+        constants: PottsConstants | None,
+        largest_exponent: float,
+    ) -> None:
+        normal, score = data.eliminated
+        self.phases = np.array(start, dtype=float)
+        self._rows = np.arange(len(self.phases))
+        count = len(self._rows)
+        hyperprior = USUAL.hyperprior
+        self.constants = constants or PottsConstants(
+            np.full(count, hyperprior.face_nats), element_nats=np.zeros(count)
         )
-        information[np.diag_indices_from(information)] *= 1 + 1e-12
-        factor = np.linalg.cholesky(information)
-        right = -np.r_[of_p, phase @ constant]
-        half = solve_triangular(factor, right, lower=True)
-        mean: Array = solve_triangular(factor.T, half)
-        return mean, np.asarray(factor, dtype=float)
-
-    def drawn() -> tuple[Array, Array]:
-        """Return the mean and a draw of (δp, s), each (p + 1,), given the present phases."""
-        mean, factor = conditional()
-        noise = rng.normal(size=len(mean))
-        return mean, mean + np.asarray(solve_triangular(factor.T, noise))
-
-    def change(signs: Array) -> Array:
-        """Return, for each element, −ln of the ratio of the posteriors with and without its phase
-        flipped (E,), at the present δp and s.
-
-        `signs` (E,) are 1 for a phase that becomes 1, and −1 for one that becomes 0.
-        """
-        force = constant + data.mixed @ both[:-1] + both[-1] * of_z_phase
-        own = signs * both[-1] * force + both[-1] ** 2 * diagonal / 2
-        return own + settings.face_nats * signs * (degrees - 2 * neighbour_sums)
-
-    mean, both = drawn()
-    energy = change(1 - 2 * phase)
-    samples: list[tuple[NDArray[np.int8], Array, Array]] = []
-    accepted = 0
-    for step in range(steps):
-        if step % settings.steps_per_draw == 0:
-            mean, both = drawn()
-            energy = change(1 - 2 * phase)
-        weights = np.cumsum(np.exp(np.clip(-energy / 2, -limit, limit)))
-        chosen = min(
-            int(np.searchsorted(weights, rng.random() * weights[-1])), count - 1
+        self._normal = normal
+        self._diagonal = np.diag(normal).copy()
+        self._target = normal @ data.base - score
+        self._neighbours = faces.adjacency.toarray()
+        self._degrees = self._neighbours.sum(axis=1)
+        self._limit = largest_exponent
+        # Sums over the elements of phase 1 in each chain.
+        self._normal_sums = self.phases @ normal
+        precision = 1 / data.deviation**2
+        self._information = precision + (self.phases * self._normal_sums).sum(
+            axis=1
         )
-        sign = 1 - 2 * phase[chosen]
-        before = of_z_phase, neighbour_sums, energy
-        row = slice(neighbours.indptr[chosen], neighbours.indptr[chosen + 1])
-        of_z_phase = of_z_phase + sign * data.of_z[chosen]
-        neighbour_sums = neighbour_sums.copy()
-        neighbour_sums[neighbours.indices[row]] += sign * neighbours.data[row]
-        phase[chosen] += sign
-        energy = change(1 - 2 * phase)
-        back = np.exp(np.clip(-energy / 2, -limit, limit)).sum()
-        if rng.random() * back < weights[-1]:
-            accepted += 1
-        else:
-            phase[chosen] -= sign
-            of_z_phase, neighbour_sums, energy = before
-        if step >= steps // 4 and step % settings.steps_per_sample == 0:
-            samples.append((phase.astype(np.int8), both, mean))
-    phases = np.array([each[0] for each in samples])
-    values = np.array([each[1] for each in samples])
-    return PosteriorDraws(
-        phases=phases,
-        contrasts=values[:, -1],
-        changes=values[:, :-1],
-        means=np.array([each[2] for each in samples]),
-        probability=phases.mean(axis=0),
-        accepted=accepted / steps,
-    )
+        self._moments = data.mean * precision + self.phases @ self._target
+        self._neighbour_sums = self.phases @ self._neighbours
+        self._energies = self._flip_energies()
+
+    def draw_constants(
+        self, hyperprior: PottsHyperprior, rng: np.random.Generator
+    ) -> None:
+        """Replace the constants of the Potts prior by draws given the phases, in place."""
+        self.constants = hyperprior.draw(
+            self.phases,
+            2 * self._neighbour_sums - self._degrees,
+            self.constants,
+            rng=rng,
+        )
+        self._energies = self._flip_energies()
+
+    @property
+    def mean_contrasts(self) -> Array:
+        """Mean (C,) of s given the phases."""
+        return self._moments / self._information
+
+    def draw_contrasts(self, rng: np.random.Generator) -> Array:
+        """Draw s (C,) given the phases."""
+        noise = rng.normal(size=len(self._rows)) / np.sqrt(self._information)
+        return self.mean_contrasts + noise
+
+    def propose(self, rng: np.random.Generator) -> float:
+        """Propose one flip in each chain and accept or reject it, in place; return the share of
+        accepted ones.
+        """
+        forward = np.cumsum(self._weights(self._energies), axis=1)
+        drawn = rng.random((len(forward), 1)) * forward[:, -1:]
+        chosen = np.minimum((forward < drawn).sum(axis=1), forward.shape[1] - 1)
+        everywhere = np.ones(len(chosen), dtype=bool)
+        self._flip(chosen, everywhere)
+        energies = self._flip_energies()
+        back = self._weights(energies).sum(axis=1)
+        accepted = rng.random(len(back)) * back < forward[:, -1]
+        self._flip(chosen, ~accepted)
+        self._energies = np.where(accepted[:, None], energies, self._energies)
+        return float(accepted.mean())
+
+    def _weights(self, energies: Array) -> Array:
+        """Return the weights of the proposals from the energies of the flips (C, E)."""
+        return np.exp(np.clip(-energies / 2, -self._limit, self._limit))
+
+    def _flip_energies(self) -> Array:
+        """Return, for each chain and element, −ln of the ratio of the posteriors with and without
+        its phase flipped (C, E).
+        """
+        signs = 1 - 2 * self.phases
+        before = self._information[:, None]
+        information = before + 2 * signs * self._normal_sums + self._diagonal
+        moments = self._moments[:, None] + signs * self._target
+        of_data = np.log(information / before) - moments**2 / information
+        of_data += self._moments[:, None] ** 2 / before
+        of_prior = (
+            self.constants.face_nats[:, None]
+            * (self._degrees - 2 * self._neighbour_sums)
+            - self.constants.element_nats[:, None]
+        )
+        return of_data / 2 + signs * of_prior
+
+    def _flip(self, elements: Index, mask: NDArray[np.bool_]) -> None:
+        """Flip one element (C,) in each chain of a mask (C,), in place."""
+        rows = self._rows[mask]
+        flipped = elements[mask]
+        signs = 1 - 2 * self.phases[rows, flipped]
+        self._information[rows] += (
+            2 * signs * self._normal_sums[rows, flipped]
+            + self._diagonal[flipped]
+        )
+        self._moments[rows] += signs * self._target[flipped]
+        self._normal_sums[rows] += signs[:, None] * self._normal[flipped]
+        self._neighbour_sums[rows] += signs[:, None] * self._neighbours[flipped]
+        self.phases[rows, flipped] += signs
