@@ -8,7 +8,8 @@ bench, `density_guesses` the mass), and
 `problem_size` estimates memory and time; `specimen_reader` reads tests without a mesh, and
 `gripper_transforms` the poses of bodies in grippers. `schema`, `recording_schema`, `load_schema`,
 `nuisance_schema` (with `nuisance_priors`), `specimen_schema` and `solver_schema` define the keys,
-`editor_schema` describes them for editors, and `validation_messages` words validation errors.
+`editor_schema` describes them for editors, `key_descriptions` for readers, and
+`validation_messages` words validation errors.
 `new_problem` writes the file of a new problem.
 
 Use `Problem` in Python and `Problem.read` for a file.

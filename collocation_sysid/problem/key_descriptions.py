@@ -123,8 +123,8 @@ def _form(part: Mapping[str, Any]) -> str:
     parts = [*part.get("anyOf", ()), *part.get("oneOf", ())]
     if parts:
         forms = [_form(each) for each in parts if each.get("type") != "null"]
-        return " or ".join(dict.fromkeys(filter(None, forms)))
-    kind = part.get("type", "")
+        return " or ".join(dict.fromkeys(each for each in forms if each))
+    kind = str(part.get("type", ""))
     limits = [
         f"{sign} {part[word]:g}"
         for word, sign in _LIMITS.items()

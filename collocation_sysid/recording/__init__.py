@@ -18,8 +18,9 @@ Begin with `experiment` (one recording with all its parts). Its parts are in:
 
 Files are read by `marker_files` (markers), `pose_files` (poses), `time_tables` (forces,
 displacements, pressures, custom sensors) and the subpackage `formats`; `recording_writers` writes
-them. `alignment`, `sample_times`, `gap_interpolation` and `rigid_fit` prepare data: one time grid,
-sample times, interpolation between consecutive samples, rigid fits. `experiment_refinement` and
+them. `alignment`, `sample_times`, `frame_times`, `gap_interpolation` and `rigid_fit` prepare data:
+one time grid, sample times, samples of lost or jittered frames, interpolation between consecutive
+samples, rigid fits. `experiment_refinement` and
 `experiment_coarsening` move an experiment to a finer or coarser mesh by `experiment_on_body`,
 `grasp_rotation` finds the fastest rotation of its grasps, `measurement_selection` copies it with a
 part of its measurements, and `checked_arrays` and `node_selection` check arrays and node

@@ -841,6 +841,20 @@ def test_a_new_problem_without_a_recording_has_no_settings_of_a_simulated_one(
     assert "simulated" not in Path("mine/problem.toml").read_text()
 
 
+def test_the_template_has_a_wrench_that_can_be_uncommented(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    run_command("new", "mine", "--kind", "swing")
+    file = tmp_path / "mine" / "problem.toml"
+    text = file.read_text()
+    assert "# wrench = { file" in text
+    file.write_text(text.replace("# wrench = { file", "wrench = { file"))
+    (grasp,) = read_problem_file(file)[0].experiment[0].grasp_list
+    assert grasp.wrench.file == "wrench.csv"
+    assert grasp.wrench.sigma_nm == 0.005
+
+
 def test_a_new_problem_leaves_the_data_that_are_there(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine").mkdir()

@@ -14,6 +14,7 @@ from collocation_sysid.cli.markdown import TerminalPage
 from collocation_sysid.common.console import PlainConsole
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.common.pages import page_files, page_text, page_url
+from collocation_sysid.problem.key_descriptions import all_keys, find_keys
 from collocation_sysid.result.run_sections import remedy_command, remedy_lines
 from collocation_sysid.statistics.concerns import TOPICS, Concern
 
@@ -49,6 +50,31 @@ def test_an_unknown_topic_is_refused_with_the_likely_one():
     assert outcome.code == 2
     assert "TOPIC: found 'verdit'; expected one of actuation, " in outcome.err
     assert "did you mean 'verdict'?" in outcome.err
+
+
+def test_keys_of_the_problem_file_are_explained():
+    shown = run_command("explain", "resample_hz").out
+    assert "experiment.resample_hz" in shown
+    assert "number > 0" in shown
+    assert "lost frames are missing samples" in shown
+    several = run_command("explain", "sigma_m").out
+    assert "experiment.markers.sigma_m" in several
+    assert "experiment.grasp.sigma_m" in several
+    one = run_command("explain", "markers.sigma_m").out
+    assert "experiment.markers.sigma_m" in one
+    assert "experiment.grasp.sigma_m" not in one
+    outcome = run_command("explain", "resampel_hz")
+    assert outcome.code == 2
+    assert "or a key of the problem file" in outcome.err
+    assert "did you mean 'resample_hz'?" in outcome.err
+
+
+def test_every_key_of_the_problem_file_has_a_path_of_the_schema():
+    paths = [each.path for each in all_keys()]
+    assert len(paths) > 200
+    for path in ("title", "experiment.nuisance.tare.prior_sigmas"):
+        assert path in paths, path
+    assert find_keys("igma_m") == []  # whole names only
 
 
 def test_code_of_a_page_can_be_copied_from_a_narrow_terminal():

@@ -365,6 +365,14 @@ def test_resampling_puts_everything_on_the_new_rate(tiny):
     assert problem.notes == ()
 
 
+def test_the_error_of_resampling_is_noted_beside_the_noise(tiny):
+    precise = "experiment.0.markers.sigma_m=1e-6"
+    between = load(tiny, "experiment.0.resample_hz=80", precise).notes
+    assert any("interpolates the markers between frames" in n for n in between)
+    at_frames = load(tiny, "experiment.0.resample_hz=50", precise).notes
+    assert not any("between frames" in n for n in at_frames)
+
+
 def test_material_beyond_vector_code_is_noted(tiny, monkeypatch):
     def printing(F, lambda_pa, mu_pa):
         return ca.SX.printme(neo_hookean(F, lambda_pa, mu_pa), 0)

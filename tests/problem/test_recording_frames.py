@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from kit.problem_files import run_command, write_problem
+from kit.problem_files import TRUTH, run_command, write_problem
 from kit.robot_log import (
     CAMERAS,
     CAMERAS_M,
@@ -19,6 +20,11 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.problem import Problem
+from collocation_sysid.recording import read_markers, write_markers_csv
+from collocation_sysid.statistics.misspecification.modal_misspecifications import (
+    FRAME_CAUSES,
+    find_misspecifications_by_modes,
+)
 
 EARTH_M_S2 = np.array([0.0, 0.0, -9.81])
 
@@ -145,6 +151,38 @@ def test_frames_of_other_names_are_noted(tmp_path: Path) -> None:
     (note,) = markers_notes(problem)
     assert "in 'optitrack'" in note
     assert "convert the poses or the markers" in note
+
+
+def test_stated_frames_replace_guesses_about_frames(tmp_path: Path) -> None:
+    file = write_problem(tmp_path, {"swing": 24})
+    table = read_markers(tmp_path / "swing_markers.csv")
+    turned = Rotation.from_euler("z", 25.0, degrees=True)
+    shift_m = np.array([0.02, 0.0, 0.01])
+    places_m = turned.apply(table.positions_m.reshape(-1, 3).copy()) + shift_m
+    write_markers_csv(
+        tmp_path / "swing_markers.csv",
+        table.t_s,
+        names=table.names,
+        positions_m=places_m.reshape(table.positions_m.shape),
+    )
+    (experiment,) = Problem.read(file).experiments
+    guesses = find_misspecifications_by_modes(experiment, TRUTH)
+    assert "camera-frame" in [each.code for each in guesses]
+    fault = 'expected one frame: set poses = "trial#/tf#mocap>gripper"'
+    stated = replace(experiment, frames_fault=fault)
+    (cause, *others) = find_misspecifications_by_modes(stated, TRUTH)
+    assert cause.code == "frames"
+    assert fault in cause.message
+    assert "template_m" not in cause.message
+    assert not {each.code for each in others} & {*FRAME_CAUSES}
+
+
+def test_frames_are_no_cause_of_tracks_that_fit(tmp_path: Path) -> None:
+    problem = Problem.read(robot_problem(tmp_path, markers_frame="optitrack"))
+    (experiment,) = problem.experiments
+    assert "in 'optitrack'" in experiment.frames_fault
+    causes = find_misspecifications_by_modes(experiment, TRUTH)
+    assert "frames" not in [each.code for each in causes]
 
 
 def markers_notes(problem: Problem) -> list[str]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kit.problem_files import AT_TRUTH, TRUTH, write_problem
 from scipy.interpolate import CubicSpline
 
 import collocation_sysid as cs
@@ -20,7 +21,6 @@ from collocation_sysid.recording import (
     write_markers_csv,
 )
 from collocation_sysid.recording.frame_times import assign_frames
-from kit.problem_files import AT_TRUTH, TRUTH, write_problem
 
 RATE_HZ = 30.0
 COUNT = 77

@@ -5,6 +5,7 @@ import pytest
 
 from collocation_sysid.recording.gap_interpolation import (
     interpolate_without_gaps,
+    interpolation_error,
     is_gap,
 )
 
@@ -60,3 +61,25 @@ def test_a_single_sample_is_found_at_its_time_alone():
 
 def test_an_interval_over_one_and_a_half_median_intervals_is_a_gap():
     assert is_gap(TIMES_S).tolist() == [False, False, True, False]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_the_error_of_straight_lines_is_estimated(noise: float) -> None:
+    rng = np.random.default_rng(2)
+    t_s = np.arange(80) / 30.0
+    at_s = np.arange(60) / 25.0
+
+    def track(times_s):
+        """Two markers of three coordinates, a fast and a slow one."""
+        phases = np.outer(times_s, [20.0, 2.0])[..., None] + np.arange(3)
+        return np.sin(phases)
+
+    measured = track(t_s) + noise * rng.normal(size=(80, 2, 3))
+    measured[[13, 40], 0] = np.nan
+    exact = interpolate_without_gaps(at_s, t_s, track(t_s)) - track(at_s)
+    actual = np.sqrt(np.mean(exact**2, axis=(0, 2)))
+    estimate = interpolation_error(at_s, t_s, measured)
+    assert estimate[0] == pytest.approx(actual[0], rel=0.15)
+    assert estimate[1] < 0.01
+    at_samples = interpolation_error(t_s, t_s, measured)
+    np.testing.assert_allclose(at_samples, 0, atol=1e-12)

@@ -318,6 +318,53 @@ def test_addresses_of_topics_are_lines_that_can_be_copied(
     assert f"  {address}" in file.getvalue().splitlines()
 
 
+def test_the_frame_of_the_markers_is_listed_and_begins_chains(
+    tmp_path: Path,
+) -> None:
+    camera = {"frame_id": "/camera", "stamp": {"sec": 0, "nanosec": 0}}
+
+    def array(t: float) -> tuple[float, dict[str, Any]]:
+        place = {"x": t, "y": 0.0, "z": 0.0}
+        marker = {"header": camera, "ns": "bar", "id": 3}
+        return t, {"markers": [{**marker, "pose": {"position": place}}]}
+
+    def transforms(t: float) -> tuple[float, dict[str, Any]]:
+        turn = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+        pairs = [("base", "camera", 1.0), ("base", "tool0", t)]
+        return t, {
+            "transforms": [
+                {
+                    "header": {"frame_id": parent},
+                    "child_frame_id": child,
+                    "transform": {
+                        "translation": {"x": x, "y": 0.0, "z": 0.0},
+                        "rotation": turn,
+                    },
+                }
+                for parent, child, x in pairs
+            ]
+        }
+
+    times_s = (0.0, 1.0, 2.0)
+    log = json_mcap(
+        tmp_path / "run.mcap",
+        {
+            "/tags": (
+                "visualization_msgs/MarkerArray",
+                [array(t) for t in times_s],
+            ),
+            "/tf": ("tf2_msgs/TFMessage", [transforms(t) for t in times_s]),
+        },
+    )
+    topics = {each.name: each for each in list_topics(log)}
+    assert topics["/tags"].frame == "camera"
+    assert topics["/tf"].frame == ""
+    assert "run.mcap#/tf#camera>tool0" in topics["/tf"].write
+    lines = run_command("log", log).out.splitlines()
+    assert "frame" in lines[0].split()
+    assert any("/tags" in line and " camera " in line for line in lines)
+
+
 def test_markers_of_several_namespaces_have_these_in_their_names(
     tmp_path: Path,
 ) -> None:
