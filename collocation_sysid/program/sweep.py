@@ -611,7 +611,17 @@ class Sweep:
             if self.body.is_unsymmetric
             else solver.factor_size
         )
-        return 8 * (self.body.linearisation_width + values)
+        bytes_each = 4 if self.has_single_precision else 8
+        return 8 * self.body.linearisation_width + bytes_each * values
+
+    @property
+    def has_single_precision(self) -> bool:
+        """Whether factors have single precision and solutions are refined: those of large bodies in
+        motion, whose masses make the matrices well conditioned.
+        """
+        return (
+            not self.dynamics.is_static and self.factoriser.has_single_precision
+        )
 
     def dynamics_at(self, equations: EquationsAtParameters) -> Dynamics:
         """Return the discrete equations of motion of `equations`, truncated to the grid times of
@@ -751,7 +761,11 @@ class Sweep:
             count = len(linearisation.force)
             threads = self.body.threads
             return self.factoriser.factorise_each(
-                matrix, count, threads=threads, buffers=buffers
+                matrix,
+                count,
+                threads=threads,
+                buffers=buffers,
+                is_single=self.has_single_precision,
             )
         except np.linalg.LinAlgError as error:
             raise SimulationError(
