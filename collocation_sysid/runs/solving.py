@@ -48,7 +48,7 @@ FAILED_STATUSES = (
 # Least decrease of χ² for which the solution from a second start is preferred.
 LEAST_GAIN = 1e-3
 # Least tolerance of a solve on a coarser mesh: below the difference between both meshes.
-COARSE_TOLERANCE = 1e-4
+COARSE_TOLERANCE = 1e-3
 # Most repetitions of a solve whose estimates change the correspondences of the measurements.
 MOST_REREADINGS = 5
 
@@ -273,7 +273,8 @@ def _solve_from_coarse(
         raise error.located(problem.path) from error
     collocation = associated_at_guess(collocation)
     collocation = WarmStart.of(coarse).apply_to_places(collocation)
-    method = with_workers(solver, workers)
+    tolerance = max(solver.tolerance, solver.coarse_start_tolerance)
+    method = with_workers(replace(solver, tolerance=tolerance), workers)
     solution = solve_with_renewed_correspondences(
         method,
         collocation,

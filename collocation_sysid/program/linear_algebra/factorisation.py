@@ -170,6 +170,12 @@ class _RefinedFactor:
         Returns a better factor, which is used if the refinement does not converge.
     positive_definite : bool
         Always true.
+    accuracy : float
+        Relative size of the last correction.
+    last_rates : dict of int to float
+        Rate at which the corrections of the last matrix became smaller, with the key 0; shared by
+        the factors of one analysis and updated in place. Above `ACCURACY` it replaces a first
+        correction, whose only purpose would be to measure that rate.
     divergence_flags : list of bool
         Not empty after the refinement has failed once.
     """
@@ -177,6 +183,8 @@ class _RefinedFactor:
     approximate: Factor
     matrix: sp.csr_array
     factorise_complete: Callable[[], Factor]
+    accuracy: float
+    last_rates: dict[int, float]
     positive_definite: bool = True
     divergence_flags: list[bool] = field(default_factory=list)
 
@@ -193,11 +201,17 @@ class _RefinedFactor:
         )
         size = last = np.abs(solution).max(axis=0, initial=TINY)
         shrinks = 1.0
+        if self.accuracy > ACCURACY:
+            shrinks = self.last_rates.get(0, 1.0)
         # The next correction would be about `shrinks` times the last.
-        while (shrinks * last > ACCURACY * size).any():
-            correction = self.approximate.solve(right - matrix @ solution)
+        while (shrinks * last > self.accuracy * size).any():
+            # In single precision the sizes of small corrections would become zero.
+            correction = np.asarray(
+                self.approximate.solve(right - matrix @ solution), dtype=float
+            )
             length = np.abs(correction).max(axis=0, initial=TINY)
             shrinks = float((length / last).max(initial=0.0))
+            self.last_rates[0] = shrinks
             if not shrinks <= CONTRACTION:
                 self.divergence_flags.append(True)
                 return self.factorise_complete().solve(right, transposed)
@@ -330,6 +344,7 @@ class Factoriser:
         self._entries = pattern.entry_count
         # Memory of factors of double and of single precision that is not in use.
         self._pools: dict[bool, list[Pardiso]] = {False: [], True: []}
+        self._last_rates: dict[int, float] = {}
         if choice == "supernodal":
             self._pools[False].append(self._pardiso(is_single=False))
 
@@ -432,6 +447,7 @@ class Factoriser:
         skew: Array = NONE,
         buffer: FactorMemory | None = None,
         is_single: bool = False,
+        accuracy: float = ACCURACY,
     ) -> Factor:
         """Factorise a matrix on the free dofs.
 
@@ -446,8 +462,10 @@ class Factoriser:
             Other methods ignore it.
         is_single : bool
             Whether the matrix is well conditioned, so that factors of wide bands and supernodal ones
-            may have single precision. Solutions are refined to `ACCURACY`; where that fails, a
-            factor of double precision is computed.
+            may have single precision. Solutions are refined; where that fails, a factor of double
+            precision is computed.
+        accuracy : float
+            Relative accuracy of solutions that are refined; others have that of the arithmetic.
 
         Raises
         ------
@@ -473,6 +491,8 @@ class Factoriser:
                     factorise_complete=cache(
                         partial(self.factorise, values, skew)
                     ),
+                    accuracy=accuracy,
+                    last_rates=self._last_rates,
                 )
         definite = (
             self._factorise_in_skyline(values, NONE, buffer=buffer)
@@ -500,6 +520,8 @@ class Factoriser:
             definite,
             self._complete_matrix(values, skew),
             factorise_complete=complete_factor,
+            accuracy=accuracy,
+            last_rates=self._last_rates,
         )
 
     def _factorise_definite(
@@ -644,6 +666,7 @@ class Factoriser:
         threads: int,
         buffers: Sequence[FactorMemory | None] = (),
         is_single: bool = False,
+        accuracy: float = ACCURACY,
     ) -> list[Factor]:
         """Return the factors of several matrices, in their order, computed in parallel.
 
@@ -659,6 +682,8 @@ class Factoriser:
             Memory for each factor; empty to allocate. It may be longer than `count`.
         is_single : bool
             Whether the matrices are well conditioned, see `factorise`.
+        accuracy : float
+            Relative accuracy of solutions that are refined.
 
         Raises
         ------
@@ -675,6 +700,7 @@ class Factoriser:
                     skew,
                     buffer=buffers[k] if buffers else None,
                     is_single=is_single,
+                    accuracy=accuracy,
                 )
 
         run_in_slices(run, count, threads=threads)
