@@ -30,7 +30,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from ...common.array_types import Array, Index
 from ...fem.kernels import make_skyline, run_in_slices
 from ...fem.pattern import SymmetricPattern
-from .lapack import cholesky_in_place, solve_band_in_blocks
+from .lapack import Band, cholesky_in_place, solve_band_in_blocks
 from .supernodal import Pardiso, SupernodalFactor, load_mkl
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ class _BandFactor:
         Always true.
     """
 
-    band: Array
+    band: Band
     order: Index
     positive_definite: bool = True
 

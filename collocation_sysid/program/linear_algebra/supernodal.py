@@ -103,7 +103,9 @@ class Pardiso:
     ) -> None:
         if load_mkl() is None:
             raise InputError(MISSING)
-        self._dtype = np.dtype(np.float32 if is_single else np.float64)
+        self._dtype: np.dtype[Any] = np.dtype(
+            np.float32 if is_single else np.float64
+        )
         self.size = len(starts) - 1
         self._handle = np.zeros(64, np.int64)
         self._options = np.zeros(64, np.int32)
@@ -134,11 +136,11 @@ class Pardiso:
         self._values = np.ascontiguousarray(values, dtype=self._dtype)
         return self._call(FACTORISE) != NOT_POSITIVE
 
-    def solve(self, right: Array) -> Array:
+    def solve(self, right: Array) -> NDArray[Any]:
         """Return the solution for right-hand sides (n,) or (n, m) by the last factorisation, which
         must have succeeded, in the precision of the factor.
         """
-        columns = np.array(right, dtype=self._dtype, order="F")
+        columns: NDArray[Any] = np.array(right, dtype=self._dtype, order="F")
         result = np.empty_like(columns)
         if columns.size:
             self._call(SOLVE, columns, result=result)
@@ -147,8 +149,8 @@ class Pardiso:
     def _call(
         self,
         phase: int,
-        right: Array | None = None,
-        result: Array | None = None,
+        right: NDArray[Any] | None = None,
+        result: NDArray[Any] | None = None,
     ) -> int:
         """Call one phase of PARDISO and return its error code, 0 or `NOT_POSITIVE`.
 
