@@ -48,7 +48,7 @@ FAILED_STATUSES = (
 # Least decrease of χ² for which the solution from a second start is preferred.
 LEAST_GAIN = 1e-3
 # Least tolerance of a solve on a coarser mesh: below the difference between both meshes.
-COARSE_TOLERANCE = 1e-3
+COARSE_TOLERANCE = 1e-4
 # Most repetitions of a solve whose estimates change the correspondences of the measurements.
 MOST_REREADINGS = 5
 
