@@ -17,7 +17,7 @@ from ..common.array_types import Array
 from ..errors import SimulationError
 from ..program.collocation import Collocation
 from ..program.least_squares import SquareRootInformation
-from ..program.linear_algebra.factorisation import Choice
+from ..program.linear_algebra.factorisation import ACCURACY, Choice
 from ..program.linear_algebra.lapack import one_blas_thread
 from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
@@ -174,7 +174,11 @@ class Horizon:
         return self._run(p, sweep, trajectories, known)
 
     def evaluate_step(
-        self, p: Array, previous: Iterate, step: Array
+        self,
+        p: Array,
+        previous: Iterate,
+        step: Array,
+        accuracy: float = ACCURACY,
     ) -> Iterate:
         """Sweep all experiments after a step of the parameters, and return the new iterate.
 
@@ -189,6 +193,8 @@ class Horizon:
             Iterate before the step.
         step : (np,) array
             Step of the parameters, along which the positions are extrapolated.
+        accuracy : float
+            Relative accuracy of the solution of each time step, see `Sweep.forward`.
 
         Raises
         ------
@@ -202,6 +208,7 @@ class Horizon:
             sweep_after_step,
             previous.trajectories,
             self._by_experiment(step),
+            self._repeat(accuracy),
         )
 
     def reassociate(self, p: Array, iterate: Iterate) -> Iterate:

@@ -16,7 +16,11 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.validated_types import Count, Options, Positive
 from ..errors import SimulationError
-from ..program.linear_algebra.factorisation import Choice
+from ..program.linear_algebra.factorisation import (
+    ACCURACY,
+    Choice,
+    Factoriser,
+)
 from .horizon import Horizon, Iterate
 from .loss_curvature import exact_curvature, secant_update, with_curvature
 from .method_options import FEWEST, SHARES, Shares, samples_in_share
@@ -63,6 +67,10 @@ LEAST_VISIBLE_SHARE = 0.97
 EQUAL_MISFIT_RATIO = 1.01
 # Largest step from which the curvature at the solution is learned.
 LOCAL = 0.1
+# Step above which sweeps of large bodies need less accuracy: Gauss–Newton's error is larger there.
+LARGE_STEP = 1e-2
+# Relative accuracy of the solutions of the time steps in these sweeps.
+ROUGH_ACCURACY = 1e-4
 # Largest number of new associations of the measurements.
 REREADINGS = 40
 
@@ -161,6 +169,9 @@ class ReducedSearch:
         Largest number of measurements that were associated.
     reassociations : int
         Number of new associations so far.
+    refines_solutions : bool
+        Whether sweeps can be done with less accuracy: those of large bodies, whose solutions are
+        refined.
     edge_m, size_m : float
         Mesh edge and body size [m].
 
@@ -194,6 +205,12 @@ class ReducedSearch:
         self.largest_trust = SEEING if self.has_correspondences else WIDEST
         self.trust = min(options.trust, self.largest_trust)
         self.indefinite_steps = 0
+        self.refines_solutions = not all(
+            Factoriser.cached(
+                segment.pattern, segment.free_dofs, choice=options.factorisation
+            ).skyline
+            for segment in collocation.transcriptions
+        )
         self.lower, self.upper = collocation.parameter_bounds
         self.reassociations = 0
         self.most_measurements = 0
@@ -371,11 +388,13 @@ class ReducedSearch:
         rejections = 0
         curvature = np.zeros((len(point.p), len(point.p)))
         previous = np.inf
+        # Points of little accuracy are not the result.
+        is_rough = False
         while True:
             step = self._next_step(point, curvature)
             length = self._step_length(step)
             # A step that the trust region shortens contains no information on the remaining distance.
-            is_full_step = length < 0.99 * self.trust
+            is_full_step = length < 0.99 * self.trust and not is_rough
             is_short = is_full_step and length <= tolerance
             if is_short and point.feasibility_m <= FEASIBLE * self.size_m:
                 return Status.CONVERGED
@@ -417,6 +436,7 @@ class ReducedSearch:
                 point = self._accept(horizon, trial)
                 rejections = 0
                 previous = length
+                is_rough = self._accuracy_after(length) > ACCURACY
                 continue
             if (
                 is_short
@@ -481,11 +501,21 @@ class ReducedSearch:
         """
         self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
+        accuracy = self._accuracy_after(self._step_length(step))
         try:
-            trial = horizon.evaluate_step(p, point, step=step)
+            trial = horizon.evaluate_step(
+                p, point, step=step, accuracy=accuracy
+            )
         except SimulationError:
             return None
         return trial if trial.is_finite else None
+
+    def _accuracy_after(self, length: float) -> float:
+        """Return the relative accuracy of the time steps' solutions in the sweep after a step of
+        the parameters of a given length, see `_step_length`.
+        """
+        is_rough = self.refines_solutions and length > LARGE_STEP
+        return ROUGH_ACCURACY if is_rough else ACCURACY
 
     def _judge(self, point: Iterate, step: Array, trial: Iterate) -> bool:
         """Return whether a trial is accepted.

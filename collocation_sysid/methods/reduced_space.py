@@ -30,7 +30,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ..common.array_types import Array
-from ..common.validated_types import AtLeastOne
+from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from ..fem.kernels import concurrent_count
 from ..program.collocation import Collocation
@@ -57,16 +57,20 @@ class ReducedSpace(SearchOptions):
     ----------
     coarse_start : {"auto", false}
         "auto": solve a problem with a large body on a coarser mesh first, and start from there,
-        unless a start is given. The result satisfies the same criterion of convergence on the given
-        mesh.
+        unless a start is given. The result on the given mesh is that of a direct start, to within
+        `coarse_start_tolerance`.
     coarse_start_nodes : int
         Number of nodes above which a body is large.
+    coarse_start_tolerance : float
+        Tolerance of the search on the given mesh after a coarse start, if it is larger than
+        `tolerance`. The default is far below the error of any mesh, and saves a sweep or two.
     """
 
     name: ClassVar[str] = "reduced-space"
 
     coarse_start: Literal["auto", False] = "auto"
     coarse_start_nodes: AtLeastOne = 1500
+    coarse_start_tolerance: Positive = 1e-6
 
     @one_blas_thread()
     def __call__(

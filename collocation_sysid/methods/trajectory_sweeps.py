@@ -19,6 +19,7 @@ from ..program.forward.loss_of_stability import explain_failure
 from ..program.forward.newton_solver import NewtonOptions
 from ..program.forward.scheme_simulation import continue_simulation
 from ..program.least_squares import SquareRootInformation
+from ..program.linear_algebra.factorisation import ACCURACY
 from ..program.measurement_residual import huber_as_least_squares
 from ..program.observable_response import ObservableResponse
 from ..program.sweep import Sweep, SweepResult
@@ -178,6 +179,7 @@ def sweep(
     trajectory: LinearisedTrajectory | SimulationResult | Array,
     known_sweep: LinearisedTrajectory | None = None,
     previous: LinearisedTrajectory | None = None,
+    accuracy: float = ACCURACY,
 ) -> LinearisedTrajectory:
     """Return the result of one sweep at parameters p and given positions: the feasibility step, the
     sensitivities, and the measurement residuals linearised after that step.
@@ -198,6 +200,8 @@ def sweep(
         Sweep of the first rows at the same p and positions, which is continued.
     previous : LinearisedTrajectory, optional
         Previous trajectory, from which changes are measured; without one they are zero.
+    accuracy : float
+        Relative accuracy of the solution of each time step, see `Sweep.forward`.
 
     Raises
     ------
@@ -210,7 +214,9 @@ def sweep(
         raise SimulationError(massless, float(dynamics.t_s[0]))
     return _linearised_trajectory(
         part,
-        solver.forward(part.x, part.equations, known=known_sweep),
+        solver.forward(
+            part.x, part.equations, known=known_sweep, accuracy=accuracy
+        ),
         previous=previous,
         times_s=solver.stopwatch.read_and_reset(),
     )
@@ -222,6 +228,7 @@ def sweep_after_step(
     p: Array,
     previous: LinearisedTrajectory,
     step: Array,
+    accuracy: float = ACCURACY,
 ) -> LinearisedTrajectory:
     """Return the result of one sweep after a step of the parameters to p.
 
@@ -242,6 +249,8 @@ def sweep_after_step(
         Trajectory before the step.
     step : (k,) array
         Step of the parameters.
+    accuracy : float
+        Relative accuracy of the solution of each time step, see `Sweep.forward`.
 
     Raises
     ------
@@ -256,7 +265,12 @@ def sweep_after_step(
     def sweep_at(x: Array) -> LinearisedTrajectory:
         """Return the sweep at positions x (rows, 3n) [m]."""
         return sweep(
-            solver, transcription, p=p, trajectory=x, previous=previous
+            solver,
+            transcription,
+            p=p,
+            trajectory=x,
+            previous=previous,
+            accuracy=accuracy,
         )
 
     def equilibria(options: NewtonOptions) -> Array | None:

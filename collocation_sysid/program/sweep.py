@@ -39,7 +39,7 @@ from ..model.force_internal_variables import ForceForwardColumns
 from ..model.internal_variables import AnyHistory
 from ..model.viscoelasticity import MemoryForwardColumns
 from .linear_algebra.block_band import Submatrix
-from .linear_algebra.factorisation import Choice, Factor, Factoriser
+from .linear_algebra.factorisation import ACCURACY, Choice, Factor, Factoriser
 from .linear_algebra.lapack import one_blas_thread
 from .reaction_forces import GraspForces
 from .stopwatch import Stopwatch
@@ -407,6 +407,7 @@ class Sweep:
         x: Array,
         equations: EquationsAtParameters,
         known: SweepResult | None = None,
+        accuracy: float = ACCURACY,
     ) -> SweepResult:
         """Compute the feasibility step p and the sensitivities Z at all grid times of this sweep.
 
@@ -419,6 +420,9 @@ class Sweep:
         known : SweepResult, optional
             Result for the first rows at the same positions and parameters; it is continued, not
             modified.
+        accuracy : float
+            Relative accuracy of the solution of each time step where it is refined, as for large
+            bodies; others have that of the arithmetic.
 
         Raises
         ------
@@ -435,6 +439,7 @@ class Sweep:
             sweep_columns,
             last=known.last if known else None,
             grasp_forces=grasp_forces,
+            accuracy=accuracy,
         )
         if known is not None:
             done = len(known.step)
@@ -611,7 +616,17 @@ class Sweep:
             if self.body.is_unsymmetric
             else solver.factor_size
         )
-        return 8 * (self.body.linearisation_width + values)
+        bytes_each = 4 if self.has_single_precision else 8
+        return 8 * self.body.linearisation_width + bytes_each * values
+
+    @property
+    def has_single_precision(self) -> bool:
+        """Whether factors have single precision and solutions are refined: those of large bodies in
+        motion, whose masses make the matrices well conditioned.
+        """
+        return (
+            not self.dynamics.is_static and self.factoriser.has_single_precision
+        )
 
     def dynamics_at(self, equations: EquationsAtParameters) -> Dynamics:
         """Return the discrete equations of motion of `equations`, truncated to the grid times of
@@ -626,6 +641,7 @@ class Sweep:
         backward: bool = False,
         first: int = 0,
         histories: Sequence[AnyHistory] = (),
+        accuracy: float = ACCURACY,
     ) -> Iterator[LinearisedChunk]:
         """Iterate over the linearised and factorised time steps, a few at a time, using threads.
 
@@ -644,6 +660,8 @@ class Sweep:
             Index of the grid time to begin with; rows without an equation are skipped.
         histories : sequence of histories
             History variables at x; empty if there are none.
+        accuracy : float
+            Relative accuracy of solutions that are refined.
 
         Raises
         ------
@@ -676,7 +694,12 @@ class Sweep:
                     for t in range(start, here.stop)
                 ]
                 factors = self._factorise(
-                    dynamics, at, grid_times=here, rows=rows, buffers=buffers
+                    dynamics,
+                    at,
+                    grid_times=here,
+                    rows=rows,
+                    buffers=buffers,
+                    accuracy=accuracy,
                 )
             steps = map(
                 FactorisedStep,
@@ -698,6 +721,7 @@ class Sweep:
         grid_times: slice,
         rows: list[StencilRow],
         buffers: Sequence[FactorMemory | None] = (),
+        accuracy: float = ACCURACY,
     ) -> list[Factor]:
         """Return the factors of −∂c_t/∂x_t of some rows, computed on several threads.
 
@@ -716,6 +740,8 @@ class Sweep:
             Coefficients of each row.
         buffers : sequence of FactorMemory or None
             Memory that the factors reuse, see `Factoriser.factorise_each`.
+        accuracy : float
+            Relative accuracy of solutions that are refined.
 
         Raises
         ------
@@ -751,7 +777,12 @@ class Sweep:
             count = len(linearisation.force)
             threads = self.body.threads
             return self.factoriser.factorise_each(
-                matrix, count, threads=threads, buffers=buffers
+                matrix,
+                count,
+                threads=threads,
+                buffers=buffers,
+                is_single=self.has_single_precision,
+                accuracy=accuracy,
             )
         except np.linalg.LinAlgError as error:
             raise SimulationError(
@@ -781,6 +812,8 @@ class ForwardSubstitution:
         State after earlier rows; by default there are none.
     grasp_forces : GraspForces, optional
         Filled in place with the forces on instrumented grasps; ignored if there are none.
+    accuracy : float
+        Relative accuracy of the solution of each row where it is refined.
     """
 
     def __init__(
@@ -789,8 +822,10 @@ class ForwardSubstitution:
         columns: SweepColumns,
         last: ForwardState | None = None,
         grasp_forces: GraspForces | None = None,
+        accuracy: float = ACCURACY,
     ) -> None:
         self.solver = solver
+        self.accuracy = accuracy
         self.columns = columns
         self.grasp_forces = grasp_forces if len(solver.sensed) else None
         self.violation_n = 0.0
@@ -871,7 +906,13 @@ class ForwardSubstitution:
                 columns.prescribed.write_into(t, start)
             self.past.appendleft(start)
             yield np.zeros(self.shape)
-        for chunk in solver.chunks(x, setting, first=done, histories=histories):
+        for chunk in solver.chunks(
+            x,
+            setting,
+            first=done,
+            histories=histories,
+            accuracy=self.accuracy,
+        ):
             residual = None
             if columns.has_step:
                 residual = np.stack(

@@ -284,7 +284,8 @@ def _solve_from_coarse(
         raise error.located(problem.path) from error
     collocation = associated_at_guess(collocation)
     collocation = WarmStart.of(coarse).apply_to_places(collocation)
-    method = with_workers(solver, workers)
+    tolerance = max(solver.tolerance, solver.coarse_start_tolerance)
+    method = with_workers(replace(solver, tolerance=tolerance), workers)
     solution = solve_with_renewed_correspondences(
         method,
         collocation,

@@ -283,10 +283,10 @@ def test_few_starts_far_away_all_succeed():
 
 
 def test_no_progress_is_a_status(monkeypatch: pytest.MonkeyPatch):
-    def first_only(self: Horizon, q, before, step):
+    def first_only(self: Horizon, q, before, step, **options):
         if not np.array_equal(q, GUESS.guess_q):
             raise SimulationError("it fails", 0.0)
-        return tried(self, q, before, step)
+        return tried(self, q, before, step, **options)
 
     tried = Horizon.evaluate_step
     monkeypatch.setattr(Horizon, "evaluate_step", first_only)

@@ -300,3 +300,71 @@ def test_numbers_that_are_not_finite_are_refused(
         Factoriser(pattern, without_first_nodes(pattern), choice).factorise(
             values
         )
+
+
+WIDE_CHOICES = ["band"] + ["supernodal"] * (load_mkl() is not None)
+
+
+@pytest.mark.parametrize("choice", WIDE_CHOICES)
+@pytest.mark.parametrize("columns", [None, 1, 5])
+@pytest.mark.parametrize("transposed", [False, True])
+@pytest.mark.parametrize("skewness", [0.0, 0.1])
+def test_factors_in_single_precision_solve_as_accurately(
+    choice, columns: int | None, transposed: bool, skewness: float
+):
+    free = without_first_nodes(WIDE)
+    values = random_values(WIDE, 100.0)
+    skew = skewness * random_values(WIDE, 0.0, seed=3)
+    skew[WIDE.diagonal] = 0
+    matrix = full_matrix(WIDE, values, skew).toarray()[np.ix_(free, free)]
+    shape = (len(free),) if columns is None else (len(free), columns)
+    right = np.random.default_rng(1).normal(size=shape)
+    accurate = np.linalg.solve(matrix.T if transposed else matrix, right)
+    factoriser = Factoriser(WIDE, free, choice)
+    assert factoriser.has_single_precision
+    errors = []
+    for accuracy in (1e-10, 1e-2):
+        factor = factoriser.factorise(
+            values, skew, is_single=True, accuracy=accuracy
+        )
+        assert factor.positive_definite
+        solved = factor.solve(right, transposed)
+        assert solved.dtype == np.float64
+        assert solved.shape == right.shape
+        errors.append(np.abs(solved - accurate).max() / np.abs(accurate).max())
+    assert errors[0] < 1e-9
+    # The rate of the refinement is known from the first factor.
+    assert errors[0] < errors[1] < 1e-2
+
+
+@pytest.mark.parametrize("choice", WIDE_CHOICES)
+@pytest.mark.parametrize("least", [1e-9, -1e-9])
+def test_matrices_beyond_single_precision_are_factorised_in_double(
+    choice, least: float
+):
+    """One eigenvalue is below the rounding of single precision."""
+    free = np.arange(WIDE.size)
+    vectors = np.linalg.qr(
+        np.random.default_rng(0).normal(size=(WIDE.size, WIDE.size))
+    )[0]
+    eigenvalues = np.linspace(1.0, 2.0, WIDE.size)
+    eigenvalues[0] = least
+    matrix = (vectors * eigenvalues) @ vectors.T
+    values = matrix[WIDE.rows, WIDE.columns]
+    factor = Factoriser(WIDE, free, choice).factorise(values, is_single=True)
+    solution = np.random.default_rng(1).normal(size=WIDE.size)
+    np.testing.assert_allclose(
+        factor.solve(matrix @ solution), solution, atol=1e-4
+    )
+
+
+def test_narrow_bands_keep_double_precision():
+    free = without_first_nodes(BAR.pattern)
+    factoriser = Factoriser(BAR.pattern, free, "band")
+    assert not factoriser.has_single_precision
+    values = random_values(BAR.pattern, 100.0)
+    right = np.ones(len(free))
+    np.testing.assert_array_equal(
+        factoriser.factorise(values, is_single=True).solve(right),
+        factoriser.factorise(values).solve(right),
+    )

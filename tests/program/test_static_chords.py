@@ -163,7 +163,7 @@ def test_a_sweep_along_unstable_equilibria_searches_stable_ones(monkeypatch):
         sought.append(options.checks_stability)
         return np.full((1, 3), float(len(sought))), None
 
-    def sweep(solver, transcription, p, trajectory, previous):
+    def sweep(solver, transcription, p, trajectory, previous, **options):
         swept.append(float(trajectory[0, 0]))
         unstable = int(len(swept) == 1)
         return SimpleNamespace(

@@ -28,6 +28,7 @@ from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program import sweep
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
+from collocation_sysid.program.linear_algebra import factorisation
 from collocation_sysid.program.stopwatch import Stopwatch
 from collocation_sysid.program.sweep import Sweep, SweepResult
 
@@ -257,3 +258,33 @@ def test_time_is_accounted_for():
     solver.forward(x, only_setting(collocation))
     assert stopwatch.evaluations > 0
     assert stopwatch.linear_algebra > 0
+
+
+@pytest.mark.parametrize("has_papers_damping", [True, False])
+def test_sweeps_in_single_precision_are_as_accurate(
+    monkeypatch, has_papers_damping: bool
+):
+    """As for bodies with wide bands; with Kelvin–Voigt damping matrices have a skew part."""
+    experiment = hung_cube(6)
+    if has_papers_damping:
+        experiment = with_papers_damping(experiment)
+    assert experiment.body.is_unsymmetric != has_papers_damping
+    collocation = Collocation([measured(experiment)], GUESS)
+    (segment,) = collocation.transcriptions
+    z, (x,) = disturbed(collocation)
+    part = collocation.iterates(z)[0]
+    expected = Sweep(segment).forward(x, part.equations)
+    monkeypatch.setattr(factorisation, "NARROW", 0)
+    factorisation._cached_analysis.cache_clear()
+    solver = Sweep(segment, factorisation="band")
+    assert solver.has_single_precision
+    for accuracy, tolerance in ((1e-10, 1e-8), (1e-4, 1e-3)):
+        result = solver.forward(x, part.equations, accuracy=accuracy)
+        for name in ("step", "by_p"):
+            values = getattr(expected, name)
+            np.testing.assert_allclose(
+                getattr(result, name),
+                values,
+                atol=tolerance * np.abs(values).max(),
+            )
+    factorisation._cached_analysis.cache_clear()

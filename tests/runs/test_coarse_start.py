@@ -93,6 +93,22 @@ def test_the_answer_is_that_of_the_direct_start(has_nuisance: bool):
     assert coarse.iterations == max(line.number for line in coarse.history)
 
 
+def test_the_search_on_the_given_mesh_has_a_tolerance_of_its_own():
+    problem = problem_of(noisy(hung_cube(10, divisions=DIVISIONS)))
+    direct = solve(problem, DIRECT)
+    errors = []
+    sweeps = []
+    for tolerance in (1e-2, 1e-10):
+        solution = solve(
+            problem, replace(COARSE, coarse_start_tolerance=tolerance)
+        )
+        assert solution.status is Status.CONVERGED
+        errors.append(np.abs(solution.q - direct.q).max())
+        sweeps.append(solution.iterations)
+    assert errors[1] < 1e-7 < errors[0] < 1e-2
+    assert sweeps[0] < sweeps[1]
+
+
 def test_iterations_are_named_as_those_of_the_coarse_start():
     problem = problem_of(noisy(hung_cube(10, divisions=DIVISIONS)))
     events: list[str] = []
@@ -159,6 +175,8 @@ def test_other_values_of_the_option_are_refused(value):
         match=f"coarse_start: found {value!r}; expected 'auto' or false",
     ):
         ReducedSpace(coarse_start=value)
+    with pytest.raises(InputError, match="coarse_start_tolerance: found 0"):
+        ReducedSpace(coarse_start_tolerance=0)
     with pytest.raises(InputError, match="coarse_start_nodes: found 0"):
         ReducedSpace(coarse_start_nodes=0)
 

@@ -589,7 +589,8 @@ class NewtonSolver:
         x : (3n,) array
             State, for the failure.
         keep_definite : bool
-            Whether a matrix that is not positive definite is a failure.
+            Whether a matrix that is not positive definite is a failure; its factor is then
+            computed in double precision.
 
         Raises
         ------
@@ -598,7 +599,9 @@ class NewtonSolver:
         """
         try:
             with self.stopwatch.solving():
-                factor = self.factoriser.factorise(at.symmetric, at.skew)
+                factor = self.factoriser.factorise(
+                    at.symmetric, at.skew, is_single=not keep_definite
+                )
         except np.linalg.LinAlgError as error:
             raise NewtonFailure(
                 x, f"the equations are singular: {error}"

@@ -8,13 +8,17 @@ band. A matrix with a skew part (see `block_band`) needs no row exchanges either
 part is positive definite and the skew part is small compared with it: within a skyline it is
 factorised directly, otherwise by its symmetric part and iterative refinement. SuperLU takes the
 rest.
+
+Wide bands and supernodal factors take half the time and memory in single precision. Iterative
+refinement with the matrix in double precision then gives solutions of the same accuracy, if the
+matrix is well conditioned, as the masses make it in time steps of motions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -26,7 +30,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from ...common.array_types import Array, Index
 from ...fem.kernels import make_skyline, run_in_slices
 from ...fem.pattern import SymmetricPattern
-from .lapack import cholesky_in_place, solve_band_in_blocks
+from .lapack import Band, cholesky_in_place, solve_band_in_blocks
 from .supernodal import Pardiso, SupernodalFactor, load_mkl
 
 if TYPE_CHECKING:
@@ -39,8 +43,8 @@ Choice = Literal["auto", "band", "sparse", "supernodal"]
 BAND_SPEED = 10.0
 # Work of a band below which it is always used.
 LITTLE_WORK = 1e8
-# Work of a band from which on supernodal sweeps are faster: some 3,000 nodes of a stout body.
-MUCH_WORK = 2e9
+# Work of a band from which on supernodal sweeps are faster: some 1,000 nodes of a stout body.
+MUCH_WORK = 3e8
 
 # Half bandwidth up to which the skyline is faster than LAPACK (measured: 17 GFlop/s at 200,
 # LAPACK's Cholesky 21 at 300).
@@ -49,7 +53,7 @@ NARROW = 250
 MANY_COLUMNS = 4
 # Largest growth of a diagonal entry without row exchanges; definite matrices have none.
 GROWTH = 10.0
-# Relative size of the last correction by the skew part, far below the accuracy of a Newton or
+# Relative size of the last correction of a refined solution, far below the accuracy of a Newton or
 # Gauss–Newton step.
 ACCURACY = 1e-10
 # Factor by which each correction must be smaller; otherwise another factorisation is cheaper.
@@ -57,7 +61,6 @@ CONTRACTION = 0.2
 # Smallest size of a correction, against division by zero.
 TINY = 1e-300
 
-(_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)
 # Skew part of a symmetric matrix.
 NONE = np.zeros(0)
 
@@ -88,27 +91,28 @@ class _BandFactor:
     Attributes
     ----------
     band : (half-bandwidth + 1, k) array
-        Lower band of the factor.
+        Lower band of the factor, in double or single precision.
     order : (k,) array
         Free dof of each row of the band.
     positive_definite : bool
         Always true.
     """
 
-    band: Array
+    band: Band
     order: Index
     positive_definite: bool = True
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs; `transposed`
-        has no effect on a symmetric matrix.
+        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, in the
+        precision of the factor; `transposed` has no effect on a symmetric matrix.
         """
-        permuted = right[self.order]
+        permuted = right[self.order].astype(self.band.dtype)
         if right.ndim > 1 and right.shape[1] >= MANY_COLUMNS:
             solved = solve_band_in_blocks(self.band, permuted)
         else:
-            solved, _ = _pbtrs(self.band, permuted, lower=1)
-        result = np.empty_like(right)
+            (pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=self.band.dtype)
+            solved, _ = pbtrs(self.band, permuted, lower=1)
+        result = np.empty(right.shape, self.band.dtype)
         result[self.order] = solved.reshape(right.shape)
         return result
 
@@ -153,52 +157,88 @@ class _SkylineFactor:
 
 @dataclass(frozen=True, eq=False)
 class _RefinedFactor:
-    """Inverse of S + K with symmetric S and skew K as the series Σ_k (−S⁻¹K)^k S⁻¹.
+    """Iterative refinement of the solutions of an approximate factor: that of the symmetric part,
+    or of rounded numbers, or both.
 
     Attributes
     ----------
-    symmetric : Factor
-        Factor of S.
-    skew : sparse array
-        K.
+    approximate : Factor
+        Factor of a matrix near `matrix`; symmetric.
+    matrix : (k, k) sparse array
+        The matrix.
     factorise_complete : callable
-        Returns the factor of S + K, which is used if the series does not converge.
+        Returns a better factor, which is used if the refinement does not converge.
     positive_definite : bool
         Always true.
+    accuracy : float
+        Relative size of the last correction.
+    last_rates : dict of int to float
+        Rate at which the corrections of the last matrix became smaller, with the key 0; shared by
+        the factors of one analysis and updated in place. Above `ACCURACY` it replaces a first
+        correction, whose only purpose would be to measure that rate.
     divergence_flags : list of bool
-        Not empty after the series has failed once.
+        Not empty after the refinement has failed once.
     """
 
-    symmetric: Factor
-    skew: sp.csc_array
+    approximate: Factor
+    matrix: sp.csr_array
     factorise_complete: Callable[[], Factor]
+    accuracy: float
+    last_rates: dict[int, float]
     positive_definite: bool = True
     divergence_flags: list[bool] = field(default_factory=list)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, of the
-        transposed matrix if `transposed`. If the series diverges, the complete matrix is
-        factorised, also for later calls.
+        transposed matrix if `transposed`. If the corrections do not shrink, the better factor is
+        computed, also for later calls.
         """
         if self.divergence_flags:
             return self.factorise_complete().solve(right, transposed)
-        solution = correction = self.symmetric.solve(right)
+        matrix = self.matrix.T if transposed else self.matrix
+        solution = np.ascontiguousarray(
+            self.approximate.solve(right), dtype=float
+        )
         size = last = np.abs(solution).max(axis=0, initial=TINY)
         shrinks = 1.0
+        if self.accuracy > ACCURACY:
+            shrinks = self.last_rates.get(0, 1.0)
         # The next correction would be about `shrinks` times the last.
-        while (shrinks * last > ACCURACY * size).any():
-            product = self.skew @ correction
-            correction = self.symmetric.solve(
-                product if transposed else -product
+        while (shrinks * last > self.accuracy * size).any():
+            # In single precision the sizes of small corrections would become zero.
+            correction = np.asarray(
+                self.approximate.solve(right - matrix @ solution), dtype=float
             )
             length = np.abs(correction).max(axis=0, initial=TINY)
             shrinks = float((length / last).max(initial=0.0))
+            self.last_rates[0] = shrinks
             if not shrinks <= CONTRACTION:
                 self.divergence_flags.append(True)
                 return self.factorise_complete().solve(right, transposed)
-            solution = solution + correction
+            solution += correction
             last = length
         return solution
+
+
+class _CompleteRows(NamedTuple):
+    """Structure of both triangles of a matrix in compressed rows.
+
+    Attributes
+    ----------
+    row_starts : (k + 1,) array
+        Index of the first entry of each row, and the number of entries.
+    columns : (e,) array
+        Column of each entry, ascending in each row.
+    lower_positions : (e,) array
+        Position of the value of each entry among those of the lower triangle.
+    skew_signs : (e,) array
+        Sign of the value of each entry of a skew matrix, relative to that of the lower triangle.
+    """
+
+    row_starts: Index
+    columns: Index
+    lower_positions: Index
+    skew_signs: Array
 
 
 class _UpperTriangle(NamedTuple):
@@ -302,9 +342,11 @@ class Factoriser:
             [strict.astype(float), -np.ones(strict.sum())]
         )
         self._entries = pattern.entry_count
-        self._pool: list[Pardiso] = []
+        # Memory of factors of double and of single precision that is not in use.
+        self._pools: dict[bool, list[Pardiso]] = {False: [], True: []}
+        self._last_rates: dict[int, float] = {}
         if choice == "supernodal":
-            self._pool.append(self._pardiso())
+            self._pools[False].append(self._pardiso(is_single=False))
 
     @classmethod
     def cached(
@@ -368,6 +410,13 @@ class Factoriser:
         """
         return (2 if self.skyline else 1) * self.factor_size
 
+    @property
+    def has_single_precision(self) -> bool:
+        """Whether factors of well-conditioned matrices have single precision: those of wide bands
+        and supernodal ones.
+        """
+        return self.is_supernodal or (self.is_banded and not self.skyline)
+
     @cached_property
     def skyline(self) -> SkylineFactorisation | None:
         """Skyline factorisation for bands up to `NARROW` wide; None for wider ones, other methods,
@@ -397,6 +446,8 @@ class Factoriser:
         values: Array,
         skew: Array = NONE,
         buffer: FactorMemory | None = None,
+        is_single: bool = False,
+        accuracy: float = ACCURACY,
     ) -> Factor:
         """Factorise a matrix on the free dofs.
 
@@ -409,6 +460,12 @@ class Factoriser:
         buffer : FactorMemory, optional
             Memory for a factor within the skyline; the factor is valid until it is used again.
             Other methods ignore it.
+        is_single : bool
+            Whether the matrix is well conditioned, so that factors of wide bands and supernodal ones
+            may have single precision. Solutions are refined; where that fails, a factor of double
+            precision is computed.
+        accuracy : float
+            Relative accuracy of solutions that are refined; others have that of the arithmetic.
 
         Raises
         ------
@@ -425,6 +482,18 @@ class Factoriser:
             raise np.linalg.LinAlgError(
                 "the matrix has entries that are not finite"
             )
+        if is_single and self.has_single_precision:
+            rounded = self._factorise_definite(values, is_single=True)
+            if rounded is not None:
+                return _RefinedFactor(
+                    rounded,
+                    self._complete_matrix(values, skew),
+                    factorise_complete=cache(
+                        partial(self.factorise, values, skew)
+                    ),
+                    accuracy=accuracy,
+                    last_rates=self._last_rates,
+                )
         definite = (
             self._factorise_in_skyline(values, NONE, buffer=buffer)
             if skew.size
@@ -447,26 +516,31 @@ class Factoriser:
                 self._superlu(values, pivot_below=1.0, skew=skew), True
             )
 
-        entries = self._signs * skew[self._full_source]
         return _RefinedFactor(
             definite,
-            self._sparse_matrix(entries),
+            self._complete_matrix(values, skew),
             factorise_complete=complete_factor,
+            accuracy=accuracy,
+            last_rates=self._last_rates,
         )
 
-    def _factorise_definite(self, values: Array) -> Factor | None:
+    def _factorise_definite(
+        self, values: Array, is_single: bool = False
+    ) -> Factor | None:
         """Return the factor of a symmetric matrix (entries of the lower triangle), or None if it is
         not positive definite, or the skyline is used, which `_factorise_in_skyline` has tried
-        already.
+        already. With `is_single`, values, factor and solutions are rounded to single precision,
+        except by SuperLU.
         """
         if self.is_supernodal:
+            pool = self._pools[is_single]
             try:
-                pardiso = self._pool.pop()
+                pardiso = pool.pop()
             except (
                 IndexError
             ):  # not asked for beforehand: other threads take from it too
-                pardiso = self._pardiso()
-            factor = SupernodalFactor(pardiso, self._pool)
+                pardiso = self._pardiso(is_single)
+            factor = SupernodalFactor(pardiso, pool)
             upper_values = values[self._upper.lower_positions]
             return factor if pardiso.factorise(upper_values) else None
         if not self.is_banded:
@@ -478,25 +552,60 @@ class Factoriser:
             )
         if self.skyline:
             return None
-        band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
+        band = np.zeros(
+            (self.half_bandwidth + 1, self._size),
+            dtype=np.float32 if is_single else np.float64,
+            order="F",
+        )
         band.T.reshape(-1)[self._band_places] = values[self._free_entries]
         return (
             _BandFactor(band, self._order) if cholesky_in_place(band) else None
         )
 
-    def _pardiso(self) -> Pardiso:
-        """Return a new PARDISO solver for the pattern."""
-        return Pardiso(self._upper.row_starts, self._upper.columns)
+    def _pardiso(self, is_single: bool) -> Pardiso:
+        """Return a new PARDISO solver for the pattern, of single or double precision."""
+        return Pardiso(
+            self._upper.row_starts, self._upper.columns, is_single=is_single
+        )
 
     @cached_property
     def _supernodal_size(self) -> int:
         """Number of floating-point numbers in a supernodal factor.
 
-        If the pool is empty, the matrix is analysed, and the solver is added to the pool.
+        If the pool of single precision, which sweeps use, is empty, the matrix is analysed, and the
+        solver is added to the pool.
         """
-        if not self._pool:
-            self._pool.append(self._pardiso())
-        return self._pool[-1].factor_size
+        pool = self._pools[True]
+        if not pool:
+            pool.append(self._pardiso(is_single=True))
+        return pool[-1].factor_size
+
+    @cached_property
+    def _rows(self) -> _CompleteRows:
+        """Both triangles of the matrix on the free dofs, row by row."""
+        order = np.lexsort((self._full_columns, self._full_rows))
+        starts = np.searchsorted(
+            self._full_rows[order], np.arange(self._size + 1)
+        )
+        return _CompleteRows(
+            starts,
+            self._full_columns[order],
+            lower_positions=self._full_source[order],
+            skew_signs=self._signs[order],
+        )
+
+    def _complete_matrix(self, values: Array, skew: Array) -> sp.csr_array:
+        """Return the matrix (k, k) of lower triangles `values` (m,) of the symmetric and `skew` (m,)
+        or (0,) of the skew part.
+        """
+        rows = self._rows
+        entries = values[rows.lower_positions]
+        if skew.size:
+            entries += rows.skew_signs * skew[rows.lower_positions]
+        return sp.csr_array(
+            (entries, rows.columns, rows.row_starts),
+            shape=(self._size, self._size),
+        )
 
     @cached_property
     def _upper(self) -> _UpperTriangle:
@@ -556,6 +665,8 @@ class Factoriser:
         count: int,
         threads: int,
         buffers: Sequence[FactorMemory | None] = (),
+        is_single: bool = False,
+        accuracy: float = ACCURACY,
     ) -> list[Factor]:
         """Return the factors of several matrices, in their order, computed in parallel.
 
@@ -569,6 +680,10 @@ class Factoriser:
             Number of threads.
         buffers : sequence of FactorMemory or None
             Memory for each factor; empty to allocate. It may be longer than `count`.
+        is_single : bool
+            Whether the matrices are well conditioned, see `factorise`.
+        accuracy : float
+            Relative accuracy of solutions that are refined.
 
         Raises
         ------
@@ -579,8 +694,13 @@ class Factoriser:
 
         def run(start: int, stop: int) -> None:
             for k in range(start, stop):
+                values, skew = matrix(k)
                 factors[k] = self.factorise(
-                    *matrix(k), buffers[k] if buffers else None
+                    values,
+                    skew,
+                    buffer=buffers[k] if buffers else None,
+                    is_single=is_single,
+                    accuracy=accuracy,
                 )
 
         run_in_slices(run, count, threads=threads)

@@ -20,6 +20,9 @@ from scipy import LowLevelCallable
 from scipy.linalg import get_blas_funcs
 from threadpoolctl import ThreadpoolController
 
+# Matrix of double or single precision.
+Band = NDArray[Any]
+
 
 def _routine(name: str, arguments: int) -> Any:
     """Return a LAPACK routine of SciPy's Cython interface as a ctypes function of `arguments`
@@ -36,7 +39,11 @@ def _routine(name: str, arguments: int) -> Any:
     return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * arguments)(address)
 
 
-_DPBTRF = _routine("dpbtrf", 6)
+# Banded Cholesky factorisation by the type of the numbers.
+_PBTRF = {
+    np.dtype(np.float64): _routine("dpbtrf", 6),
+    np.dtype(np.float32): _routine("spbtrf", 6),
+}
 
 
 @cache
@@ -54,8 +61,9 @@ def one_blas_thread() -> Iterator[None]:
         yield
 
 
-def cholesky_in_place(band: NDArray[np.float64]) -> bool:
-    """Factorise a symmetric band matrix in place and return whether it is positive definite.
+def cholesky_in_place(band: Band) -> bool:
+    """Factorise a symmetric band matrix of double or single precision in place, and return whether
+    it is positive definite.
 
     Parameters
     ----------
@@ -69,7 +77,7 @@ def cholesky_in_place(band: NDArray[np.float64]) -> bool:
     width = ctypes.c_int(rows - 1)
     leading = ctypes.c_int(rows)
     failed_at = ctypes.c_int(0)
-    _DPBTRF(
+    _PBTRF[band.dtype](
         ctypes.addressof(lower),
         ctypes.addressof(size),
         ctypes.addressof(width),
@@ -84,13 +92,9 @@ def cholesky_in_place(band: NDArray[np.float64]) -> bool:
 # calls.
 BLOCK_ROWS = 64
 
-(_trsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
 
-
-def solve_band_in_blocks(
-    band: NDArray[np.float64], right: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the solution of L Lᵀ x = b for many right-hand sides b.
+def solve_band_in_blocks(band: Band, right: Band) -> Band:
+    """Return the solution of L Lᵀ x = b for many right-hand sides b, all in the same precision.
 
     LAPACK's pbtrs reads the complete factor for every column; products of blocks read it once.
 
@@ -111,10 +115,11 @@ def solve_band_in_blocks(
         band, (size, size), (stride, reach * stride), writeable=False
     )
     solution = np.array(right, order="C")
+    (trsm,) = get_blas_funcs(("trsm",), dtype=band.dtype)
     starts = range(0, size, step)
     for start in starts:
         stop = min(start + step, size)
-        solution[start:stop] = _trsm(
+        solution[start:stop] = trsm(
             1.0, factor[start:stop, start:stop], solution[start:stop], lower=1
         )
         for rows, block in _blocks_below(factor, start, stop=stop, reach=reach):
@@ -123,7 +128,7 @@ def solve_band_in_blocks(
         stop = min(start + step, size)
         for rows, block in _blocks_below(factor, start, stop=stop, reach=reach):
             solution[start:stop] -= block.T @ solution[rows]
-        solution[start:stop] = _trsm(
+        solution[start:stop] = trsm(
             1.0,
             factor[start:stop, start:stop],
             solution[start:stop],
@@ -134,8 +139,8 @@ def solve_band_in_blocks(
 
 
 def _blocks_below(
-    factor: NDArray[np.float64], start: int, stop: int, reach: int
-) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+    factor: Band, start: int, stop: int, reach: int
+) -> Iterator[tuple[slice, Band]]:
     """Yield the rows and entries of the blocks of a band below its diagonal block.
 
     Parameters

@@ -37,6 +37,8 @@ NOT_POSITIVE = -4
 NO_MEMORY = -2
 # Place in the options `iparm` of the number of entries of the factor.
 COUNTED = 17
+# Place of the flag for numbers of single precision.
+IN_SINGLE = 27
 # Place of the flag for indices that count from zero.
 FROM_ZERO = 34
 # Threading layer of MKL without threads of its own.
@@ -87,6 +89,8 @@ class Pardiso:
     ----------
     starts, columns : arrays
         Starts of the rows of the upper triangle, and their columns, ascending from the diagonal.
+    is_single : bool
+        Whether matrices, factors and solutions have single precision instead of double.
 
     Raises
     ------
@@ -94,27 +98,33 @@ class Pardiso:
         If MKL is not installed.
     """
 
-    def __init__(self, starts: Index, columns: Index) -> None:
+    def __init__(
+        self, starts: Index, columns: Index, is_single: bool = False
+    ) -> None:
         if load_mkl() is None:
             raise InputError(MISSING)
+        self._dtype: np.dtype[Any] = np.dtype(
+            np.float32 if is_single else np.float64
+        )
         self.size = len(starts) - 1
         self._handle = np.zeros(64, np.int64)
         self._options = np.zeros(64, np.int32)
         self._starts = starts.astype(np.int32)
         self._columns = columns.astype(np.int32)
-        self._values = np.zeros(len(columns))
+        self._values = np.zeros(len(columns), self._dtype)
         kind = ctypes.c_int(POSITIVE_DEFINITE)
         load_mkl().pardisoinit(
             _pointer(self._handle), ctypes.byref(kind), _pointer(self._options)
         )
         self._options[FROM_ZERO] = 1
+        self._options[IN_SINGLE] = is_single
         self._options[COUNTED] = -1
         self._call(ANALYSE)
         self.factor_size = int(self._options[COUNTED])
 
     def factorise(self, values: Array) -> bool:
         """Factorise the values of the upper triangle, row by row, and return whether the matrix is
-        positive definite.
+        positive definite (of values rounded to the precision of the factor).
 
         Raises
         ------
@@ -123,14 +133,14 @@ class Pardiso:
         numpy.linalg.LinAlgError
             If PARDISO fails for another reason.
         """
-        self._values = np.ascontiguousarray(values, dtype=float)
+        self._values = np.ascontiguousarray(values, dtype=self._dtype)
         return self._call(FACTORISE) != NOT_POSITIVE
 
-    def solve(self, right: Array) -> Array:
+    def solve(self, right: Array) -> NDArray[Any]:
         """Return the solution for right-hand sides (n,) or (n, m) by the last factorisation, which
-        must have succeeded.
+        must have succeeded, in the precision of the factor.
         """
-        columns = np.array(right, dtype=float, order="F")
+        columns: NDArray[Any] = np.array(right, dtype=self._dtype, order="F")
         result = np.empty_like(columns)
         if columns.size:
             self._call(SOLVE, columns, result=result)
@@ -139,8 +149,8 @@ class Pardiso:
     def _call(
         self,
         phase: int,
-        right: Array | None = None,
-        result: Array | None = None,
+        right: NDArray[Any] | None = None,
+        result: NDArray[Any] | None = None,
     ) -> int:
         """Call one phase of PARDISO and return its error code, 0 or `NOT_POSITIVE`.
 
