@@ -13,9 +13,9 @@ from ..methods.solution import Solution, custom_sensor_rms
 from ..program.collocation import ExperimentIterate
 from ..program.custom_sensor_residual import custom_sensor_residuals
 from ..program.observables import ObservedMotion, ReactionForces
+from ..program.reactions.reaction_resultant import ReactionGrid
 from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
-from ..program.wrench.wrench_observable import ReactionGrid
 from ..recording.experiment import Experiment
 from .feature import Feature, Units
 from .measurement_results import (

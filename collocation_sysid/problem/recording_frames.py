@@ -23,7 +23,7 @@ from ..recording.formats.log_frames import (
     topic_frames,
 )
 from ..recording.formats.logs import TopicAddress
-from ..recording.measured_wrench import Frame
+from ..recording.poses import Frame
 from .recording_schema import ExperimentSection, WrenchSection
 
 # Names of frames that are level by convention, or their endings; the first are more reliable.

@@ -23,9 +23,9 @@ from ..recording.depth_camera import Background, PoseMatrix
 from ..recording.experiment import EARTH_M_S2, Kind, StartRule
 from ..recording.grasp import Axes
 from ..recording.markers import Places
-from ..recording.measured_wrench import Frame
 from ..recording.node_selection import Nodes
 from ..recording.placement import AttachmentRule
+from ..recording.poses import Frame
 from ..recording.solid_sections import SolidSection
 from .load_schema import (
     ForceSection,

@@ -14,7 +14,7 @@ x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axi
                    see `program.shared_nuisances`
 =================  =========================================================================
 
-History variables, reaction forces, wrenches and contact pressures are eliminated. A subclass,
+History variables, reaction forces, their resultants and contact pressures are eliminated. A subclass,
 `lifted.lifted_collocation.LiftedCollocation`, has them as variables at the end of z, with equations
 at the end of g.
 

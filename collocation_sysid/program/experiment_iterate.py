@@ -22,7 +22,7 @@ from .depth.depth_residual import DepthResidual
 from .depth.outline_residual import OutlineResidual
 from .measurement_residual import Observable
 from .observables import ObservedMotion, ReactionForces
-from .reaction_forces import reaction_vjp, reactions_at
+from .reactions.reaction_forces import reaction_vjp, reactions_at
 from .transcription import Transcription
 
 
@@ -229,8 +229,8 @@ class ExperimentIterate:
         Returns
         -------
         list of (array, array)
-            For each measurement, residuals (s, G, 3) and derivatives (s, G, 3, k). Wrenches are
-            included, with the reaction forces of the motion.
+            For each measurement, residuals (s, G, 3) and derivatives (s, G, 3, k), also
+            for sensors of reactions, with the reaction forces of the motion.
         """
         none = np.zeros(0, dtype=np.int64)
         count = len(self.phi)
@@ -252,8 +252,8 @@ class ExperimentIterate:
         return linearised
 
     def predict_wrenches(self) -> list[Array]:
-        """Return the prediction (S, 6) for each wrench sensor [N, N m]; NaN at samples for which
-        the rows of x do not suffice.
+        """Return the prediction (S, 6) for each force–torque sensor [N, N m]; NaN at samples for
+        which the rows of x do not suffice.
         """
         return [
             sensor.predict_reactions(self.reactions, self.phi)

@@ -26,13 +26,13 @@ from ..common.array_types import Array, Index
 from ..model.generated_functions import GeneratedFunction
 from ..model.nuisance_map import NuisanceMap
 from .observables import ObservableDerivatives, PointPositions, SparseEntries
-from .wrench.wrench_observable import GraspWrench, ReactionGrid
+from .reactions.reaction_resultant import ReactionGrid, ReactionResultant
 
 # Numbers of a vector [x, y, z], whose residuals share a weight of Huber's loss.
 GROUP = 3
 
 # Observables of measurements.
-Observable = PointPositions | GraspWrench
+Observable = PointPositions | ReactionResultant
 
 T = TypeVar("T", float, ca.SX)
 Expression = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
@@ -426,10 +426,10 @@ class MeasurementResidual(ABC):
             "measured": measured,
             "is_compared": is_compared,
         }
-        is_wrench = isinstance(self.observable, GraspWrench)
+        is_resultant = isinstance(self.observable, ReactionResultant)
         times = (
             {"reaction_grid": ReactionGrid.from_times(known_s)}
-            if is_wrench
+            if is_resultant
             else {"rows": np.arange(len(known_s))}
         )
         changes["observable"] = replace(self.observable, **times)

@@ -223,9 +223,18 @@ class Experiment:
         """Measured wrenches of the grasps that have a sensor, obstacles included, in the order of
         `grasps`.
         """
-        return tuple(
-            grasp.wrench for grasp in self.grasps if grasp.wrench is not None
-        )
+        return tuple(self.sensors_by_grasp.values())
+
+    @property
+    def sensors_by_grasp(self) -> dict[int, Wrench]:
+        """Measurements of the force–torque sensors by the number of their grasp or obstacle, from 1
+        on, in the order of `grasps`.
+        """
+        return {
+            number: grasp.wrench
+            for number, grasp in enumerate(self.grasps, 1)
+            if grasp.wrench is not None
+        }
 
     @property
     def symmetry(self) -> int:

@@ -179,6 +179,44 @@ class Grasp:
         """
         return self.poses.moved_positions(nodes_m[self.nodes], t_s)
 
+    @property
+    def has_sensor(self) -> bool:
+        """Whether a force–torque sensor measures the grasp."""
+        return self.wrench is not None
+
+    def without_sensor(self) -> Self:
+        """Return a copy of the grasp without its force–torque sensor, if it has one."""
+        return replace(self, wrench=None)
+
+    def with_loads(self, t_s: Array, values: Array) -> Self:
+        """Return a copy of the grasp with other samples of its force–torque sensor.
+
+        Parameters
+        ----------
+        t_s : (S,) array
+            Sample times [s].
+        values : (S, 3) or (S, 6) array
+            Forces [N] and torques [N m]; NaN where missing.
+
+        Raises
+        ------
+        ValueError
+            If the grasp has no sensor.
+        """
+        if self.wrench is None:
+            raise ValueError("the grasp has no force–torque sensor")
+        return replace(
+            self, wrench=replace(self.wrench, t_s=t_s, values=values)
+        )
+
+    def with_zero_loads_at(self, t_s: Array) -> Self:
+        """Return the grasp with zeros at the times `t_s` (S,) [s] as placeholders of its measured
+        loads, NaN for components that are not measured; a copy if it has no sensor.
+        """
+        return replace(
+            self, wrench=self.wrench and self.wrench.with_zeros_at(t_s)
+        )
+
 
 def prescribed_nodes(grasps: Sequence[Grasp]) -> Index:
     """Return all nodes that are held at some time along some axis, sorted without repeats; errors

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,9 +14,8 @@ from ..common.time_dependence import over_time
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from .checked_arrays import float_converter, read_only_floats
+from .poses import Frame
 from .sample_times import first_unordered_time
-
-Frame = Literal["world", "grasp"]
 
 COMPONENTS = ("fx", "fy", "fz", "tx", "ty", "tz")
 # Units of the components: three forces and three torques.

@@ -118,7 +118,7 @@ def _unsupported_features(
         delayed,
         "one whose clock is known",
     )
-    filtered = nuisance.sensor_lag_s and experiment.wrenches
+    filtered = nuisance.sensor_lag_s and experiment.sensors_by_grasp
     yield "a sensor with a low-pass (sensor_lag)", filtered, "one without"
     laws = (
         law_function(each.force, each.points.dofs)

@@ -34,7 +34,7 @@ from ...model.force_term import States
 from ...model.parameters import Parameters
 from ...program.collocation import ExperimentIterate
 from ...program.contact.contact_summary import surface_gaps_and_pressures
-from ...program.reaction_forces import forces_on_dofs, reaction_forces
+from ...program.reactions.reaction_forces import forces_on_dofs, reaction_forces
 from ...recording.grasp import free_rigid_motions
 from ...recording.homogeneous_deformation import (
     STRESS_PER_FORCE,

@@ -21,11 +21,12 @@ from ...methods.solution import Solution
 from ...program.collocation import Collocation, ExperimentIterate
 from ...program.observables import ReactionForces
 from ...program.transcription import Transcription
-from ...program.wrench.wrench_residual import (
+from ...program.wrench_residual import (
     WrenchResidual,
     without_grasp_sensors,
 )
-from ...recording.measured_wrench import Frame, Wrench
+from ...recording.measured_wrench import Wrench
+from ...recording.poses import Frame
 from ..axes import OTHER_AXES
 from .misspecification_hypothesis import Hypothesis, HypothesisTest
 
