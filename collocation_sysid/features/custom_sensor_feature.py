@@ -134,8 +134,8 @@ def _predict_sensors(
     reactions: tuple[ReactionGrid, ReactionForces],
     phi: Array,
 ) -> list[Array]:
-    """Return the predictions of custom sensors, for each (S, G, 3) at S samples of G points or
-    wrenches.
+    """Return the predictions of custom sensors, for each (S, G, 3) at S samples of G points, or
+    forces and torques.
 
     Parameters
     ----------

@@ -89,7 +89,7 @@ def reason_against_copy(experiment: Experiment, _: Experiment) -> str:
     """Return that points cannot be compared if nothing else is measured; else ""."""
     is_compared = (
         experiment.markers.sample_count
-        or experiment.wrenches
+        or experiment.sensors_by_grasp
         or experiment.readings
     )
     if is_compared:

@@ -122,10 +122,10 @@ class NuisanceSection(Section):
         Delay with which each point mass or force begins or ends, if it does so within the
         recording: prior_s, 10 ms by default.
     tare : TarePrior or "none", optional
-        A constant offset of each component of a wrench, in multiples of its sigma: prior_sigmas, 10
+        A constant offset of each component of a force sensor, in multiples of its sigma: prior_sigmas, 10
         by default.
     sensor_time : SensorTimePrior or "none", optional
-        Delay of the measured wrenches; at most three standard deviations: prior_s, 5 ms by default.
+        Delay of the force sensors; at most three standard deviations: prior_s, 5 ms by default.
     sensor_lag : SensorLagPrior or "none", optional
         Time constant of a first-order low-pass in the sensor; from zero to three standard
         deviations: prior_s.

@@ -700,6 +700,22 @@ class ExperimentSection(NamedSection):
         return table and (table.file or self.file)
 
     @property
+    def measurement_files(self) -> list[str | None]:
+        """Files of markers, custom sensors, depth cameras, grasps and obstacles; None for those
+        that are not named.
+        """
+        names = [
+            self.markers.file,
+            *(each.file for each in (*self.reading, *self.depth)),
+        ]
+        for grasp in self.moved_sections:
+            names += [
+                grasp.poses or self.file_of(grasp.displacement),
+                self.file_of(grasp.wrench),
+            ]
+        return names
+
+    @property
     def grasp_list(self) -> list[GraspSection]:
         """Grasps as a list; a single table is a list of one, no grasp an empty one."""
         return self.grasp if isinstance(self.grasp, list) else [self.grasp]

@@ -579,7 +579,7 @@ TARE = NuisanceRow(
     by="worst",
     label="tare{which} of {axis}",
     sentence="tare: up to {size}",
-    description="a constant offset of each component of a wrench, in multiples of its sigma",
+    description="a constant offset of each component of a force sensor, in multiples of its sigma",
 )
 SENSOR_TIME = NuisanceRow(
     "sensor_time_s",
@@ -594,7 +594,7 @@ SENSOR_TIME = NuisanceRow(
     by="worst",
     label="time shift of the sensor{which}",
     sentence="delay of the sensor: {size}",
-    description="delay of the measured wrenches; at most three standard deviations",
+    description="delay of the force sensors; at most three standard deviations",
 )
 SENSOR_LAG = NuisanceRow(
     "sensor_lag_s",
@@ -812,9 +812,9 @@ class Nuisance:
         Delay with which each point mass or force begins or ends, if it does so within the
         recording.
     tare : float or None
-        A constant offset of each component of a wrench, in multiples of its sigma.
+        A constant offset of each component of a force sensor, in multiples of its sigma.
     sensor_time_s : float or None
-        Delay of the measured wrenches; at most three standard deviations.
+        Delay of the force sensors; at most three standard deviations.
     sensor_lag_s : float or None
         Time constant of a first-order low-pass in the sensor; from zero to three standard
         deviations.

@@ -272,7 +272,7 @@ def test_models_are_not_compared_by_what_only_a_depth_camera_sees(tmp_path):
         "compare-models", file, "--materials", both, "--out", tmp_path / "both"
     )
     assert compared.code == 2
-    assert "'hanging' has neither markers nor a measured wrench" in " ".join(
+    assert "'hanging' has neither markers nor a measured force" in " ".join(
         compared.err.split()
     )
     assert not (tmp_path / "both").exists()

@@ -25,9 +25,8 @@ from ...program.streaming import StreamingModel
 from ...recording.custom_sensor import Gauge
 from ...recording.formats.text import number_from_text
 from ...recording.formats.topics import POSE
-from ...recording.measured_wrench import Wrench
+from ...recording.measured_wrench import WRENCH_COLUMNS, Wrench
 from ...recording.poses import first_matrix_fault, first_pose_fault
-from ...recording.time_tables import WRENCH_COLUMNS
 
 Pose = Any
 

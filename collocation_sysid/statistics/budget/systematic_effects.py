@@ -1135,9 +1135,9 @@ class Assumptions(Options):
         Delay with which each point mass or force begins or ends, if it does so within the recording
         [s].
     tare
-        A constant offset of each component of a wrench, in multiples of its sigma [σ].
+        A constant offset of each component of a force sensor, in multiples of its sigma [σ].
     sensor_time_s
-        Delay of the measured wrenches; at most three standard deviations [s].
+        Delay of the force sensors; at most three standard deviations [s].
     sensor_lag_s
         Time constant of a first-order low-pass in the sensor; from zero to three standard
         deviations [s].
