@@ -23,6 +23,7 @@ from .measurement_results import (
     InstrumentMisfit,
     InstrumentPrediction,
     PredictionErrors,
+    SensorSeries,
     comparison_columns,
     misfit,
 )
@@ -183,6 +184,22 @@ def recorded(
     }
 
 
+def simulated_series(
+    experiment: Experiment, predicted: InstrumentPrediction
+) -> Iterator[SensorSeries]:
+    """Yield the measured and simulated numbers of each sensor, without units."""
+    for k, gauge in enumerate(experiment.readings, 1):
+        columns = comparison_columns(
+            gauge.sample_times_s,
+            gauge.measured_values,
+            None,
+            predicted.readings[gauge.name],
+        )
+        count = gauge.measured_values.shape[1]
+        names = [f"{gauge.name} {j + 1}" for j in range(count)]
+        yield SensorSeries("reading", k, columns, names)
+
+
 def units_by_name(experiment: Experiment) -> dict[str, str] | None:
     """Return the units of the custom sensors that state one, by name; None if none does."""
     return {
@@ -243,6 +260,7 @@ CUSTOM_SENSORS = Feature(
     misfits=misfits,
     step_differences=step_differences,
     recorded=recorded,
+    simulated_series=simulated_series,
     fit_fields=fit_fields,
     fit_lines=fit_lines,
     error_texts=error_texts,

@@ -27,6 +27,7 @@ from .measurement_results import (
     InstrumentMisfit,
     InstrumentPrediction,
     PredictionErrors,
+    SensorSeries,
 )
 
 Fields = Mapping[str, Any]
@@ -120,6 +121,9 @@ class Feature:
         ``recorded(experiment, solution, predicted, positions_m)``: fields of `MotionRecord` for
         pictures and films, of a recording that was fitted, simulated (`predicted` is not None), or
         both; `positions_m` are the shown positions (T, n, 3).
+    simulated_series : callable
+        ``simulated_series(experiment, predicted)``: measured and simulated numbers of each sensor
+        over time, for a picture.
     errors : callable
         ``errors(experiment, predicted)``: fields of `PredictionErrors`.
     misfits : callable
@@ -176,6 +180,9 @@ class Feature:
     recorded: Callable[
         [Experiment, Solution, InstrumentPrediction | None, Array], Fields
     ] = _no_fields
+    simulated_series: Callable[
+        [Experiment, InstrumentPrediction], Iterable[SensorSeries]
+    ] = _nothing
     errors: Callable[[Experiment, InstrumentPrediction], Fields] = _no_fields
     misfits: Callable[
         [Experiment, InstrumentPrediction], Iterable[InstrumentMisfit]

@@ -23,7 +23,6 @@ from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.transcription import Transcription
 from ..recording import Experiment
-from ..recording.measured_wrench import COMPONENTS, UNITS
 from ..runs.forward_simulation import (
     ForwardSimulation,
     simulate_with_parameters,
@@ -312,8 +311,8 @@ class ParameterSliders:
         return "; ".join(texts) or "no measurement to compare with"
 
     def _figure(self, simulation: ForwardSimulation) -> Figure:
-        """Return the picture of the first kind of measurements that the recording has: markers, a
-        wrench, a custom sensor; without these, the picture of the shapes.
+        """Return the picture of the first kind of measurements that the recording has: markers,
+        else the first sensor; without these, the picture of the shapes.
         """
         from .pictures.over_time import marker_tracks, sensor_picture
 
@@ -326,25 +325,13 @@ class ParameterSliders:
                 fitted_m=self._fitted_markers_m,
                 simulated_m=simulation.trajectory.markers_m,
             )
-        if experiment.wrenches:
-            sensor = experiment.wrenches[0]
-            columns = _sensor_columns(
-                sensor.t_s,
-                sensor.values,
-                simulated=simulation.predicted.wrenches[0],
-            )
-            columns[:, 1:] *= sensor.symmetry
-            return sensor_picture(columns, COMPONENTS, units=UNITS)
-        if experiment.readings:
-            gauge = experiment.readings[0]
-            predicted = simulation.predicted.readings[gauge.name]
-            columns = _sensor_columns(
-                gauge.sample_times_s, gauge.measured_values, simulated=predicted
-            )
-            count = gauge.measured_values.shape[1]
-            return sensor_picture(
-                columns, [f"{gauge.name} {k + 1}" for k in range(count)]
-            )
+        for feature in FEATURES:
+            for series in feature.simulated_series(
+                experiment, simulation.predicted
+            ):
+                return sensor_picture(
+                    series.columns, series.names, units=series.units
+                )
         return self._shapes_figure(simulation)
 
     def _shapes_figure(self, simulation: ForwardSimulation) -> Figure:
@@ -392,16 +379,6 @@ def _slider(widgets: Any, name: str, values: SliderRange) -> Any:
     step = (values.high - values.low) / STEPS
     return widgets.FloatSlider(
         value=values.value, min=values.low, max=values.high, step=step, **common
-    )
-
-
-def _sensor_columns(t_s: Array, measured: Array, simulated: Array) -> Array:
-    """Return the columns of `sensor_picture`, without a fit.
-
-    `t_s` is (S,), `measured` and `simulated` are (S, m).
-    """
-    return np.column_stack(
-        [t_s, measured, np.full_like(measured, np.nan), simulated]
     )
 
 
