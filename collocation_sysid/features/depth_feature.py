@@ -13,7 +13,13 @@ from ..methods.solution import Solution
 from ..methods.stiffness_scan import typical_constants
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
-from ..program.depth.depth_comparison import DepthError, SurfaceComparison
+from ..program.depth.depth_comparison import (
+    DepthError,
+    SurfaceComparison,
+    depth_residuals,
+    outline_distances_px,
+    surface_residuals,
+)
 from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
 from ..recording.experiment import Experiment
@@ -131,7 +137,7 @@ def step_differences(
     """Return the changes (S, M, 3) of the residuals of each camera and outline, at the
     correspondences of the fit.
     """
-    if not (residuals := part.surface_residuals):
+    if not (residuals := surface_residuals(part)):
         return []
     known_s = part.segment.experiment.t_s
     rows_s = part.segment.dynamics.t_s
@@ -221,7 +227,7 @@ def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
                 reading.signed_distances_m(observation, part.phi)
                 / reading.correspondences.camera.depth.sigma_m
             )
-            for reading, observation in part.depth_residuals
+            for reading, observation in depth_residuals(part)
         ):
             continue
         experiment = part.segment.experiment
@@ -252,7 +258,7 @@ def part_concerns(part: ExperimentIterate) -> Iterator[Concern]:
         yield from camera_pose_concerns(
             [nuisance.names[k] for k in pose], part.phi[pose].tolist()
         )
-    for reading, distance_px in part.outline_distances_px:
+    for reading, distance_px in outline_distances_px(part):
         name = reading.correspondences.camera.depth.name
         yield from outline_concerns(
             f"'{name}' of '{experiment.name}'", distance_px
@@ -362,7 +368,7 @@ def fitted_surfaces(part: ExperimentIterate) -> dict[str, SurfaceComparison]:
         reading.correspondences.camera.depth.name: SurfaceComparison.from_fit(
             reading, part.x, values=observation, phi=part.phi
         )
-        for reading, observation in part.depth_residuals
+        for reading, observation in depth_residuals(part)
     }
 
 
@@ -381,7 +387,7 @@ def fit_fields(part: ExperimentIterate, _: Solution) -> dict[str, Any]:
 def excluded_loss(part: ExperimentIterate) -> float:
     """Return the loss of the points beyond the gate, each counted like one at the gate."""
     return sum(
-        reading.loss_of_distant_points for reading, _ in part.depth_residuals
+        reading.loss_of_distant_points for reading, _ in depth_residuals(part)
     )
 
 
@@ -390,7 +396,7 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
     first on all points, then on all outlines.
     """
     name = part.segment.experiment.name
-    for reading, observation in part.depth_residuals:
+    for reading, observation in depth_residuals(part):
         distance_m = reading.signed_distances_m(observation, part.phi)
         correspondences = reading.correspondences
         excluded = ", ".join(
@@ -409,7 +415,7 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
             f"points of '{correspondences.camera.depth.name}' {distances}; excluded: "
             f"{excluded or 'none'}"
         )
-    for outline, distance_px in part.outline_distances_px:
+    for outline, distance_px in outline_distances_px(part):
         if len(distance_px):
             yield (
                 f"experiment '{name}': {len(distance_px)} points of "

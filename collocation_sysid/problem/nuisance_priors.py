@@ -218,7 +218,7 @@ class DisplacementZeroPrior(NuisancePriorSection):
 
 class ObstaclePrior(NuisancePriorSection):
     """Prior of a nuisance parameter: a constant offset of each obstacle along its normal, or along
-    the axis of its displacement, which changes the beginning of the contact.
+    the axis of its displacement, which changes when it touches the body.
 
     Attributes
     ----------

@@ -105,7 +105,7 @@ class NuisanceSection(Section):
         A constant offset of each displacement along each of its axes: prior_m, 0.1 mm by default.
     obstacle : ObstaclePrior or "none", optional
         A constant offset of each obstacle along its normal, or along the axis of its displacement,
-        which changes the beginning of the contact: prior_m, 0.1 mm by default. A constant tilt of
+        which changes when it touches the body: prior_m, 0.1 mm by default. A constant tilt of
         each obstacle that is a plane or a box, about its point or middle: prior_rad. Delay of each
         obstacle's motion, to first order: prior_s.
     tension_factor : TensionFactorPrior or "none", optional

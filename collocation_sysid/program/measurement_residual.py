@@ -378,6 +378,13 @@ class MeasurementResidual(ABC):
         """
         return np.ones(len(self.t_s), dtype=bool)
 
+    @property
+    def uncompared_count(self) -> int:
+        """Number of scalar measurements that belong to the body at the present estimates but are
+        not compared; 0 for most kinds.
+        """
+        return 0
+
     def rough_residuals(self, x: Array, phi: Array) -> Array | None:
         """Return residuals for ranking first guesses, or None if the ordinary residuals are
         suitable, as here.

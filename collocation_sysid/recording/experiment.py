@@ -470,10 +470,7 @@ class Experiment:
         air drag; computed anew at each access.
         """
         couplings = [each.measure.couplings for each in self.actuators]
-        couplings += [
-            each.contact_surface(self.body).points.couplings
-            for each in self.obstacles
-        ]
+        couplings += [each.couplings_with(self.body) for each in self.obstacles]
         couplings += [
             self.body.unit_air_drag.points.couplings
         ] * self.has_air_drag

@@ -463,7 +463,7 @@ OBSTACLE_OFFSET = NuisanceRow(
     label="place of {which}",
     sentence="position error of an obstacle: up to {size}",
     description="a constant offset of each obstacle along its normal, or along the axis of its "
-    "displacement, which changes the beginning of the contact",
+    "displacement, which changes when it touches the body",
 )
 OBSTACLE_TILT = NuisanceRow(
     "obstacle_tilt_rad",
@@ -793,7 +793,7 @@ class Nuisance:
         A constant offset of each displacement along each of its axes.
     obstacle_offset_m : float or None
         A constant offset of each obstacle along its normal, or along the axis of its displacement,
-        which changes the beginning of the contact.
+        which changes when it touches the body.
     obstacle_tilt_rad : float or None
         A constant tilt of each obstacle that is a plane or a box, about its point or middle.
     obstacle_time_s : float or None

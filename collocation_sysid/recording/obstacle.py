@@ -19,6 +19,7 @@ from ..errors import InputError
 from ..fem.contact_surface import ContactSurface
 from ..fem.laws.constants import FRICTION, Constant, constant_named
 from ..fem.meshes.selection import Selection
+from ..fem.pattern import SymmetricPattern
 from .grasp import Grasp
 from .node_selection import Nodes, selection_from_section
 from .obstacle_solids import KINDS, Solid, orthogonal_axes
@@ -151,6 +152,10 @@ class Obstacle(Grasp):
         results are cached.
         """
         return _contact_surface(body, self)
+
+    def couplings_with(self, body: Body) -> SymmetricPattern:
+        """Return the pairs of nodes of a body and the obstacle between which forces can act."""
+        return self.contact_surface(body).points.couplings
 
     @property
     def offset_direction(self) -> Array:

@@ -14,7 +14,7 @@ PICTURE_CAPTIONS = {
     "field": "Spatially varying constant between the ends of its 95 % interval; below, a cut "
     "through the body. Pale colours: the data add little to the prior.",
     "mesh": "The mesh, its grasped nodes and the estimated positions of the markers.",
-    "pressure": "Contact pressure of obstacles on the body.",
+    "pressure": "Pressure of obstacles on the body.",
     "gap": "Gap between the body's surface and obstacles.",
     "tracks": "Measured, fitted and simulated markers, the residual below.",
     "wrench": "Wrench of a grasp: measured, fitted and simulated.",

@@ -125,7 +125,7 @@ def write_data(
     """Simulate every experiment at the parameters' guesses and write tables of its measurements,
     with noise, and of its poses.
 
-    Images of depth cameras are not written.
+    Images of cameras are not written.
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ def _write_tables(
     The measurements are those of markers, force sensors and custom sensors; on a test bench, tables
     of displacement and load replace those of poses and force sensors. A specimen has one table, of
     its stresses. Components that a force sensor does not measure are left out or NaN. Images of
-    depth cameras are not written.
+    cameras are not written.
 
     Parameters
     ----------

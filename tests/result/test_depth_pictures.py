@@ -26,7 +26,10 @@ from kit.results import a_result
 
 import collocation_sysid as cs
 from collocation_sysid.pipeline import run
-from collocation_sysid.program.depth.depth_comparison import SurfaceComparison
+from collocation_sysid.program.depth.depth_comparison import (
+    SurfaceComparison,
+    depth_residuals,
+)
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording.depth_camera import points_from_image
@@ -288,7 +291,7 @@ def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(
     found,
 ):
     (part,) = found.collocation.iterates(found.z)
-    ((reading, looked),) = part.depth_residuals
+    ((reading, looked),) = depth_residuals(part)
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
     rows = surface_rows(surface, part.segment.experiment.upward_direction)
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
@@ -324,7 +327,7 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(
     found,
 ):
     (part,) = found.collocation.iterates(found.z)
-    ((reading, looked),) = part.depth_residuals
+    ((reading, looked),) = depth_residuals(part)
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
     rows = surface_rows(surface, part.segment.experiment.upward_direction)
     experiment = part.segment.experiment

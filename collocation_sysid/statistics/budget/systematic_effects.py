@@ -1116,7 +1116,7 @@ class Assumptions(Options):
         A constant offset of each displacement along each of its axes [m].
     obstacle_offset_m
         A constant offset of each obstacle along its normal, or along the axis of its displacement,
-        which changes the beginning of the contact [m].
+        which changes when it touches the body [m].
     obstacle_tilt_rad
         A constant tilt of each obstacle that is a plane or a box, about its point or middle [rad].
     obstacle_time_s

@@ -7,6 +7,6 @@
 - `wrench_causes`, `wrench_at_guess`: force sensors; `obstacle_misspecifications`: obstacles and
   their loads;
   `camera_misspecifications`, `camera_image_misspecifications`, `camera_clock_misspecifications`:
-  depth cameras, their images and times; `specimen_misspecifications`: homogeneous tests.
+  cameras, their images and times; `specimen_misspecifications`: homogeneous tests.
 - `fit_misspecifications`: hypotheses after a fit.
 """

@@ -137,7 +137,7 @@ def _excess_factor(value: float, limits: tuple[float, float]) -> float:
 AGAINST = -0.8
 # Fewest samples for this correlation.
 FEWEST_SAMPLES = 3
-# Loads of an obstacle below this share of the largest may be those of no contact.
+# Loads of an obstacle below this share of the largest may be those before it touches the body.
 TOUCHING = 0.05
 
 
@@ -163,7 +163,7 @@ def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
             load_n = sensor.values[:, axis_index]
             is_measured = np.isfinite(load_n)
             if isinstance(grasp, Obstacle):
-                # Before contact the load is noise.
+                # Before the obstacle touches the body, the load is noise.
                 is_measured &= np.abs(load_n) > TOUCHING * np.nanmax(
                     np.abs(load_n), initial=0.0
                 )
