@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array, Index
 from ..common.declarations import declaration, identity, key
+from ..common.time_dependence import at_times
 from ..common.validated_types import Finite, NotNegative
 from ..errors import InputError
 from ..fem.meshes.selection import Selection
@@ -208,6 +209,33 @@ class Grasp:
         return replace(
             self, wrench=replace(self.wrench, t_s=t_s, values=values)
         )
+
+    @property
+    def load_times_s(self) -> Array:
+        """Sample times (S,) of the force–torque sensor [s]; empty without a sensor."""
+        return np.zeros(0) if self.wrench is None else self.wrench.t_s
+
+    def with_loads_within(self, t_s: Array, fewest: int) -> Self:
+        """Return the grasp with the samples of its sensor from the first to the last of the times
+        `t_s` (T,) [s]; without the sensor if it has fewer than `fewest` samples or no measured
+        component there.
+        """
+        if self.wrench is None:
+            return replace(self)
+        here = (self.wrench.t_s >= t_s[0]) & (self.wrench.t_s <= t_s[-1])
+        if here.sum() < fewest or not self.wrench.is_measured[here].any():
+            return self.without_sensor()
+        return replace(self, wrench=at_times(self.wrench, here))
+
+    def without_loads_after(self, end_s: float) -> Self:
+        """Return a copy of the grasp with measurements of its sensor after `end_s` [s] replaced by
+        NaN; the grasp itself without a sensor.
+        """
+        if self.wrench is None:
+            return self
+        is_later = (self.wrench.t_s > end_s)[:, None]
+        values = np.where(is_later, np.nan, self.wrench.values)
+        return self.with_loads(self.wrench.t_s, values)
 
     def with_zero_loads_at(self, t_s: Array) -> Self:
         """Return the grasp with zeros at the times `t_s` (S,) [s] as placeholders of its measured
