@@ -127,7 +127,7 @@ class DisplacementSection(TableSection):
         return self
 
 
-class WrenchSection(TableSection):
+class ForceSensorSection(TableSection):
     """The measured force and torque that the grasp exerts on the body.
 
     Columns t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, in these or other units, at their
@@ -172,7 +172,7 @@ class WrenchSection(TableSection):
         return bool({"frame", "point_m"} & self.model_fields_set)
 
     @model_validator(mode="after")
-    def _require_one_frame(self) -> WrenchSection:
+    def _require_one_frame(self) -> ForceSensorSection:
         """Return the section itself; raise `ValueError` for sensor_frame with frame or point_m."""
         if self.sensor_frame is not None and self.states_axes:
             raise ValueError(
@@ -297,7 +297,7 @@ class GraspSection(MovedSection):
         roughness of the poses by default.
     axes : {"x", "y", "z", "xy", "xz", "yz", "xyz"}
         Axes of the world along which the nodes are prescribed; they slide along the others.
-    wrench : WrenchSection, optional
+    wrench : ForceSensorSection, optional
         Measured force and torque on the body: file, sigma_n, sigma_nm, …
     """
 
@@ -307,7 +307,12 @@ class GraspSection(MovedSection):
     sigma_m: NotNegative | None = None
     sigma_rad: NotNegative | None = None
     axes: Axes = "xyz"
-    wrench: WrenchSection | None = None
+    wrench: ForceSensorSection | None = None
+
+    @property
+    def sensor(self) -> ForceSensorSection | None:
+        """Table of the measured force and torque; None if they are not measured."""
+        return self.wrench
 
 
 class ObstacleSection(MovedSection):
@@ -347,7 +352,7 @@ class ObstacleSection(MovedSection):
     slip : float, optional
         Sliding speed [m/s], or slip from sample to sample [m] of a static experiment, at which
         friction is 0.7 of its limit.
-    force : WrenchSection, optional
+    force : ForceSensorSection, optional
         Measured force on the body: file, sigma_n, …
     """
 
@@ -363,11 +368,11 @@ class ObstacleSection(MovedSection):
     stiffness_pa_m: Positive | None = None
     width_m: Positive | None = None
     slip: Positive | None = None
-    force: WrenchSection | None = None
+    force: ForceSensorSection | None = None
 
     @property
-    def wrench(self) -> WrenchSection | None:
-        """Measured force, under the name that grasps have for it."""
+    def sensor(self) -> ForceSensorSection | None:
+        """Table of the measured force; None if it is not measured."""
         return self.force
 
 
@@ -711,7 +716,7 @@ class ExperimentSection(NamedSection):
         for grasp in self.moved_sections:
             names += [
                 grasp.poses or self.file_of(grasp.displacement),
-                self.file_of(grasp.wrench),
+                self.file_of(grasp.sensor),
             ]
         return names
 
