@@ -8,5 +8,7 @@ recording belong into the packages `program`, `model` and `recording`.
 - `registry`: the features, in the order of the residuals.
 - `measurement_results`: predictions and errors of measurements, as in ``result.json``.
 - `marker_feature`, `wrench_feature`, `custom_sensor_feature`, `depth_feature`: measurements.
+- `wrench_causes`, `wrench_at_guess`: likely errors in the description of force sensors, after a fit
+  and by the simulation at the guess.
 - `contact_feature`: contact with obstacles.
 """

@@ -22,12 +22,6 @@ from ..statistics.misspecification.misspecification_hypothesis import (
     rank,
 )
 from ..statistics.misspecification.plausibility import load_sign_hypotheses
-from ..statistics.misspecification.wrench_at_guess import wrench_deviations
-from ..statistics.misspecification.wrench_causes import (
-    CHECKED_SAMPLES,
-    wrench_causes,
-    wrench_mistakes,
-)
 from .feature import Feature, SimulatedCheck, Units
 from .measurement_results import (
     FittedExperiment,
@@ -37,6 +31,12 @@ from .measurement_results import (
     SensorSeries,
     comparison_columns,
     misfit,
+)
+from .wrench_at_guess import wrench_deviations
+from .wrench_causes import (
+    CHECKED_SAMPLES,
+    wrench_causes,
+    wrench_mistakes,
 )
 
 # Longest fit of the first samples to the markers that needs no request [s].
