@@ -359,6 +359,19 @@ def validation_concerns(
         )
 
 
+def live_limitations(
+    experiment: Experiment,
+) -> list[tuple[str, object, str]]:
+    """Return that frames of a live recording contain no images."""
+    return [
+        (
+            "depth cameras, because frames do not contain their images",
+            experiment.depths,
+            "none",
+        )
+    ]
+
+
 # Results ------------------------------------------------------------------------------------------
 
 
@@ -473,6 +486,7 @@ DEPTH = Feature(
     part_concerns=part_concerns,
     simulation_concerns=simulation_concerns,
     validation_concerns=validation_concerns,
+    live_limitations=live_limitations,
     notes=notes,
     excluded_loss=excluded_loss,
     fit_fields=fit_fields,

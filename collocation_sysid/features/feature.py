@@ -149,6 +149,10 @@ class Feature:
     validation_concerns : callable
         ``validation_concerns(name, error, solution)``: concerns about a prediction of an experiment
         that was not fitted, compared with the fit of the others.
+    live_limitations : callable
+        ``live_limitations(experiment)``: parts of an experiment that live estimation does not
+        support, each as its description, a value that is true if the experiment has it, and the
+        supported alternative.
     notes : callable
         ``notes(part)``: notes on the fit of one experiment.
     excluded_loss : callable
@@ -208,6 +212,9 @@ class Feature:
     ] = _nothing
     validation_concerns: Callable[
         [str, PredictionErrors, Solution], Iterable[Concern]
+    ] = _nothing
+    live_limitations: Callable[
+        [Experiment], Iterable[tuple[str, object, str]]
     ] = _nothing
     notes: Callable[[ExperimentIterate], Iterable[str]] = _nothing
     excluded_loss: Callable[[ExperimentIterate], float] = _no_loss

@@ -32,9 +32,6 @@ from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp, prescribed_nodes
 from ..recording.loads import Force, LoadTime, PointMass
 from ..recording.nuisance import (
-    DEPTH_BIAS,
-    DEPTH_EDGE,
-    DEPTH_SCALE,
     GAUGE,
     GRASP_SHIFT,
     GRASP_TURN,
@@ -798,8 +795,8 @@ def _components(
             (each.name for each in experiment.obstacles),
             len(experiment.body_grasps),
         )
-    if of == "depth":
-        return enumerate(depth.name for depth in experiment.depths)
+    if of == "camera":
+        return enumerate(experiment.camera_names)
     if of == "load":
         return enumerate(which for which, _ in _timed_loads(experiment))
     if of == "sensor":
@@ -839,21 +836,7 @@ def _component_axes(
             (k, name, unit, sigma * sigma_k)
             for k, name, unit, sigma_k in sensor.component_noises()
         ]
-    if row in (OBSTACLE_TILT, OBSTACLE_TIME):
-        obstacle = experiment.grasps[number]
-        assert isinstance(obstacle, Obstacle)
-        if not (
-            obstacle.shape.has_tilt
-            if row == OBSTACLE_TILT
-            else len(obstacle.poses.t_s) > 1
-        ):
-            return []
-    if (
-        row in (DEPTH_BIAS, DEPTH_SCALE)
-        and experiment.depths[number].camera.matrix is None
-    ):
-        return []
-    if row == DEPTH_EDGE and not len(experiment.depths[number].images_m):
+    if not row.applies_to(experiment, number):
         return []
     axes = [(axis, name, row.unit, sigma) for axis, name in enumerate(names)]
     return [

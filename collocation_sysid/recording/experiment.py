@@ -226,6 +226,11 @@ class Experiment:
         return tuple(self.sensors_by_grasp.values())
 
     @property
+    def camera_names(self) -> list[str]:
+        """Names of the depth cameras, in their order."""
+        return [camera.name for camera in self.depths]
+
+    @property
     def sensors_by_grasp(self) -> dict[int, Wrench]:
         """Measurements of the force–torque sensors by the number of their grasp or obstacle, from 1
         on, in the order of `grasps`.

@@ -10,7 +10,7 @@ pictures, and `solve_progress` shows a solve while it runs.
 
 Pictures: the package `pictures` has static figures in the look of `figure_style`; `animation` makes
 films, `interactive_view` an interactive window, and `web_page` a web page with the moving body;
-`parameter_sliders` shows simulations at other parameters in a notebook. `depth_overlays` prepares
-the points of depth cameras for all of these, and `element_fields` evaluates stress and energy in
+`parameter_sliders` shows simulations at other parameters in a notebook. `camera_overlays` prepares
+the points of cameras for all of these, and `element_fields` evaluates stress and energy in
 each element.
 """

@@ -34,7 +34,7 @@ from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.result.animation import FilmFigure
-from collocation_sysid.result.depth_overlays import (
+from collocation_sysid.result.camera_overlays import (
     save_overlays,
     surface_rows,
     undeformed_rows,

@@ -332,7 +332,7 @@ def plan_models(
         if not (each.validation or is_compared):
             raise InputError(
                 f"'{each.name}' has neither markers nor a measured force; expected one of these, "
-                "because models are compared by their predictions of these, not of depth images "
+                "because models are compared by their predictions of these, not of images "
                 "or readings"
             )
     planned = []
