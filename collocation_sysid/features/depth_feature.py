@@ -26,19 +26,19 @@ from ..recording.experiment import Experiment
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ..statistics.assessment import forward_simulation_concerns
 from ..statistics.concerns import Concern, concern_if
-from ..statistics.misspecification.camera_clock_misspecifications import (
-    camera_clock_hypotheses,
-)
-from ..statistics.misspecification.camera_image_misspecifications import (
-    camera_image_hypotheses,
-)
-from ..statistics.misspecification.camera_misspecifications import (
-    camera_hypotheses,
-    require_depth_units,
-)
 from ..statistics.misspecification.misspecification_hypothesis import (
     Hypothesis,
     rank,
+)
+from .camera_clock_misspecifications import (
+    camera_clock_hypotheses,
+)
+from .camera_image_misspecifications import (
+    camera_image_hypotheses,
+)
+from .camera_misspecifications import (
+    camera_hypotheses,
+    require_depth_units,
 )
 from .feature import Feature, SimulatedCheck, Units
 from .measurement_results import (

@@ -269,7 +269,7 @@ class MotionRecord:
             else self.rolled_out_positions_m
         )
 
-    def depth_points_m(self, sample: int) -> Array:
+    def camera_points_m(self, sample: int) -> Array:
         """Return the points (P, 3) [m] of all depth cameras at the time of the sample with index
         `sample`.
 

@@ -25,6 +25,9 @@ from kit.problem_files import pictures_drawn, run_command
 from kit.results import a_result
 
 import collocation_sysid as cs
+from collocation_sysid.features.camera_misspecifications import (
+    camera_hypotheses,
+)
 from collocation_sysid.pipeline import run
 from collocation_sysid.program.depth.depth_comparison import (
     SurfaceComparison,
@@ -44,9 +47,6 @@ from collocation_sysid.result.pictures.depth_comparison_picture import (
     depth_picture,
 )
 from collocation_sysid.result.replay import MotionRecord
-from collocation_sysid.statistics.misspecification.camera_misspecifications import (
-    camera_hypotheses,
-)
 
 UPWARD, INVERTED = np.diag([1.0, -1, -1, 1]), np.linalg.inv(POSE)
 AWAY = np.eye(4) + 5 * np.outer(
@@ -347,13 +347,13 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(
         visible_points={"front": np.vstack([rows, later])},
     )
     count = reading.correspondences.is_compared.sum()
-    assert [len(replay.depth_points_m(t)) for t in range(3)] == [
+    assert [len(replay.camera_points_m(t)) for t in range(3)] == [
         count,
         0,
         count,
     ]
     sparse = replace(replay, visible_points={"front": rows})
-    assert [len(sparse.depth_points_m(t)) > 0 for t in range(3)] == [
+    assert [len(sparse.camera_points_m(t)) > 0 for t in range(3)] == [
         True,
         False,
         False,
@@ -361,9 +361,9 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(
     film = FilmFigure(sparse)
     ((_, _, _, drawn, _),) = film.drawings
     film.show_sample(0)
-    u, _ = drawn.depth_points.get_data()
+    u, _ = drawn.camera_points.get_data()
     assert 0 < len(u) <= reading.correspondences.is_compared.sum()
-    shown = drawn.view.to_sheet_mm(sparse.depth_points_m(0))
+    shown = drawn.view.to_sheet_mm(sparse.camera_points_m(0))
     assert np.isin(np.round(u, 6), np.round(shown[:, 0], 6)).all()
     film.show_sample(2)
-    assert len(drawn.depth_points.get_data()[0]) == 0
+    assert len(drawn.camera_points.get_data()[0]) == 0

@@ -298,7 +298,7 @@ class _Recording:
                     radius_m=radius_m,
                 )
         depth_points_m = [
-            replay.depth_points_m(k) for k in range(len(replay.t_s))
+            replay.camera_points_m(k) for k in range(len(replay.t_s))
         ]
         if any(map(len, depth_points_m)):
             path = self._path(name, "depth_points")
