@@ -285,10 +285,10 @@ class GraspSection(MovedSection):
         Selection: a table of box_m, ball_m, face or indices, or the name of a point array or
         physical group.
     from_s : float, optional
-        First time [s] of the grasp or contact; the start of the recording by default.
+        First time [s] at which the grasp or obstacle acts; the start of the recording by default.
     until_s : float, optional
-        Last time [s] of the grasp or contact; the end of the recording by default. If a grasp ends
-        at the first sample, the body is released from its equilibrium in this grasp.
+        Last time [s] at which the grasp or obstacle acts; the end of the recording by default. If a
+        grasp ends at the first sample, the body is released from its equilibrium in this grasp.
     sigma_m : float, optional
         Standard deviation of the noise in each position of the poses [m]; estimated from their
         roughness by default.
@@ -321,10 +321,10 @@ class ObstacleSection(MovedSection):
     Attributes
     ----------
     from_s : float, optional
-        First time [s] of the grasp or contact; the start of the recording by default.
+        First time [s] at which the grasp or obstacle acts; the start of the recording by default.
     until_s : float, optional
-        Last time [s] of the grasp or contact; the end of the recording by default. If a grasp ends
-        at the first sample, the body is released from its equilibrium in this grasp.
+        Last time [s] at which the grasp or obstacle acts; the end of the recording by default. If a
+        grasp ends at the first sample, the body is released from its equilibrium in this grasp.
     sigma_m : float, optional
         Standard deviation of the noise in each position of the poses [m]; estimated from their
         roughness by default.

@@ -51,10 +51,10 @@ class Grasp:
     poses : PoseSequence or (T, 4, 4) array
         Rigid motion that carries the nodes.
     from_s : float
-        First time [s] of the grasp or contact; the start of the recording by default.
+        First time [s] at which the grasp or obstacle acts; the start of the recording by default.
     until_s : float
-        Last time [s] of the grasp or contact; the end of the recording by default. If a grasp ends
-        at the first sample, the body is released from its equilibrium in this grasp.
+        Last time [s] at which the grasp or obstacle acts; the end of the recording by default. If a
+        grasp ends at the first sample, the body is released from its equilibrium in this grasp.
     sigma_m : float, optional
         Standard deviation of the noise in each position of the poses [m]; estimated from their
         roughness by default.
