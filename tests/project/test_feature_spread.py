@@ -88,6 +88,8 @@ def test_a_feature_without_functions_contributes_nothing():
     nothing = Feature("nothing")
     assert not [*nothing.hypotheses(None)]
     assert not [*nothing.error_texts(None, None)]
+    assert not [*nothing.simulated_series(None, None)]
+    assert not [*nothing.live_limitations(None)]
     assert nothing.simulated_hypotheses(None) == ((), ())
     assert nothing.reason_against_copy(None, None) == ""
     assert nothing.excluded_loss(None) == 0.0
