@@ -391,8 +391,8 @@ class StreamingModel:
 
     @cached_property
     def reaction_sensors(self) -> tuple[Sensor, ...]:
-        """Resultants of reactions that sensors observe, each with the index of its grasp, from 0: those
-        of force–torque sensors, then of custom sensors.
+        """Resultants of reactions that sensors observe, each with the index of its grasp, from 0:
+        those of force–torque sensors, then of custom sensors.
         """
         channels = [reading.observable for reading in self.segment.residuals]
         grasps = [id(grasp) for grasp in self.segment.experiment.grasps]

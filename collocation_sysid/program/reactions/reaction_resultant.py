@@ -5,7 +5,7 @@ In the frame of the sensor with axes Q_k and origin o_k,
 
     W_k = Σ_g (Q_kᵀ R_g, Q_kᵀ (x_g − o_k) × R_g) + load of the tool,
 
-with the reaction forces R of `reaction` and the grasped nodes x_g. A tool of mass m between sensor
+with the reaction forces R of `reaction_forces` and the grasped nodes x_g. A tool of mass m between sensor
 and body, with its centre at c in the frame of the grasp, adds the force m (a_c − g) at its centre,
 a_c being the acceleration of the centre and g gravity. Values are Y = L W, where L is a first-order
 low-pass with an estimated time constant, or the identity.
