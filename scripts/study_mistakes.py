@@ -29,6 +29,9 @@ from collocation_sysid.features.depth_feature import (
     depth_image_hypotheses,
     may_be_images,
 )
+from collocation_sysid.features.wrench_causes import (
+    wrench_mistakes,
+)
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
@@ -38,9 +41,6 @@ from collocation_sysid.runs.check import (
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
     Hypothesis,
     rank,
-)
-from collocation_sysid.statistics.misspecification.wrench_causes import (
-    wrench_mistakes,
 )
 
 # Seed of the random choices of a mistake, such as which markers are exchanged.

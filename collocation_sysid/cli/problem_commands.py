@@ -326,7 +326,7 @@ def _write_depth_overlays(problem: Problem, folder: Path) -> None:
     """
     if not any(experiment.depths for experiment in problem.experiments):
         return
-    from ..result.depth_overlays import save_overlays
+    from ..result.camera_overlays import save_overlays
 
     require_possible(folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -145,7 +145,6 @@ def live(options: LiveCommand) -> None:
         update_as_json,
         without_garbage_of_startup,
     )
-    from ..problem.gripper_transforms import gripper_transforms
 
     if (
         options.udp is None and sys.stdin is None
@@ -166,17 +165,8 @@ def live(options: LiveCommand) -> None:
     else:
         lines = receive_datagrams(options.udp, opened)
         source = f"UDP port {options.udp}"
-    reader = FrameReader(
-        estimator.model.moving_grasps + 1,
-        estimator.names,
-        source=source,
-        gauges=estimator.model.experiment.readings,
-        wrenches=estimator.model.wrenches,
-        gripper_transforms=gripper_transforms(
-            estimator.problem,
-            estimator.model.experiment.name,
-            grasps=estimator.model.moving_grasps,
-        ),
+    reader = FrameReader.from_model(
+        estimator.model, estimator.problem, source=source
     )
     bad = 0
     with options.open_recording(estimator) as recording:

@@ -13,9 +13,9 @@ from ..methods.solution import Solution, custom_sensor_rms
 from ..program.collocation import ExperimentIterate
 from ..program.custom_sensor_residual import custom_sensor_residuals
 from ..program.observables import ObservedMotion, ReactionForces
+from ..program.reactions.reaction_resultant import ReactionGrid
 from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
-from ..program.wrench.wrench_observable import ReactionGrid
 from ..recording.experiment import Experiment
 from .feature import Feature, Units
 from .measurement_results import (
@@ -23,6 +23,7 @@ from .measurement_results import (
     InstrumentMisfit,
     InstrumentPrediction,
     PredictionErrors,
+    SensorSeries,
     comparison_columns,
     misfit,
 )
@@ -134,8 +135,8 @@ def _predict_sensors(
     reactions: tuple[ReactionGrid, ReactionForces],
     phi: Array,
 ) -> list[Array]:
-    """Return the predictions of custom sensors, for each (S, G, 3) at S samples of G points or
-    wrenches.
+    """Return the predictions of custom sensors, for each (S, G, 3) at S samples of G points, or
+    forces and torques.
 
     Parameters
     ----------
@@ -181,6 +182,22 @@ def recorded(
             for gauge in experiment.readings
         }
     }
+
+
+def simulated_series(
+    experiment: Experiment, predicted: InstrumentPrediction
+) -> Iterator[SensorSeries]:
+    """Yield the measured and simulated numbers of each sensor, without units."""
+    for k, gauge in enumerate(experiment.readings, 1):
+        columns = comparison_columns(
+            gauge.sample_times_s,
+            gauge.measured_values,
+            None,
+            predicted.readings[gauge.name],
+        )
+        count = gauge.measured_values.shape[1]
+        names = [f"{gauge.name} {j + 1}" for j in range(count)]
+        yield SensorSeries("reading", k, columns, names)
 
 
 def units_by_name(experiment: Experiment) -> dict[str, str] | None:
@@ -243,6 +260,7 @@ CUSTOM_SENSORS = Feature(
     misfits=misfits,
     step_differences=step_differences,
     recorded=recorded,
+    simulated_series=simulated_series,
     fit_fields=fit_fields,
     fit_lines=fit_lines,
     error_texts=error_texts,

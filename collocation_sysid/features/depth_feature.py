@@ -13,26 +13,32 @@ from ..methods.solution import Solution
 from ..methods.stiffness_scan import typical_constants
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
-from ..program.depth.depth_comparison import DepthError, SurfaceComparison
+from ..program.depth.depth_comparison import (
+    DepthError,
+    SurfaceComparison,
+    depth_residuals,
+    outline_distances_px,
+    surface_residuals,
+)
 from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
 from ..recording.experiment import Experiment
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ..statistics.assessment import forward_simulation_concerns
 from ..statistics.concerns import Concern, concern_if
-from ..statistics.misspecification.camera_clock_misspecifications import (
-    camera_clock_hypotheses,
-)
-from ..statistics.misspecification.camera_image_misspecifications import (
-    camera_image_hypotheses,
-)
-from ..statistics.misspecification.camera_misspecifications import (
-    camera_hypotheses,
-    require_depth_units,
-)
 from ..statistics.misspecification.misspecification_hypothesis import (
     Hypothesis,
     rank,
+)
+from .camera_clock_misspecifications import (
+    camera_clock_hypotheses,
+)
+from .camera_image_misspecifications import (
+    camera_image_hypotheses,
+)
+from .camera_misspecifications import (
+    camera_hypotheses,
+    require_depth_units,
 )
 from .feature import Feature, SimulatedCheck, Units
 from .measurement_results import (
@@ -89,7 +95,7 @@ def reason_against_copy(experiment: Experiment, _: Experiment) -> str:
     """Return that points cannot be compared if nothing else is measured; else ""."""
     is_compared = (
         experiment.markers.sample_count
-        or experiment.wrenches
+        or experiment.sensors_by_grasp
         or experiment.readings
     )
     if is_compared:
@@ -131,7 +137,7 @@ def step_differences(
     """Return the changes (S, M, 3) of the residuals of each camera and outline, at the
     correspondences of the fit.
     """
-    if not (residuals := part.surface_residuals):
+    if not (residuals := surface_residuals(part)):
         return []
     known_s = part.segment.experiment.t_s
     rows_s = part.segment.dynamics.t_s
@@ -221,7 +227,7 @@ def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
                 reading.signed_distances_m(observation, part.phi)
                 / reading.correspondences.camera.depth.sigma_m
             )
-            for reading, observation in part.depth_residuals
+            for reading, observation in depth_residuals(part)
         ):
             continue
         experiment = part.segment.experiment
@@ -252,7 +258,7 @@ def part_concerns(part: ExperimentIterate) -> Iterator[Concern]:
         yield from camera_pose_concerns(
             [nuisance.names[k] for k in pose], part.phi[pose].tolist()
         )
-    for reading, distance_px in part.outline_distances_px:
+    for reading, distance_px in outline_distances_px(part):
         name = reading.correspondences.camera.depth.name
         yield from outline_concerns(
             f"'{name}' of '{experiment.name}'", distance_px
@@ -353,6 +359,19 @@ def validation_concerns(
         )
 
 
+def live_limitations(
+    experiment: Experiment,
+) -> list[tuple[str, object, str]]:
+    """Return that frames of a live recording contain no images."""
+    return [
+        (
+            "depth cameras, because frames do not contain their images",
+            experiment.depths,
+            "none",
+        )
+    ]
+
+
 # Results ------------------------------------------------------------------------------------------
 
 
@@ -362,7 +381,7 @@ def fitted_surfaces(part: ExperimentIterate) -> dict[str, SurfaceComparison]:
         reading.correspondences.camera.depth.name: SurfaceComparison.from_fit(
             reading, part.x, values=observation, phi=part.phi
         )
-        for reading, observation in part.depth_residuals
+        for reading, observation in depth_residuals(part)
     }
 
 
@@ -381,7 +400,7 @@ def fit_fields(part: ExperimentIterate, _: Solution) -> dict[str, Any]:
 def excluded_loss(part: ExperimentIterate) -> float:
     """Return the loss of the points beyond the gate, each counted like one at the gate."""
     return sum(
-        reading.loss_of_distant_points for reading, _ in part.depth_residuals
+        reading.loss_of_distant_points for reading, _ in depth_residuals(part)
     )
 
 
@@ -390,7 +409,7 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
     first on all points, then on all outlines.
     """
     name = part.segment.experiment.name
-    for reading, observation in part.depth_residuals:
+    for reading, observation in depth_residuals(part):
         distance_m = reading.signed_distances_m(observation, part.phi)
         correspondences = reading.correspondences
         excluded = ", ".join(
@@ -409,7 +428,7 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
             f"points of '{correspondences.camera.depth.name}' {distances}; excluded: "
             f"{excluded or 'none'}"
         )
-    for outline, distance_px in part.outline_distances_px:
+    for outline, distance_px in outline_distances_px(part):
         if len(distance_px):
             yield (
                 f"experiment '{name}': {len(distance_px)} points of "
@@ -467,6 +486,7 @@ DEPTH = Feature(
     part_concerns=part_concerns,
     simulation_concerns=simulation_concerns,
     validation_concerns=validation_concerns,
+    live_limitations=live_limitations,
     notes=notes,
     excluded_loss=excluded_loss,
     fit_fields=fit_fields,

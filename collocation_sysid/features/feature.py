@@ -27,6 +27,7 @@ from .measurement_results import (
     InstrumentMisfit,
     InstrumentPrediction,
     PredictionErrors,
+    SensorSeries,
 )
 
 Fields = Mapping[str, Any]
@@ -120,6 +121,9 @@ class Feature:
         ``recorded(experiment, solution, predicted, positions_m)``: fields of `MotionRecord` for
         pictures and films, of a recording that was fitted, simulated (`predicted` is not None), or
         both; `positions_m` are the shown positions (T, n, 3).
+    simulated_series : callable
+        ``simulated_series(experiment, predicted)``: measured and simulated numbers of each sensor
+        over time, for a picture.
     errors : callable
         ``errors(experiment, predicted)``: fields of `PredictionErrors`.
     misfits : callable
@@ -145,6 +149,10 @@ class Feature:
     validation_concerns : callable
         ``validation_concerns(name, error, solution)``: concerns about a prediction of an experiment
         that was not fitted, compared with the fit of the others.
+    live_limitations : callable
+        ``live_limitations(experiment)``: parts of an experiment that live estimation does not
+        support, each as its description, a value that is true if the experiment has it, and the
+        supported alternative.
     notes : callable
         ``notes(part)``: notes on the fit of one experiment.
     excluded_loss : callable
@@ -176,6 +184,9 @@ class Feature:
     recorded: Callable[
         [Experiment, Solution, InstrumentPrediction | None, Array], Fields
     ] = _no_fields
+    simulated_series: Callable[
+        [Experiment, InstrumentPrediction], Iterable[SensorSeries]
+    ] = _nothing
     errors: Callable[[Experiment, InstrumentPrediction], Fields] = _no_fields
     misfits: Callable[
         [Experiment, InstrumentPrediction], Iterable[InstrumentMisfit]
@@ -201,6 +212,9 @@ class Feature:
     ] = _nothing
     validation_concerns: Callable[
         [str, PredictionErrors, Solution], Iterable[Concern]
+    ] = _nothing
+    live_limitations: Callable[
+        [Experiment], Iterable[tuple[str, object, str]]
     ] = _nothing
     notes: Callable[[ExperimentIterate], Iterable[str]] = _nothing
     excluded_loss: Callable[[ExperimentIterate], float] = _no_loss

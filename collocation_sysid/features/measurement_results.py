@@ -253,6 +253,31 @@ class ForwardResult:
     experiments: Mapping[str, SimulatedExperiment]
 
 
+@dataclass(frozen=True, eq=False)
+class SensorSeries:
+    """Numbers of one sensor over time: measured, fitted and simulated.
+
+    Attributes
+    ----------
+    kind : str
+        Kind of the sensor, with which names of pictures begin.
+    number : int
+        Number of the sensor among those of its kind, from 1.
+    columns : (S, 1 + 3m)
+        Time [s], and m numbers as measured, fitted and simulated; NaN where one is missing.
+    names : sequence of m str
+        Names of the numbers.
+    units : sequence of m str
+        Units of the numbers; empty if they are not stated.
+    """
+
+    kind: str
+    number: int
+    columns: Array
+    names: Sequence[str]
+    units: Sequence[str] = ()
+
+
 def misfit(
     what: str, declared_size: str, ratio: Array, size: str = ""
 ) -> InstrumentMisfit:

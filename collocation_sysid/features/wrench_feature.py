@@ -14,6 +14,7 @@ from ..program.collocation import ExperimentIterate
 from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
 from ..recording.experiment import Experiment
+from ..recording.measured_wrench import COMPONENTS, UNITS
 from ..statistics.assessment import forward_simulation_concerns
 from ..statistics.concerns import Concern
 from ..statistics.misspecification.misspecification_hypothesis import (
@@ -21,20 +22,21 @@ from ..statistics.misspecification.misspecification_hypothesis import (
     rank,
 )
 from ..statistics.misspecification.plausibility import load_sign_hypotheses
-from ..statistics.misspecification.wrench_at_guess import wrench_deviations
-from ..statistics.misspecification.wrench_causes import (
-    CHECKED_SAMPLES,
-    wrench_causes,
-    wrench_mistakes,
-)
 from .feature import Feature, SimulatedCheck, Units
 from .measurement_results import (
     FittedExperiment,
     InstrumentMisfit,
     InstrumentPrediction,
     PredictionErrors,
+    SensorSeries,
     comparison_columns,
     misfit,
+)
+from .wrench_at_guess import wrench_deviations
+from .wrench_causes import (
+    CHECKED_SAMPLES,
+    wrench_causes,
+    wrench_mistakes,
 )
 
 # Longest fit of the first samples to the markers that needs no request [s].
@@ -193,6 +195,17 @@ def recorded(
     return {"wrenches": series}
 
 
+def simulated_series(
+    experiment: Experiment, predicted: InstrumentPrediction
+) -> Iterator[SensorSeries]:
+    """Yield the measured and simulated wrench of each sensor, of the whole specimen."""
+    pairs = zip(experiment.wrenches, predicted.wrenches, strict=True)
+    for k, (sensor, simulated) in enumerate(pairs, 1):
+        columns = comparison_columns(sensor.t_s, sensor.values, None, simulated)
+        columns[:, 1:] *= sensor.symmetry
+        yield SensorSeries("wrench", k, columns, COMPONENTS, units=UNITS)
+
+
 def validation_concerns(
     name: str, error: PredictionErrors, solution: Solution
 ) -> list[Concern]:
@@ -277,6 +290,7 @@ WRENCH = Feature(
     fit_hypotheses=fit_hypotheses,
     validation_concerns=validation_concerns,
     recorded=recorded,
+    simulated_series=simulated_series,
     fit_fields=fit_fields,
     pooled_fields=pooled_fields,
     fit_lines=fit_lines,

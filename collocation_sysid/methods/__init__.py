@@ -8,7 +8,7 @@ Solvers
     `horizon` and `trajectory_sweeps` its linearised problem, and `experiment_executors` runs it in
     threads or on a Dask cluster. `interior_point` solves for motion and parameters simultaneously
     with IPOPT; `condensed_program` removes variables that follow from others, `initial_point`
-    computes its start, and `complementarity` adds hard contact. `continuation` runs any method on
+    computes its start, and `complementarity` adds hard obstacles. `continuation` runs any method on
     growing parts of the recordings. `comparison` contains methods of the literature, to compare
     with.
 Start

@@ -106,7 +106,7 @@ def with_curvature(
 
 def require_second_derivatives(collocation: Collocation) -> None:
     """Do nothing, or raise an `InputError` if the problem has no exact second derivatives: for
-    materials with memory, forces with internal variables, measured wrenches and custom sensors of
+    materials with memory, forces with internal variables, measured forces and custom sensors of
     grasp forces.
     """
     if collocation.has_eliminated_histories:
@@ -116,7 +116,7 @@ def require_second_derivatives(collocation: Collocation) -> None:
         )
     if any(len(segment.sensed_dofs) for segment in collocation.transcriptions):
         raise InputError(
-            "hessian = 'exact' is not available for measured wrenches and readings of grasps; "
+            "hessian = 'exact' is not available for measured forces and readings of grasps; "
             "expected 'gauss-newton'"
         )
 

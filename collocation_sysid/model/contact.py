@@ -707,6 +707,14 @@ class Contact(Pointwise):
             self.law_of_contact.gaps(y + half_step),
         )
 
+    def separate_bodies(self, places: Array, shape: Array) -> Array:
+        """Return positions with the frame of the obstacle moved out of the body, see `ForceTerm`."""
+        frame = self.law_of_contact.obstacle.nodes
+        penetration_m, normal = self.deepest_point(shape.ravel())
+        moved = places.copy()
+        moved[frame] -= max(penetration_m, 0.0) * normal
+        return moved
+
     def deepest_point(self, x: Array) -> tuple[float, Array]:
         """Return the penetration δ − g [m] of the point with the smallest gap at positions x (3n,) [m],
         and the gradient of its gap (3,) in the axes of the world, the obstacle's outward normal.

@@ -346,10 +346,10 @@ class Dynamics:
             previous_states=previous_states or {},
         )
 
-    def contact_with_pressures(
+    def forces_with_pressures(
         self, x: Array, scaled_pressures: Mapping[int, Array]
     ) -> tuple[AnyHistory, ...]:
-        """Return contact forces at given pressures b, one object with the interface of
+        """Return the forces of obstacles at given pressures b, one object with the interface of
         `ForceHistory` for each entry.
 
         Parameters
@@ -357,7 +357,7 @@ class Dynamics:
         x : (N, 3n)
             Positions [m].
         scaled_pressures : mapping
-            Scaled contact pressure b (1, N, points) [m] by the index of the force in
+            Scaled pressure b (1, N, points) [m] by the index of the force in
             `Forces.external_terms`.
         """
         states = self.all_evaluation_states(x)

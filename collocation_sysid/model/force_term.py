@@ -97,6 +97,19 @@ class ForceTerm(ABC):
     def force(self, states: States) -> Array:
         """Return the forces F (T, 3n) [N]."""
 
+    def separate_bodies(self, places: Array, shape: Array) -> Array:
+        """Return positions (n, 3) [m] with an obstacle, on which the force acts as well, moved out
+        of the body by its deepest penetration; the given ones for other forces.
+
+        Parameters
+        ----------
+        places : (n, 3) array
+            Positions of the nodes [m]; not modified.
+        shape : (n, 3) array
+            Positions [m] at which the penetration is determined.
+        """
+        return places
+
     @abstractmethod
     def add_derivatives(
         self,

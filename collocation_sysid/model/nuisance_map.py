@@ -31,11 +31,7 @@ from ..fem.laws.constants import unit_of, without_unit
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp, prescribed_nodes
 from ..recording.loads import Force, LoadTime, PointMass
-from ..recording.measured_wrench import COMPONENTS, UNITS, Wrench
 from ..recording.nuisance import (
-    DEPTH_BIAS,
-    DEPTH_EDGE,
-    DEPTH_SCALE,
     GAUGE,
     GRASP_SHIFT,
     GRASP_TURN,
@@ -799,12 +795,12 @@ def _components(
             (each.name for each in experiment.obstacles),
             len(experiment.body_grasps),
         )
-    if of == "depth":
-        return enumerate(depth.name for depth in experiment.depths)
+    if of == "camera":
+        return enumerate(experiment.camera_names)
     if of == "load":
         return enumerate(which for which, _ in _timed_loads(experiment))
     if of == "sensor":
-        count = len(_wrenches(experiment))
+        count = len(experiment.sensors_by_grasp)
         return [(k, f" {k + 1}" if count > 1 else "") for k in range(count)]
     if of == "tendon":
         return enumerate(tendon.name for tendon in experiment.tendons)
@@ -825,7 +821,7 @@ def _component_axes(
     row : NuisanceRow
         Kind of nuisance parameter.
     number : int
-        Index of the component among those of the kind `row.of`: a marker, grasp, wrench, camera, …
+        Index of the component among those of the kind `row.of`: a marker, grasp, sensor, camera, …
     """
     sigma = experiment.nuisance.sigma(row)
     names = row.axes.split() or [""]
@@ -835,40 +831,18 @@ def _component_axes(
     if not sigma:
         return []
     if row == TARE:
-        wrench = _wrenches(experiment)[number]
-        measured = np.flatnonzero(wrench.measured_components).tolist()
+        sensor = [*experiment.sensors_by_grasp.values()][number]
         return [
-            (k, COMPONENTS[k], UNITS[k], sigma * float(wrench.sigmas[k]))
-            for k in measured
+            (k, name, unit, sigma * sigma_k)
+            for k, name, unit, sigma_k in sensor.component_noises()
         ]
-    if row in (OBSTACLE_TILT, OBSTACLE_TIME):
-        obstacle = experiment.grasps[number]
-        assert isinstance(obstacle, Obstacle)
-        if not (
-            obstacle.shape.has_tilt
-            if row == OBSTACLE_TILT
-            else len(obstacle.poses.t_s) > 1
-        ):
-            return []
-    if (
-        row in (DEPTH_BIAS, DEPTH_SCALE)
-        and experiment.depths[number].camera.matrix is None
-    ):
-        return []
-    if row == DEPTH_EDGE and not len(experiment.depths[number].images_m):
+    if not row.applies_to(experiment, number):
         return []
     axes = [(axis, name, row.unit, sigma) for axis, name in enumerate(names)]
     return [
         each
         for each in axes
         if row != ZERO or each[1] in experiment.grasps[number].zero
-    ]
-
-
-def _wrenches(experiment: Experiment) -> list[Wrench]:
-    """Return the wrench sensors of grasps and obstacles, without None for those that have none."""
-    return [
-        grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None
     ]
 
 

@@ -32,8 +32,8 @@ from ..recording.formats.units import si_factor
 from .recording_schema import (
     DisplacementSection,
     ExperimentSection,
+    ForceSensorSection,
     TableSection,
-    WrenchSection,
 )
 
 # What the time is called in a table some of whose columns have names of the user's own: beside
@@ -179,21 +179,21 @@ def add_displacement(
     table.add(layout, {key: values[key] for key in chosen}, known)
 
 
-def add_wrench(
-    table: BenchTable, layout: WrenchSection, at_s: Array, wrench: Array
+def add_loads(
+    table: BenchTable, layout: ForceSensorSection, at_s: Array, loads: Array
 ) -> None:
-    """Add a wrench to a table, in place, such that `read_wrench` reads it back.
+    """Add measured forces and torques to a table, in place, such that they are read back.
 
     Parameters
     ----------
     table : BenchTable
-    layout : WrenchSection
-        Sign, axis and symmetry; the wrench of a body that the problem models in part is multiplied
+    layout : ForceSensorSection
+        Sign, axis and symmetry; the loads of a body that the problem models in part are multiplied
         by `symmetry`. The stress is written instead of the force if `area_m2` is stated.
     at_s : (S,) array
         Times of the samples [s]. Each is assigned to the nearest row; other rows are left blank.
-    wrench : (S, 6) array
-        Wrench on the modelled part: fx, fy, fz [N], tx, ty, tz [N m]; NaN where not measured.
+    loads : (S, 6) array
+        Loads on the modelled part: fx, fy, fz [N], tx, ty, tz [N m]; NaN where not measured.
 
     Raises
     ------
@@ -208,7 +208,7 @@ def add_wrench(
     """
     rows = np.searchsorted((table.t_s[1:] + table.t_s[:-1]) / 2, at_s)
     six_components = np.full((len(table.t_s), 6), np.nan)
-    six_components[rows] = layout.sign * layout.symmetry * wrench
+    six_components[rows] = layout.sign * layout.symmetry * loads
     components = [quantity.key for quantity in (*FORCES, *TORQUES)]
     values = dict(zip(components, six_components.T, strict=True))
     column = f"f{layout.axis}"
@@ -233,11 +233,11 @@ def _named_quantities(layout: TableSection) -> list[str]:
 def bench_tables(
     section: ExperimentSection,
     experiment: Experiment,
-    wrenches: Iterable[Array],
+    loads: Iterable[Array],
 ) -> dict[str, BenchTable]:
     """Return the tables of a test bench that a simulation writes, by file name, see `table_name`.
 
-    Displacements are written at the times of the poses, wrenches into the same table if the file is
+    Displacements are written at the times of the poses, loads into the same table if the file is
     the same, else at their own times. Nothing is written to disk.
 
     Parameters
@@ -246,8 +246,8 @@ def bench_tables(
         Table of the experiment in the problem file, which states the layout of the files.
     experiment : Experiment
         Simulated experiment, with the grasps and obstacles of `section` in the same order.
-    wrenches : iterable of (S, 6) array
-        Simulated wrench of each grasp or obstacle with a sensor, at its own times [N, N m].
+    loads : iterable of (S, 6) array
+        Simulated force and torque of each grasp or obstacle with a sensor, at its own times [N, N m].
 
     Raises
     ------
@@ -258,7 +258,7 @@ def bench_tables(
     declared_tables = [
         t
         for each in section.moved_sections
-        for t in (each.displacement, each.wrench)
+        for t in (each.displacement, each.sensor)
         if t
     ]
     time = (
@@ -277,12 +277,12 @@ def bench_tables(
                 grasp=grasp,
                 rest_length_m=strain_length_m(layout, experiment.body),
             )
-    measured = iter(wrenches)
+    measured = iter(loads)
     for declared, grasp in moved:
-        if (sensed := declared.wrench) is not None and grasp.wrench is not None:
-            at_s = grasp.wrench.t_s
+        if (sensed := declared.sensor) is not None and grasp.has_sensor:
+            at_s = grasp.load_times_s
             table = tables.setdefault(
                 table_name(section, sensed), BenchTable(at_s, time)
             )
-            add_wrench(table, sensed, at_s=at_s, wrench=next(measured))
+            add_loads(table, sensed, at_s=at_s, loads=next(measured))
     return tables

@@ -325,19 +325,12 @@ def _smallest_size(
 
 def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     """Return the paths of the data files that a problem names, in `folder`, whether or not they
-    exist; Python files and poses of depth cameras are not among them.
+    exist; Python files and poses of cameras are not among them.
     """
     names = [file.object.mesh, file.object.surface]
     names += [section.file for section in file.specimens]
     for section in file.recordings:
-        names += [
-            section.markers.file,
-            *(each.file for each in (*section.reading, *section.depth)),
-        ]
-        for grasp in section.moved_sections:
-            displacement_file = section.file_of(grasp.displacement)
-            wrench_file = section.file_of(grasp.wrench)
-            names += [grasp.poses or displacement_file, wrench_file]
+        names += section.measurement_files
         for _, word, kind in LOADS:
             keys = [
                 key.name for _, key in keys_of(kind) if key.constant is not None

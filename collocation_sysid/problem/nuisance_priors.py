@@ -218,7 +218,7 @@ class DisplacementZeroPrior(NuisancePriorSection):
 
 class ObstaclePrior(NuisancePriorSection):
     """Prior of a nuisance parameter: a constant offset of each obstacle along its normal, or along
-    the axis of its displacement, which changes the beginning of the contact.
+    the axis of its displacement, which changes when it touches the body.
 
     Attributes
     ----------
@@ -315,8 +315,8 @@ class JoiningPrior(NuisancePriorSection):
 
 
 class TarePrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: a constant offset of each component of a wrench, in multiples
-    of its sigma.
+    """Prior of a nuisance parameter: a constant offset of each component of a force sensor, in
+    multiples of its sigma.
 
     Attributes
     ----------
@@ -330,7 +330,7 @@ class TarePrior(NuisancePriorSection):
 
 
 class SensorTimePrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: delay of the measured wrenches; at most three standard
+    """Prior of a nuisance parameter: delay of the force sensors; at most three standard
     deviations.
 
     Attributes

@@ -105,7 +105,7 @@ class NuisanceSection(Section):
         A constant offset of each displacement along each of its axes: prior_m, 0.1 mm by default.
     obstacle : ObstaclePrior or "none", optional
         A constant offset of each obstacle along its normal, or along the axis of its displacement,
-        which changes the beginning of the contact: prior_m, 0.1 mm by default. A constant tilt of
+        which changes when it touches the body: prior_m, 0.1 mm by default. A constant tilt of
         each obstacle that is a plane or a box, about its point or middle: prior_rad. Delay of each
         obstacle's motion, to first order: prior_s.
     tension_factor : TensionFactorPrior or "none", optional
@@ -122,10 +122,10 @@ class NuisanceSection(Section):
         Delay with which each point mass or force begins or ends, if it does so within the
         recording: prior_s, 10 ms by default.
     tare : TarePrior or "none", optional
-        A constant offset of each component of a wrench, in multiples of its sigma: prior_sigmas, 10
+        A constant offset of each component of a force sensor, in multiples of its sigma: prior_sigmas, 10
         by default.
     sensor_time : SensorTimePrior or "none", optional
-        Delay of the measured wrenches; at most three standard deviations: prior_s, 5 ms by default.
+        Delay of the force sensors; at most three standard deviations: prior_s, 5 ms by default.
     sensor_lag : SensorLagPrior or "none", optional
         Time constant of a first-order low-pass in the sensor; between zero and three
         standard deviations of its prior: prior_s.

@@ -1,7 +1,7 @@
 """Coordinate frames of an experiment whose files are topics of logs.
 
 The world of an experiment is the frame of its poses. The log's static transforms relate it to the
-frames of gravity, of the markers and of wrench sensors.
+frames of gravity, of the markers and of force sensors.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from ..recording.formats.log_frames import (
     topic_frames,
 )
 from ..recording.formats.logs import TopicAddress
-from ..recording.measured_wrench import Frame
-from .recording_schema import ExperimentSection, WrenchSection
+from ..recording.poses import Frame
+from .recording_schema import ExperimentSection, ForceSensorSection
 
 # Names of frames that are level by convention, or their endings; the first are more reliable.
 LEVEL_FRAMES = ("world", "map", "odom", "base_link", "base", "base_footprint")
@@ -37,7 +37,7 @@ SMALLEST_TILT_DEG = 1.0
 
 @dataclass(frozen=True)
 class SensorMounting:
-    """Pose of a wrench sensor, from the transforms of a log.
+    """Pose of a force sensor, from the transforms of a log.
 
     Attributes
     ----------
@@ -66,24 +66,24 @@ class SensorMounting:
         return float(np.degrees(rotation.magnitude()))
 
     def rotate(self, values: Array) -> Array:
-        """Return wrenches (S, 6) in the sensor's axes, expressed in the axes of `frame`; NaN if any
+        """Return forces and torques (S, 6) in the sensor's axes, expressed in the axes of `frame`; NaN if any
         component of the force, or of the torque, is missing.
         """
         rows = values.reshape(-1, 2, 3) @ self.pose[:3, :3].T
         return rows.reshape(-1, 6)
 
     def describe(self) -> str:
-        """Return a sentence about what was done with the wrench."""
+        """Return a sentence about what was done with the measured forces."""
         owner = "the body" if self.frame == "grasp" else "the world"
         return (
-            f"the wrench is measured in {self.sensor!r}: by the static transforms of the log its "
+            f"the force is measured in {self.sensor!r}: by the static transforms of the log its "
             f"components are rotated by {self.angle_deg:.3g}° to the axes of {owner}, and its "
             f"torques are about the point {point_text(self.point_m)} m "
             f"{'of the undeformed body' if self.frame == 'grasp' else 'in the world'}; other "
             "axes are stated by frame and point_m"
         )
 
-    def contradicts(self, section: WrenchSection) -> bool:
+    def contradicts(self, section: ForceSensorSection) -> bool:
         """Whether a table states the same frame, but other axes or another point, see
         `LARGEST_ROTATION_DEG` and `LARGEST_OFFSET_M`.
         """
@@ -139,14 +139,14 @@ class RecordingFrames:
 
     @cached_property
     def transforms(self) -> LogFrames | None:
-        """Transforms of the log of the first poses, else of the markers or of a wrench; None if all
-        are files.
+        """Transforms of the log of the first poses, else of the markers or of a force sensor; None
+        if all are files.
         """
         section = self.section
         names = [
             *(each.poses for each in section.moved_sections),
             section.markers.file,
-            *(section.file_of(each.wrench) for each in section.moved_sections),
+            *(section.file_of(each.sensor) for each in section.moved_sections),
         ]
         for name in filter(None, names):
             if (address := TopicAddress.from_path(self.folder / name)) is None:
@@ -279,12 +279,12 @@ class RecordingFrames:
             )
         return ""
 
-    # Wrenches -------------------------------------------------------------------------------------
+    # Force sensors --------------------------------------------------------------------------------
 
     def sensor_mounting(
-        self, section: WrenchSection, key: str, k: int
+        self, section: ForceSensorSection, key: str, k: int
     ) -> SensorMounting | None:
-        """Return the pose of the wrench sensor of a grasp in the body, else in the world.
+        """Return the pose of the force sensor of a grasp in the body, else in the world.
 
         The sensor's frame is `sensor_frame`, else that of the log's messages. None if no frame is
         known, or if none is stated and static transforms connect it neither with the frame whose
@@ -292,7 +292,7 @@ class RecordingFrames:
 
         Parameters
         ----------
-        section : WrenchSection
+        section : ForceSensorSection
         key : str
             Dotted key of the section, for messages.
         k : int
@@ -330,8 +330,8 @@ class RecordingFrames:
                 self._require_static_transform(child or self.world, sensor)
         return None
 
-    def _sensor_frame(self, section: WrenchSection) -> str:
-        """Return the name of the frame of a wrench, stated or of its messages; empty if unknown."""
+    def _sensor_frame(self, section: ForceSensorSection) -> str:
+        """Return the name of the frame of a sensor, stated or of its messages; empty if unknown."""
         if section.sensor_frame is not None:
             return section.sensor_frame
         if (file := self.section.file_of(section)) is None:
@@ -340,9 +340,9 @@ class RecordingFrames:
         return frames.parent if frames is not None else ""
 
     def sensor_note(
-        self, section: WrenchSection, mounting: SensorMounting | None
+        self, section: ForceSensorSection, mounting: SensorMounting | None
     ) -> str:
-        """Return a note on the axes of a wrench: those that the log gives, or that the stated ones
+        """Return a note on the axes of a force sensor: those that the log gives, or that the stated ones
         contradict the log, or that the frame of the messages is not connected; else "".
         """
         file = self.section.file_of(section)
@@ -351,7 +351,7 @@ class RecordingFrames:
             if not sensor or section.states_axes or sensor == self.world:
                 return ""
             return (
-                f"{file}: the wrench is measured in {sensor!r}, which no static transform of the "
+                f"{file}: the force is measured in {sensor!r}, which no static transform of the "
                 "log connects with the gripper or the poses: its components are taken along the "
                 "axes of the world; state sensor_frame, or frame and point_m"
             )

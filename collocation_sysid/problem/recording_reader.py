@@ -64,11 +64,11 @@ from .problem_size import MOST_SAMPLES, Say, Size, require_feasible
 from .recording_frames import RecordingFrames
 from .recording_schema import (
     ExperimentSection,
+    ForceSensorSection,
     GraspSection,
     ObstacleSection,
     ReadingSection,
     TableSection,
-    WrenchSection,
 )
 
 Moved = GraspSection | ObstacleSection
@@ -366,8 +366,8 @@ class RecordingReader:
         arguments: dict[str, Any] = defaults | declared_in(
             section, kind, where=self._grasp_key(k)
         )
-        wrench = section.wrench and self._wrench(
-            section.wrench, self._grasp_key(k, word), k=k, t_s=t_s
+        wrench = section.sensor and self._wrench(
+            section.sensor, self._grasp_key(k, word), k=k, t_s=t_s
         )
         with located(where=self._grasp_key(k)):
             grasp = kind(
@@ -385,7 +385,7 @@ class RecordingReader:
     # What is measured, and what acts --------------------------------------------------------------
 
     def _read_wrench(
-        self, section: WrenchSection, key: str
+        self, section: ForceSensorSection, key: str
     ) -> tuple[Array, Array]:
         """Return times (S,) [s] and values (S, 6) [N, N m] of a wrench's file, divided by the
         section's `symmetry`; `key` is that of the section, for messages.
@@ -400,7 +400,7 @@ class RecordingReader:
         )
 
     def _wrench(
-        self, section: WrenchSection, key: str, k: int, t_s: Array
+        self, section: ForceSensorSection, key: str, k: int, t_s: Array
     ) -> Wrench:
         """Return the measured wrench within the times t_s of the experiment, and note how many
         samples are used.
@@ -413,7 +413,7 @@ class RecordingReader:
 
         Parameters
         ----------
-        section : WrenchSection
+        section : ForceSensorSection
         key : str
             Dotted key of the section, for messages.
         k : int
@@ -734,9 +734,9 @@ class RecordingReader:
         """
         section = self.section
         wrench_sections = [
-            (k, grasp.wrench)
+            (k, grasp.sensor)
             for k, grasp in enumerate(section.moved_sections)
-            if grasp.wrench
+            if grasp.sensor
         ]
         if not (
             wrench_sections

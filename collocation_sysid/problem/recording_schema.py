@@ -23,9 +23,9 @@ from ..recording.depth_camera import Background, PoseMatrix
 from ..recording.experiment import EARTH_M_S2, Kind, StartRule
 from ..recording.grasp import Axes
 from ..recording.markers import Places
-from ..recording.measured_wrench import Frame
 from ..recording.node_selection import Nodes
 from ..recording.placement import AttachmentRule
+from ..recording.poses import Frame
 from ..recording.solid_sections import SolidSection
 from .load_schema import (
     ForceSection,
@@ -127,7 +127,7 @@ class DisplacementSection(TableSection):
         return self
 
 
-class WrenchSection(TableSection):
+class ForceSensorSection(TableSection):
     """The measured force and torque that the grasp or the obstacle exerts on the body.
 
     The table has the column t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, in these or
@@ -173,7 +173,7 @@ class WrenchSection(TableSection):
         return bool({"frame", "point_m"} & self.model_fields_set)
 
     @model_validator(mode="after")
-    def _require_one_frame(self) -> WrenchSection:
+    def _require_one_frame(self) -> ForceSensorSection:
         """Return the section itself; raise `ValueError` for sensor_frame with frame or point_m."""
         if self.sensor_frame is not None and self.states_axes:
             raise ValueError(
@@ -286,10 +286,10 @@ class GraspSection(MovedSection):
         Selection: a table of box_m, ball_m, face or indices, or the name of a point array or
         physical group.
     from_s : float, optional
-        First time [s] of the grasp or contact; the start of the recording by default.
+        First time [s] at which the grasp or obstacle acts; the start of the recording by default.
     until_s : float, optional
-        Last time [s] of the grasp or contact; the end of the recording by default. If a grasp ends
-        at the first sample, the body is released from its equilibrium in this grasp.
+        Last time [s] at which the grasp or obstacle acts; the end of the recording by default. If a
+        grasp ends at the first sample, the body is released from its equilibrium in this grasp.
     sigma_m : float, optional
         Standard deviation of the noise in each position of the poses [m]; estimated from their
         roughness by default.
@@ -298,7 +298,7 @@ class GraspSection(MovedSection):
         roughness of the poses by default.
     axes : {"x", "y", "z", "xy", "xz", "yz", "xyz"}
         Axes of the world along which the nodes are prescribed; they slide along the others.
-    wrench : WrenchSection, optional
+    wrench : ForceSensorSection, optional
         Measured force and torque on the body: file, sigma_n, sigma_nm, …
     """
 
@@ -308,7 +308,12 @@ class GraspSection(MovedSection):
     sigma_m: NotNegative | None = None
     sigma_rad: NotNegative | None = None
     axes: Axes = "xyz"
-    wrench: WrenchSection | None = None
+    wrench: ForceSensorSection | None = None
+
+    @property
+    def sensor(self) -> ForceSensorSection | None:
+        """Table of the measured force and torque; None if they are not measured."""
+        return self.wrench
 
 
 class ObstacleSection(MovedSection):
@@ -317,10 +322,10 @@ class ObstacleSection(MovedSection):
     Attributes
     ----------
     from_s : float, optional
-        First time [s] of the grasp or contact; the start of the recording by default.
+        First time [s] at which the grasp or obstacle acts; the start of the recording by default.
     until_s : float, optional
-        Last time [s] of the grasp or contact; the end of the recording by default. If a grasp ends
-        at the first sample, the body is released from its equilibrium in this grasp.
+        Last time [s] at which the grasp or obstacle acts; the end of the recording by default. If a
+        grasp ends at the first sample, the body is released from its equilibrium in this grasp.
     sigma_m : float, optional
         Standard deviation of the noise in each position of the poses [m]; estimated from their
         roughness by default.
@@ -348,7 +353,7 @@ class ObstacleSection(MovedSection):
     slip : float, optional
         Sliding speed [m/s], or slip from sample to sample [m] of a static experiment, at which
         friction is 0.7 of its limit.
-    force : WrenchSection, optional
+    force : ForceSensorSection, optional
         Measured force on the body: file, sigma_n, …
     """
 
@@ -364,11 +369,11 @@ class ObstacleSection(MovedSection):
     stiffness_pa_m: Positive | None = None
     width_m: Positive | None = None
     slip: Positive | None = None
-    force: WrenchSection | None = None
+    force: ForceSensorSection | None = None
 
     @property
-    def wrench(self) -> WrenchSection | None:
-        """Measured force, under the name that grasps have for it."""
+    def sensor(self) -> ForceSensorSection | None:
+        """Table of the measured force; None if it is not measured."""
         return self.force
 
 
@@ -700,6 +705,22 @@ class ExperimentSection(NamedSection):
         (None), or neither names one.
         """
         return table and (table.file or self.file)
+
+    @property
+    def measurement_files(self) -> list[str | None]:
+        """Files of markers, custom sensors, depth cameras, grasps and obstacles; None for those
+        that are not named.
+        """
+        names = [
+            self.markers.file,
+            *(each.file for each in (*self.reading, *self.depth)),
+        ]
+        for grasp in self.moved_sections:
+            names += [
+                grasp.poses or self.file_of(grasp.displacement),
+                self.file_of(grasp.sensor),
+            ]
+        return names
 
     @property
     def grasp_list(self) -> list[GraspSection]:

@@ -11,9 +11,10 @@ Transcription
     variables that are otherwise eliminated have equations of their own.
 Measurements
     `observables` are measurable quantities, `observable_response` linearises them along the
-    equations of motion, and `measurement_residual` compares them with data. `custom_sensor_residual`
-    is the measurement of a custom sensor; the packages `markers`, `wrench` and `depth` contain the
-    other kinds. `reaction_forces` are those of grasps.
+    equations of motion, and `measurement_residual` compares them with data. Residuals of
+    force–torque sensors are in `wrench_residual`, of custom sensors in `custom_sensor_residual`,
+    of others in the packages `markers` and `depth`. The package `reactions` contains the reactions
+    of grasps.
 Linear algebra
     `sweep` solves the linearised equations of motion forward and backward in time,
     `least_squares` accumulates normal equations in square-root form, `stopwatch` measures time, and

@@ -14,8 +14,8 @@ x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axi
                    see `program.shared_nuisances`
 =================  =========================================================================
 
-History variables, reaction forces, wrenches and contact pressures are eliminated. A subclass,
-`lifted.lifted_collocation.LiftedCollocation`, has them as variables at the end of z, with equations
+History variables, reaction forces, their resultants and pressures of obstacles are eliminated. A
+subclass, `lifted.lifted_collocation.LiftedCollocation`, has them as variables at the end of z, with equations
 at the end of g.
 
 Constraints g, in this order:
@@ -252,12 +252,12 @@ class Collocation:
     @property
     def associated_count(self) -> int:
         """Number of scalar measurements that belong to the body at the present estimates: those
-        that are compared, and the points of depth cameras that are left out because of a crease.
+        that are compared, and the points of cameras that are left out because of a crease.
         """
         return self.measurement_count + sum(
-            each.correspondences.excluded_counts["crease"]
+            reading.uncompared_count
             for segment in self.transcriptions
-            for each in segment.depths
+            for reading in segment.residuals
         )
 
     @property
@@ -400,8 +400,7 @@ class Collocation:
         p : (nq + nphi,) array
             Parameters; not modified.
         positions : sequence of (rows, 3n) arrays
-            First rows of each experiment [m], which depth cameras need; empty without depth
-            cameras.
+            First rows of each experiment [m], which cameras need; empty without cameras.
 
         Returns
         -------
@@ -431,8 +430,8 @@ class Collocation:
         positions: Sequence[Array],
         only_poses: bool = False,
     ) -> tuple[Collocation, Array]:
-        """Return the program with unknown marker places and depth cameras initialised before a
-        solve, and p in it; see `Transcription.place_unknown_markers`.
+        """Return the program with unknown marker places and poses of cameras initialised before
+        a solve, and p in it; see `Transcription.place_unknown_markers`.
 
         Parameters
         ----------
@@ -447,7 +446,7 @@ class Collocation:
         -------
         (Collocation, array)
             The program with the new associations, and p in it; self and p if no experiment has
-            unknown places or depth cameras.
+            unknown places or cameras.
         """
         if not any(segment.rows_to_place for segment in self.transcriptions):
             return self, p

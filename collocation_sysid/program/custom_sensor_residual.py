@@ -32,7 +32,7 @@ from .measurement_residual import (
     neighbouring_times,
 )
 from .observables import ObservedMotion, PointPositions
-from .wrench.wrench_observable import GraspWrench, ReactionGrid
+from .reactions.reaction_resultant import ReactionGrid, ReactionResultant
 
 # Grid times around a sample, for positions, velocities and accelerations.
 NEIGHBOURS = 5
@@ -295,7 +295,7 @@ def custom_sensor_residuals(
         else:
             grasp = experiment.grasps[gauge.grasp - 1]
             origin = np.zeros(3)
-            channel = GraspWrench.from_experiment(
+            channel = ReactionResultant.from_experiment(
                 experiment,
                 grasp,
                 frame=gauge.frame,

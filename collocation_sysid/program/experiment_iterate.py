@@ -18,11 +18,9 @@ from ..common.array_types import Array
 from ..fem.body import Linearisation
 from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.internal_variables import AnyHistory
-from .depth.depth_residual import DepthResidual
-from .depth.outline_residual import OutlineResidual
 from .measurement_residual import Observable
 from .observables import ObservedMotion, ReactionForces
-from .reaction_forces import reaction_vjp, reactions_at
+from .reactions.reaction_forces import reaction_vjp, reactions_at
 from .transcription import Transcription
 
 
@@ -44,8 +42,8 @@ class ExperimentIterate:
         History variables by the index of the history, where they are variables of the program;
         others follow from x.
     lifted_pressures : mapping of int to array
-        Contact variables b (1, N, i) by the index of the force, where contact is a complementarity
-        problem (see `model.contact`); others follow from x.
+        Pressure variables b (1, N, i) of obstacles by the index of the force, where pressure and
+        gap are complementary; others follow from x.
     lifted_observables : mapping of int to array
         Observables by the index of the measurement, where they are variables of the program; others
         follow from x.
@@ -70,11 +68,11 @@ class ExperimentIterate:
     @cached_property
     def histories(self) -> tuple[AnyHistory, ...]:
         """History variables of the body and of forces at all evaluations, then forces of
-        complementary contact with given pressures: lifted ones where they are variables, otherwise
+        obstacles with given pressures: lifted ones where they are variables, otherwise
         computed from the positions.
         """
         dynamics = self.equations.dynamics
-        pressed = dynamics.contact_with_pressures(self.x, self.lifted_pressures)
+        pressed = dynamics.forces_with_pressures(self.x, self.lifted_pressures)
         return (*dynamics.histories(self.x, self.lifted_histories), *pressed)
 
     @cached_property
@@ -108,41 +106,6 @@ class ExperimentIterate:
             )
             for k, reading in enumerate(self.segment.residuals)
         ]
-
-    @property
-    def depth_residuals(self) -> list[tuple[DepthResidual, Array]]:
-        """Measurement models of the depth cameras, each with the values (n, e, 3) of its
-        observable: positions of the surface nodes [m].
-        """
-        return self.surface_residuals[: len(self.segment.depths)]
-
-    @property
-    def surface_residuals(self) -> list[tuple[DepthResidual, Array]]:
-        """Measurement models of the depth cameras, then of the outlines, each with the values (n,
-        e, 3) of its observable.
-        """
-        readings = (*self.segment.depths, *self.segment.outlines)
-        return [
-            *zip(
-                readings,
-                self.observables[len(self.observables) - len(readings) :],
-                strict=True,
-            )
-        ]
-
-    @property
-    def outline_distances_px(self) -> list[tuple[OutlineResidual, Array]]:
-        """Measurement models of the outlines, each with the signed distances (n,) of outline points
-        from their edges [pixels]; points without an edge are left out.
-        """
-        distances = []
-        for reading, observation in self.surface_residuals[
-            len(self.segment.depths) :
-        ]:
-            assert isinstance(reading, OutlineResidual)
-            distances_px = reading.signed_distances_px(observation, self.phi)
-            distances.append((reading, distances_px[np.isfinite(distances_px)]))
-        return distances
 
     @property
     def loss(self) -> float:
@@ -229,8 +192,8 @@ class ExperimentIterate:
         Returns
         -------
         list of (array, array)
-            For each measurement, residuals (s, G, 3) and derivatives (s, G, 3, k). Wrenches are
-            included, with the reaction forces of the motion.
+            For each measurement, residuals (s, G, 3) and derivatives (s, G, 3, k), also
+            for sensors of reactions, with the reaction forces of the motion.
         """
         none = np.zeros(0, dtype=np.int64)
         count = len(self.phi)
@@ -252,8 +215,8 @@ class ExperimentIterate:
         return linearised
 
     def predict_wrenches(self) -> list[Array]:
-        """Return the prediction (S, 6) for each wrench sensor [N, N m]; NaN at samples for which
-        the rows of x do not suffice.
+        """Return the prediction (S, 6) for each force–torque sensor [N, N m]; NaN at samples for
+        which the rows of x do not suffice.
         """
         return [
             sensor.predict_reactions(self.reactions, self.phi)

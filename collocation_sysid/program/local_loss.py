@@ -1,7 +1,8 @@
 """Second derivatives of the loss by positions and nuisance parameters, for local observables.
 
 An observable is local if it depends on few positions at each time, such as the place of a marker.
-Wrenches are not; programs that need their second derivatives lift them, see `lifted_wrenches`.
+Resultants of reactions are not; programs that need their second derivatives lift them, see
+`lifted_resultants`.
 """
 
 from __future__ import annotations

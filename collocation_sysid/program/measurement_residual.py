@@ -26,13 +26,13 @@ from ..common.array_types import Array, Index
 from ..model.generated_functions import GeneratedFunction
 from ..model.nuisance_map import NuisanceMap
 from .observables import ObservableDerivatives, PointPositions, SparseEntries
-from .wrench.wrench_observable import GraspWrench, ReactionGrid
+from .reactions.reaction_resultant import ReactionGrid, ReactionResultant
 
 # Numbers of a vector [x, y, z], whose residuals share a weight of Huber's loss.
 GROUP = 3
 
 # Observables of measurements.
-Observable = PointPositions | GraspWrench
+Observable = PointPositions | ReactionResultant
 
 T = TypeVar("T", float, ca.SX)
 Expression = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
@@ -378,6 +378,13 @@ class MeasurementResidual(ABC):
         """
         return np.ones(len(self.t_s), dtype=bool)
 
+    @property
+    def uncompared_count(self) -> int:
+        """Number of scalar measurements that belong to the body at the present estimates but are
+        not compared; 0 for most kinds.
+        """
+        return 0
+
     def rough_residuals(self, x: Array, phi: Array) -> Array | None:
         """Return residuals for ranking first guesses, or None if the ordinary residuals are
         suitable, as here.
@@ -426,10 +433,10 @@ class MeasurementResidual(ABC):
             "measured": measured,
             "is_compared": is_compared,
         }
-        is_wrench = isinstance(self.observable, GraspWrench)
+        is_resultant = isinstance(self.observable, ReactionResultant)
         times = (
             {"reaction_grid": ReactionGrid.from_times(known_s)}
-            if is_wrench
+            if is_resultant
             else {"rows": np.arange(len(known_s))}
         )
         changes["observable"] = replace(self.observable, **times)

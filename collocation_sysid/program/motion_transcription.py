@@ -45,9 +45,9 @@ from .linear_algebra.block_band import (
     skew_block_band,
 )
 from .motion_jacobian import MotionJacobian, shifted_back
+from .reactions.reaction_resultant import ReactionGrid, sensed_dofs
 from .shared_nuisances import NuisanceIndices
-from .wrench.wrench_observable import ReactionGrid, sensed_dofs
-from .wrench.wrench_residual import WrenchResidual, wrench_residuals
+from .wrench_residual import WrenchResidual, wrench_residuals
 
 T = TypeVar("T", bound=np.generic)
 # Coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v from the stencils (p, q) of two positions, see

@@ -2,7 +2,7 @@
 derivatives.
 
 An observable has values c (n, e, 3) at n of the grid times: positions of e points of the body
-(`PointPositions`, here), or force and torque of a grasp (`wrench_observable.GraspWrench`).
+(`PointPositions`, here), or force and torque of a grasp (`ReactionResultant`).
 `measurement_residual` turns them into residuals. An observable is `local` if it depends on few
 positions at each time; then it provides derivatives by these positions. Other observables can be
 lifted to variables of the program, see `lifted_variables`.
@@ -349,7 +349,7 @@ class PointPositions:
         """Return the changes of the values due to sensor frames moved by pose errors: 0 for points
         of the body.
 
-        The signature is that of `GraspWrench.frame_changes`.
+        The signature is that of `ReactionResultant.frame_changes`.
         """
         return 0.0
 

@@ -30,9 +30,9 @@ from .forward.newmark import simulate_newmark
 from .forward.newton_solver import NewtonOptions
 from .forward.scheme_simulation import Progress, simulate_scheme
 from .observables import ObservedMotion, ReactionForces
-from .reaction_forces import reactions_at
-from .wrench.wrench_observable import ReactionGrid, sensed_dofs
-from .wrench.wrench_residual import wrench_residuals
+from .reactions.reaction_forces import reactions_at
+from .reactions.reaction_resultant import ReactionGrid, sensed_dofs
+from .wrench_residual import wrench_residuals
 
 # Name of the integrator that is no collocation scheme.
 NEWMARK = "newmark"

@@ -18,7 +18,6 @@ from ..common.array_types import Array, Index
 from ..fem.laws.constants import GAMMA_M, without_region
 from ..model.dynamics import StencilRow
 from ..recording.experiment import Experiment
-from ..recording.measured_wrench import Wrench
 from ..recording.poses import Poses, PoseSequence
 from .collocation import Collocation
 from .custom_sensor_residual import NEIGHBOURS as GAUGE_NEIGHBOURS
@@ -28,11 +27,13 @@ from .least_squares import SquareRootInformation
 from .markers.marker_residual import NEIGHBOURS, MarkerResidual
 from .measurement_residual import MeasurementResidual
 from .observables import PointPositions
+from .reactions.grasp_reactions import DELAY_STEPS, Sensor
+from .reactions.reaction_resultant import (
+    TIMES_PER_SAMPLE,
+    ReactionResultant,
+)
 from .sweep import Sweep
 from .transcription import Transcription
-from .wrench.grasp_reactions import DELAY_STEPS, Sensor
-from .wrench.wrench_observable import GraspWrench
-from .wrench.wrench_residual import NEIGHBOURS as WRENCH_NEIGHBOURS
 
 if TYPE_CHECKING:
     from ..fem.kernels.skyline import FactorMemory
@@ -113,7 +114,7 @@ class StreamInstrument(NamedTuple):
         Rows that its samples need.
     observable : slice or int
         Slice of its points among all observed points, those of the markers first; or the index of
-        the wrench in `StreamingModel.wrench_sensors`.
+        the resultant in `StreamingModel.reaction_sensors`.
     """
 
     reading: MeasurementResidual
@@ -341,17 +342,17 @@ class StreamingModel:
             channel = reading.observable
             is_custom = reading in self.segment.custom_sensors
             stencil = StreamStencil(GAUGE_NEIGHBOURS)
-            if isinstance(channel, GraspWrench):
-                observable = [other for other, _ in self.wrench_sensors].index(
-                    channel
-                )
+            if isinstance(channel, ReactionResultant):
+                observable = [
+                    other for other, _ in self.reaction_sensors
+                ].index(channel)
                 stencil = stencil._replace(
                     first=int(channel.known_rows[0]), delay=DELAY_STEPS
                 )
                 if not is_custom:
                     clock_error = channel.clock_limit_s / step_s
                     stencil = stencil._replace(
-                        neighbours=WRENCH_NEIGHBOURS, clock_error=clock_error
+                        neighbours=TIMES_PER_SAMPLE, clock_error=clock_error
                     )
             else:
                 points_of_sensor = next(points)
@@ -387,28 +388,20 @@ class StreamingModel:
         )
 
     @cached_property
-    def wrench_sensors(self) -> tuple[Sensor, ...]:
-        """Wrenches of grasps that sensors observe, each with the index of its grasp, from 0: those
-        of force–torque sensors, then of custom sensors.
+    def reaction_sensors(self) -> tuple[Sensor, ...]:
+        """Resultants of reactions that sensors observe, each with the index of its grasp, from 0:
+        those of force–torque sensors, then of custom sensors.
         """
         channels = [reading.observable for reading in self.segment.residuals]
         grasps = [id(grasp) for grasp in self.segment.experiment.grasps]
-        wrenches = (
-            channel for channel in channels if isinstance(channel, GraspWrench)
+        resultants = (
+            channel
+            for channel in channels
+            if isinstance(channel, ReactionResultant)
         )
         return tuple(
-            (channel, grasps.index(id(channel.grasp))) for channel in wrenches
+            (channel, grasps.index(id(channel.grasp))) for channel in resultants
         )
-
-    @cached_property
-    def wrenches(self) -> dict[int, Wrench]:
-        """Wrench sensors of the problem's recording, by the number of their grasp, from 1 on."""
-        pairs = enumerate(self.experiment.grasps, 1)
-        return {
-            number: grasp.wrench
-            for number, grasp in pairs
-            if grasp.wrench is not None
-        }
 
     @cached_property
     def moving_grasps(self) -> Index:
@@ -550,9 +543,7 @@ def _still_experiment(
         experiment,
         t_s=t_s,
         grasps=[
-            replace(
-                grasp, wrench=grasp.wrench and grasp.wrench.with_zeros_at(t_s)
-            )
+            grasp.with_zero_loads_at(t_s)
             for grasp in _grasps_at(experiment, _first_poses(experiment))
         ],
         markers=markers.with_samples(t_s, tracks),

@@ -32,6 +32,7 @@ from .observables import (
     ObservableDerivatives,
     ObservedMotion,
 )
+from .reactions.grasp_reactions import DELAY_STEPS, GraspReactions
 from .streaming_model import ROW_TOLERANCE, ROWS_PER_CHUNK, StreamingModel
 from .sweep import (
     FactorisedStep,
@@ -40,7 +41,6 @@ from .sweep import (
     PrescribedColumns,
     SweepColumns,
 )
-from .wrench.grasp_reactions import DELAY_STEPS, GraspReactions
 
 # Largest correction of a row, divided by the size of the body, after which the row is not
 # linearised again: the next correction would be about its square.
@@ -129,7 +129,7 @@ class LinearisedResidual(NamedTuple):
 
 
 # A row as `StoredRow`; positions and columns of markers and of the points of custom sensors,
-# (3M + …, 1 + m); and wrenches with their derivatives by all parameters, (sensors, 6, 1 + P).
+# (3M + …, 1 + m); and resultants with their derivatives by all parameters, (sensors, 6, 1 + P).
 ObservedRow = tuple[StoredRow, Array, Array]
 
 
@@ -322,14 +322,16 @@ class StreamingSweep:
             StoredRow(self.transformed, w[:, 0], columns=k.columns)
             for w, k in zip(columns_of_rows, stored, strict=True)
         ]
-        all_wrenches = np.array(
-            [wrenches for *_, wrenches in state.observed_rows]
+        all_resultants = np.array(
+            [resultants for *_, resultants in state.observed_rows]
         )
-        all_wrenches[..., 0] += all_wrenches[..., 1:] @ (
+        all_resultants[..., 0] += all_resultants[..., 1:] @ (
             (self.transformed - transformed) / old_rates
         )
-        all_wrenches[..., 1:] *= self.rates / old_rates
-        read = tuple(zip(stored_rows, point_columns, all_wrenches, strict=True))
+        all_resultants[..., 1:] *= self.rates / old_rates
+        read = tuple(
+            zip(stored_rows, point_columns, all_resultants, strict=True)
+        )
         reactions = state.reactions.moved_to(step, factors)
         return replace(
             state,
@@ -652,31 +654,33 @@ class StreamingSweep:
             zip(
                 stored_rows,
                 self._at_points(all_columns),
-                self._observed_wrenches(rows),
+                self._observed_resultants(rows),
                 strict=True,
             )
         )
         return stored_rows
 
-    def _observed_wrenches(self, here: slice) -> Array:
-        """Return wrenches of the sensors and their derivatives (rows, sensors, 6, 1 + P).
+    def _observed_resultants(self, here: slice) -> Array:
+        """Return the reaction resultants of the sensors and their derivatives (rows, sensors, 6, 1 + P).
 
         Index 0 of the last axis has the value [N, N m], the others the derivatives with respect to
-        p. At row k the wrench is that of `DELAY_STEPS` rows before. Rows before the first available
-        wrench are zero.
+        p. At row k the resultant is that of `DELAY_STEPS` rows before. Rows before the first available
+        resultant are zero.
         """
-        sensors = self.model.wrench_sensors
+        sensors = self.model.reaction_sensors
         size = self.model.parameter_count
-        wrenches = np.zeros((here.stop - here.start, len(sensors), 6, 1 + size))
+        resultants = np.zeros(
+            (here.stop - here.start, len(sensors), 6, 1 + size)
+        )
         if not sensors:
-            return wrenches
+            return resultants
         first = max(here.start, int(sensors[0][0].known_rows[0]) + DELAY_STEPS)
         if first >= here.stop:
-            return wrenches
+            return resultants
         stencils = self.model.stencils
         x = self.x[: here.stop, self.sensed]
         rows = np.arange(first, here.stop)
-        reactions, channels = self.reactions.wrenches(
+        reactions, channels = self.reactions.resultants(
             sensors,
             self.setting,
             x=x,
@@ -688,10 +692,10 @@ class StreamingSweep:
             value, slopes = channel.linearise(
                 motion, self.phi, columns=self.moving, size=size
             )
-            sensor_wrenches = wrenches[first - here.start :, k]
-            sensor_wrenches[..., 0] = value.reshape(-1, 6)
-            sensor_wrenches[..., 1:] = slopes.by_common.reshape(-1, 6, size)
-        return wrenches
+            sensor_resultants = resultants[first - here.start :, k]
+            sensor_resultants[..., 0] = value.reshape(-1, 6)
+            sensor_resultants[..., 1:] = slopes.by_common.reshape(-1, 6, size)
+        return resultants
 
     def _at_points(self, columns: Array) -> Array:
         """Interpolate columns (…, 3n, k) of nodal values at the markers and other observed points;
@@ -797,7 +801,7 @@ class StreamingSweep:
             stencil.rows_of_sample(min(at)).start,
             stencil.rows_of_sample(max(at)).stop,
         )
-        _, point_columns, wrenches = zip(
+        _, point_columns, resultants = zip(
             *(self.read[k + stencil.delay - self.row] for k in needed_rows),
             strict=True,
         )
@@ -817,7 +821,7 @@ class StreamingSweep:
             values = np.array(point_columns)[:, place]
         else:
             columns = np.arange(model.parameter_count)
-            values = np.array(wrenches)[:, observable]
+            values = np.array(resultants)[:, observable]
         values = values.reshape(len(needed_rows), -1, 3, 1 + len(columns))
         slopes = ObservableDerivatives.without_own(columns, values[..., 1:])
         residual, slope = sensor.linearise(

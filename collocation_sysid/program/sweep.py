@@ -41,7 +41,7 @@ from ..model.viscoelasticity import MemoryForwardColumns
 from .linear_algebra.block_band import Submatrix
 from .linear_algebra.factorisation import ACCURACY, Choice, Factor, Factoriser
 from .linear_algebra.lapack import one_blas_thread
-from .reaction_forces import GraspForces
+from .reactions.reaction_forces import GraspForces
 from .stopwatch import Stopwatch
 from .transcription import Transcription
 

@@ -86,7 +86,7 @@ class Transcription(MotionTranscription):
 
     @cached_property
     def residuals(self) -> tuple[MeasurementResidual, ...]:
-        """All measurement models: markers, wrench sensors, custom sensors, depth cameras,
+        """All measurement models: markers, force–torque sensors, custom sensors, depth cameras,
         outlines.
         """
         return (
@@ -100,7 +100,7 @@ class Transcription(MotionTranscription):
     @cached_property
     def local_loss(self) -> LocalLoss:
         """Second derivatives of the loss by x and φ of those measurements that depend on few
-        positions (`local` observables with at least one point); wrenches are not among them.
+        positions (`local` observables with at least one point); resultants of reactions are not among them.
         """
         pairs = (
             (reading, reading.observable.local) for reading in self.residuals

@@ -4,8 +4,8 @@ Begin with `experiment` (one recording with all its parts). Its parts are in:
 
 - `grasp`, `poses`, `measured_wrench`: prescribed displacements, the rigid motions that prescribe
   them, and measured reaction forces.
-- `obstacle`, `obstacle_solids`, `solid_sections`: rigid obstacles for contact, their shapes, and the
-  tables that state them.
+- `obstacle`, `obstacle_solids`, `solid_sections`: rigid obstacles, their shapes, and the tables that
+  state them.
 - `loads`, `tendon`, `pressure`, `actuator`: point masses, forces, tendons and pressures.
 - `markers`, `placement`: tracked markers and where they sit on the body.
 - `depth_camera`: depth cameras and scanners.
@@ -45,6 +45,8 @@ from .markers import Markers as Markers
 from .markers import Placement as Placement
 from .markers import place_markers as place_markers
 from .measured_wrench import Wrench as Wrench
+from .measured_wrench import read_wrench as read_wrench
+from .measured_wrench import write_wrench_csv as write_wrench_csv
 from .nuisance import Nuisance as Nuisance
 from .nuisance import NuisanceRow as NuisanceRow
 from .obstacle import Obstacle as Obstacle
@@ -60,7 +62,6 @@ from .pressure import Pressure as Pressure
 from .recording_writers import write_gauge_csv as write_gauge_csv
 from .recording_writers import write_markers_csv as write_markers_csv
 from .recording_writers import write_poses_csv as write_poses_csv
-from .recording_writers import write_wrench_csv as write_wrench_csv
 from .rigid_fit import align_to_template as align_to_template
 from .rigid_fit import fit_poses as fit_poses
 from .sample_times import sample_interval_s as sample_interval_s
@@ -68,4 +69,3 @@ from .specimen import Specimen as Specimen
 from .tendon import Tendon as Tendon
 from .time_tables import displaced_axes as displaced_axes
 from .time_tables import read_displacement as read_displacement
-from .time_tables import read_wrench as read_wrench

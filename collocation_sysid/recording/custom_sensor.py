@@ -19,7 +19,7 @@ from ..common.schema_tables import Vector
 from ..common.validated_types import AtLeastOne, Positive, Text
 from ..errors import InputError
 from .checked_arrays import read_only_floats
-from .measured_wrench import Frame
+from .poses import Frame
 from .sample_times import first_unordered_time
 
 

@@ -227,9 +227,23 @@ class Experiment:
         """Measured wrenches of the grasps that have a sensor, obstacles included, in the order of
         `grasps`.
         """
-        return tuple(
-            grasp.wrench for grasp in self.grasps if grasp.wrench is not None
-        )
+        return tuple(self.sensors_by_grasp.values())
+
+    @property
+    def camera_names(self) -> list[str]:
+        """Names of the depth cameras, in their order."""
+        return [camera.name for camera in self.depths]
+
+    @property
+    def sensors_by_grasp(self) -> dict[int, Wrench]:
+        """Measurements of the force–torque sensors by the number of their grasp or obstacle, from 1
+        on, in the order of `grasps`.
+        """
+        return {
+            number: grasp.wrench
+            for number, grasp in enumerate(self.grasps, 1)
+            if grasp.wrench is not None
+        }
 
     @property
     def symmetry(self) -> int:
@@ -465,10 +479,7 @@ class Experiment:
         air drag; computed anew at each access.
         """
         couplings = [each.measure.couplings for each in self.actuators]
-        couplings += [
-            each.contact_surface(self.body).points.couplings
-            for each in self.obstacles
-        ]
+        couplings += [each.couplings_with(self.body) for each in self.obstacles]
         couplings += [
             self.body.unit_air_drag.points.couplings
         ] * self.has_air_drag

@@ -1,9 +1,12 @@
-"""Measured wrench of a grasp: the force and the torque that the grasp exerts on the body."""
+"""Measured wrench of a grasp, the force and the torque that the grasp exerts on the body, and its
+files.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Literal
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,13 +18,16 @@ from ..common.time_dependence import over_time
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from .checked_arrays import float_converter, read_only_floats
+from .formats.columns import FORCE, FORCES, STRESS, TORQUES, read_columns
+from .poses import Frame
+from .recording_writers import write_columns_csv
 from .sample_times import first_unordered_time
-
-Frame = Literal["world", "grasp"]
+from .time_tables import axis_components, without_rounding
 
 COMPONENTS = ("fx", "fy", "fz", "tx", "ty", "tz")
 # Units of the components: three forces and three torques.
 UNITS = ("N",) * 3 + ("N m",) * 3
+WRENCH_COLUMNS = tuple(quantity.column for quantity in (*FORCES, *TORQUES))
 
 
 def _with_torques(values: ArrayLike) -> Array:
@@ -134,6 +140,13 @@ class Wrench:
             COMPONENTS[k] for k in np.flatnonzero(self.measured_components)
         )
 
+    def component_noises(self) -> list[tuple[int, str, str, float]]:
+        """Return index, name, unit and σ of each component that is measured at any sample."""
+        return [
+            (k, COMPONENTS[k], UNITS[k], float(self.sigmas[k]))
+            for k in np.flatnonzero(self.measured_components).tolist()
+        ]
+
     @property
     def sigmas(self) -> Array:
         """(6,) standard deviations of the components [N, N m]; those of torques are 1 if `sigma_nm`
@@ -141,3 +154,71 @@ class Wrench:
         """
         torque = 1.0 if self.sigma_nm is None else self.sigma_nm
         return np.repeat([self.sigma_n, torque], 3)
+
+
+def read_wrench(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    axis: str = "z",
+    sign: int = 1,
+    area_m2: float | None = None,
+    symmetry: int = 1,
+    timed: bool = True,
+) -> tuple[Array, Array]:
+    """Read force and torque of a grasp over time, columns in any order; blank cells are missing.
+
+    Parameters
+    ----------
+    path : str or Path
+    columns : mapping, optional
+        Names of the columns of fx, fy, fz, tx, ty, tz, or of a machine's force or stress, and of t,
+        if their names are not recognised.
+    axis : {"x", "y", "z"}
+        Axis of a machine's force or stress.
+    sign : {1, -1}
+        Factor on the file's values: -1 if a positive value pulls the body against the axis.
+    area_m2 : float, optional
+        Undeformed area that an engineering stress multiplies; given if the file holds a stress.
+    symmetry : int
+        Number of equal parts of the specimen, of which the body is one; loads are divided by it.
+    timed : bool
+        Whether times are required; otherwise rows are numbered in seconds if there are no times.
+
+    Returns
+    -------
+    t_s : (S,) array
+    values : (S, 6) array
+        fx, fy, fz [N], tx, ty, tz [N m]; NaN where missing.
+
+    Raises
+    ------
+    InputError
+        If a column names no unit or a wrong one, is unknown or repeated, a cell is not a number, or
+        time does not increase; the line is named.
+    """
+    quantities = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
+    table = read_columns(
+        path,
+        quantities,
+        column_names=columns,
+        blank_allowed=True,
+        requires_times=timed,
+    )
+    factor = sign * (area_m2 or 1.0) / symmetry
+    return without_rounding(table.t_s), factor * axis_components(
+        table, (*FORCES, *TORQUES), axis=axis
+    )
+
+
+def write_wrench_csv(
+    path: str | Path, t_s: ArrayLike, values: ArrayLike
+) -> None:
+    """Write wrenches (S, 3) or (S, 6) [N, N m] at times (S,) [s] as `read_wrench` reads them; NaN
+    becomes a blank cell.
+
+    Components without any finite value are left out.
+    """
+    rows = np.asarray(values, dtype=float)
+    there = np.flatnonzero(np.isfinite(rows).any(axis=0))
+    columns = {WRENCH_COLUMNS[k]: rows[:, k] for k in there}
+    write_columns_csv(path, {"t_s": np.asarray(t_s), **columns})

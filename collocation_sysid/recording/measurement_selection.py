@@ -19,7 +19,6 @@ from .custom_sensor import Gauge
 from .depth_camera import until_all_cameras_see
 from .experiment import Experiment
 from .grasp import Grasp
-from .measured_wrench import Wrench
 from .poses import PoseSequence
 from .time_tables import FEWEST_SHARED_SAMPLES
 
@@ -45,9 +44,9 @@ def shortened_experiment(
         Least number of samples. It is increased until every depth camera has points and three
         images (one if the experiment is static), but not beyond the recording.
     shortens_sensors : bool
-        Whether later samples of wrenches are removed, and wrenches with fewer than three samples
-        (one if static) or no measured component; and zeros are put in the place of markers of which
-        no sample remains. By default wrenches keep their samples after the end, which are ignored.
+        Whether later samples of force sensors are removed, and those sensors with fewer than three
+        samples (one if static) or no measured component; and zeros are put in the place of markers of which
+        no sample remains. By default force sensors keep their samples after the end, which are ignored.
     """
     fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
     count, depths = until_all_cameras_see(
@@ -63,8 +62,7 @@ def shortened_experiment(
                 markers, positions_m=np.nan_to_num(markers.positions_m)
             )
         grasps = tuple(
-            replace(grasp, wrench=_within(grasp.wrench, t_s, fewest=fewest))
-            for grasp in grasps
+            grasp.with_loads_within(t_s, fewest=fewest) for grasp in grasps
         )
     return replace(
         experiment,
@@ -75,25 +73,12 @@ def shortened_experiment(
     )
 
 
-def _within(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
-    """Return the samples of a wrench from the first to the last of the times `t_s` (T,) [s].
-
-    None if there is no wrench, or fewer than `fewest` samples or no measured component there.
-    """
-    if wrench is None:
-        return None
-    here = (wrench.t_s >= t_s[0]) & (wrench.t_s <= t_s[-1])
-    if here.sum() < fewest or not wrench.is_measured[here].any():
-        return None
-    return at_times(wrench, here)
-
-
 def without_later_measurements(
     experiment: Experiment, end_s: float
 ) -> Experiment:
     """Return the experiment without the measurements after `end_s` [s]; its times stay.
 
-    Markers and wrenches become NaN, depth images are left out, and custom sensors become NaN unless
+    Markers and measured forces become NaN, depth images are left out, and custom sensors become NaN unless
     nothing would remain of them. The experiment itself is not modified.
     """
     markers = experiment.markers
@@ -104,24 +89,13 @@ def without_later_measurements(
         experiment,
         markers=replace(markers, positions_m=positions_m),
         grasps=tuple(
-            _without_later_wrench(grasp, end_s) for grasp in experiment.grasps
+            grasp.without_loads_after(end_s) for grasp in experiment.grasps
         ),
         depths=[depth for depth in depths if depth is not None],
         readings=[
             _without_later_values(gauge, end_s) for gauge in experiment.readings
         ],
     )
-
-
-def _without_later_wrench(grasp: Grasp, end_s: float) -> Grasp:
-    """Return a copy of the grasp with measurements of its sensor after `end_s` [s] replaced by NaN;
-    the grasp itself without a sensor.
-    """
-    wrench = grasp.wrench
-    if wrench is None:
-        return grasp
-    values = np.where((wrench.t_s > end_s)[:, None], np.nan, wrench.values)
-    return replace(grasp, wrench=replace(wrench, values=values))
 
 
 def _without_later_values(gauge: Gauge, end_s: float) -> Gauge:
@@ -140,41 +114,42 @@ def moved_grasp(grasp: Grasp, poses: PoseSequence, t_s: Array) -> Grasp:
     A sensor of the grasp has zeros as placeholders, at its own rate over these times, and NaN for
     components that it does not measure.
     """
-    wrench = grasp.wrench
-    if wrench is None:
-        return replace(grasp, poses=poses)
-    rate_hz = (len(wrench.t_s) - 1) / max(np.ptp(wrench.t_s), 1e-300)
+    moved = replace(grasp, poses=poses)
+    if not grasp.has_sensor:
+        return moved
+    sample_times_s = grasp.load_times_s
+    rate_hz = (len(sample_times_s) - 1) / max(np.ptp(sample_times_s), 1e-300)
     count = max(FEWEST_PLACEHOLDERS, 1 + int(np.ptp(t_s) * rate_hz + 1e-6))
-    times_s = t_s[0] + np.arange(count) / rate_hz
-    return replace(grasp, poses=poses, wrench=wrench.with_zeros_at(times_s))
+    return moved.with_zero_loads_at(t_s[0] + np.arange(count) / rate_hz)
 
 
 def measured_count(experiment: Experiment) -> int:
-    """Return how many numbers the markers (coordinates) and wrenches (components) measure."""
-    of_wrenches = (int(each.is_measured.sum()) for each in experiment.wrenches)
-    return 3 * experiment.markers.sample_count + sum(of_wrenches)
+    """Return how many numbers the markers (coordinates) and force sensors (components) measure."""
+    sensors = experiment.sensors_by_grasp.values()
+    of_sensors = sum(int(each.is_measured.sum()) for each in sensors)
+    return 3 * experiment.markers.sample_count + of_sensors
 
 
 def main_measurement(experiments: Sequence[Experiment]) -> tuple[str, str]:
     """Return the kind of measurement that dominates, as plural text, and the key that states its
-    noise: markers, else depth cameras, else wrenches, else custom sensors.
+    noise: markers, else depth cameras, else force sensors, else custom sensors.
     """
     if any(each.markers.sample_count for each in experiments):
         return "markers", "sigma_m"
     if any(each.depths for each in experiments):
         return "points of depth cameras", "sigma_m of depth"
-    if any(each.wrenches for each in experiments):
-        return "wrenches", "sigma_n"
+    if any(each.sensors_by_grasp for each in experiments):
+        return "measured forces", "sigma_n"
     return "readings", "sigma of the readings"
 
 
 def is_load_only(experiment: Experiment) -> bool:
-    """Return whether a static experiment measures wrenches only, so that no measurement shows the
+    """Return whether a static experiment measures forces only, so that no measurement shows the
     shape of the body between the faces.
     """
     return bool(
         experiment.is_static
-        and experiment.wrenches
+        and experiment.sensors_by_grasp
         and not experiment.markers.sample_count
         and not experiment.depths
         and not experiment.readings

@@ -36,7 +36,7 @@ Component = Literal[
     "pressure",
     "load",
     "sensor",
-    "depth",
+    "camera",
     "gauge",
 ]
 ModelPart = Literal[
@@ -95,6 +95,9 @@ class NuisanceRow:
         Parts of the model that depend on the values.
     applies : callable
         ``applies(experiment)``, whether the experiment has such parameters.
+    applies_to : callable
+        ``applies_to(experiment, index)``, whether the component with this index has such
+        parameters, in an experiment that has them; see `of`.
     low, high : float
         Limits, in prior standard deviations.
     reach : float
@@ -132,6 +135,7 @@ class NuisanceRow:
     axes: str = ""
     changes: tuple[ModelPart, ...] = ("reading",)
     applies: Callable[[Any], bool] = lambda experiment: True
+    applies_to: Callable[[Any, int], bool] = lambda experiment, index: True
     low: float = -np.inf
     high: float = np.inf
     reach: float = 1.0
@@ -221,6 +225,16 @@ def _distort_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
 def _has_markers(experiment: Any) -> bool:
     """Return whether the experiment has a marker, also one without samples."""
     return bool(experiment.markers.names)
+
+
+def _has_camera_matrix(experiment: Any, index: int) -> bool:
+    """Return whether a depth camera has images with a camera matrix, not clouds of points alone."""
+    return experiment.depths[index].camera.matrix is not None
+
+
+def _has_images(experiment: Any, index: int) -> bool:
+    """Return whether a depth camera has images, not clouds of points alone."""
+    return bool(len(experiment.depths[index].images_m))
 
 
 def _has_depth_cameras(experiment: Any) -> bool:
@@ -463,7 +477,7 @@ OBSTACLE_OFFSET = NuisanceRow(
     label="place of {which}",
     sentence="position error of an obstacle: up to {size}",
     description="a constant offset of each obstacle along its normal, or along the axis of its "
-    "displacement, which changes the beginning of the contact",
+    "displacement, which changes when it touches the body",
 )
 OBSTACLE_TILT = NuisanceRow(
     "obstacle_tilt_rad",
@@ -477,6 +491,9 @@ OBSTACLE_TILT = NuisanceRow(
     considered=0.2 * DEGREE,
     applies=lambda experiment: any(
         each.shape.has_tilt for each in experiment.obstacles
+    ),
+    applies_to=lambda experiment, index: (
+        experiment.grasps[index].shape.has_tilt
     ),
     label="tilt of {which}, {axis}",
     sentence="tilt of an obstacle: {size}",
@@ -494,6 +511,9 @@ OBSTACLE_TIME = NuisanceRow(
     considered=1e-3,
     applies=lambda experiment: any(
         len(each.poses.t_s) > 1 for each in experiment.obstacles
+    ),
+    applies_to=lambda experiment, index: (
+        len(experiment.grasps[index].poses.t_s) > 1
     ),
     label="delay of {which}",
     sentence="delay of an obstacle: up to {size}",
@@ -579,7 +599,7 @@ TARE = NuisanceRow(
     by="worst",
     label="tare{which} of {axis}",
     sentence="tare: up to {size}",
-    description="a constant offset of each component of a wrench, in multiples of its sigma",
+    description="a constant offset of each component of a force sensor, in multiples of its sigma",
 )
 SENSOR_TIME = NuisanceRow(
     "sensor_time_s",
@@ -594,7 +614,7 @@ SENSOR_TIME = NuisanceRow(
     by="worst",
     label="time shift of the sensor{which}",
     sentence="delay of the sensor: {size}",
-    description="delay of the measured wrenches; at most three standard deviations",
+    description="delay of the force sensors; at most three standard deviations",
 )
 SENSOR_LAG = NuisanceRow(
     "sensor_lag_s",
@@ -646,7 +666,7 @@ DEPTH_TURN = NuisanceRow(
     "rad",
     sigma=5 * DEGREE,
     key="depth_pose",
-    of="depth",
+    of="camera",
     axes="x y z",
     changes=("depth",),
     applies=_has_depth_cameras,
@@ -664,7 +684,7 @@ DEPTH_SHIFT = NuisanceRow(
     "m",
     sigma=0.02,
     key="depth_pose",
-    of="depth",
+    of="camera",
     axes="x y z",
     changes=("depth",),
     applies=_has_depth_cameras,
@@ -684,9 +704,10 @@ DEPTH_BIAS = NuisanceRow(
     "m",
     sigma=5e-3,
     key="depth_bias",
-    of="depth",
+    of="camera",
     changes=("depth",),
     applies=_has_depth_cameras,
+    applies_to=_has_camera_matrix,
     low=-4.0,
     high=4.0,
     reach=UNLIMITED_REACH,
@@ -701,9 +722,10 @@ DEPTH_SCALE = NuisanceRow(
     "1",
     sigma=5e-3,
     key="depth_scale",
-    of="depth",
+    of="camera",
     changes=("depth",),
     applies=_has_depth_cameras,
+    applies_to=_has_camera_matrix,
     low=-4.0,
     high=4.0,
     reach=4.0,
@@ -717,7 +739,7 @@ DEPTH_TIME = NuisanceRow(
     "s",
     sigma=5e-3,
     key="depth_time",
-    of="depth",
+    of="camera",
     changes=("depth",),
     applies=lambda experiment: (
         _is_motion(experiment) and _has_depth_cameras(experiment)
@@ -734,9 +756,10 @@ DEPTH_EDGE = NuisanceRow(
     "px",
     sigma=2.0,
     key="depth_edge",
-    of="depth",
+    of="camera",
     changes=("depth",),
     applies=_has_depth_outlines,
+    applies_to=_has_images,
     low=-4.0,
     high=4.0,
     reach=UNLIMITED_REACH,
@@ -793,7 +816,7 @@ class Nuisance:
         A constant offset of each displacement along each of its axes.
     obstacle_offset_m : float or None
         A constant offset of each obstacle along its normal, or along the axis of its displacement,
-        which changes the beginning of the contact.
+        which changes when it touches the body.
     obstacle_tilt_rad : float or None
         A constant tilt of each obstacle that is a plane or a box, about its point or middle.
     obstacle_time_s : float or None
@@ -812,9 +835,9 @@ class Nuisance:
         Delay with which each point mass or force begins or ends, if it does so within the
         recording.
     tare : float or None
-        A constant offset of each component of a wrench, in multiples of its sigma.
+        A constant offset of each component of a force sensor, in multiples of its sigma.
     sensor_time_s : float or None
-        Delay of the measured wrenches; at most three standard deviations.
+        Delay of the force sensors; at most three standard deviations.
     sensor_lag_s : float or None
         Time constant of a first-order low-pass in the sensor; between zero and three
         standard deviations of its prior.

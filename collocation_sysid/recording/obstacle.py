@@ -5,7 +5,7 @@ moving.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ from ..errors import InputError
 from ..fem.contact_surface import ContactSurface
 from ..fem.laws.constants import FRICTION, Constant, constant_named
 from ..fem.meshes.selection import Selection
+from ..fem.pattern import SymmetricPattern
 from .grasp import Grasp
 from .node_selection import Nodes, selection_from_section
 from .obstacle_solids import KINDS, Solid, orthogonal_axes
@@ -46,6 +47,36 @@ def _require_selection(faces: Any) -> Selection:
             f"faces of an obstacle is {faces!r}; expected a selection"
         )
     return faces
+
+
+@dataclass(frozen=True, eq=False)
+class ObstacleForces:
+    """Measured forces of an obstacle on the body.
+
+    Attributes
+    ----------
+    t_s : (S,) array
+        Sample times [s].
+    forces_n : (S, 3) array
+        Forces along the axes of the sensor [N]; NaN where missing.
+    sigma_n : float
+        Standard deviation of their noise [N].
+    frame_poses : PoseSequence or None
+        Motion of the axes of the sensor; None if they are those of the world.
+    """
+
+    t_s: Array
+    forces_n: Array
+    sigma_n: float
+    frame_poses: PoseSequence | None
+
+    @property
+    def world_forces_n(self) -> Array:
+        """Forces (S, 3) along the axes of the world [N], NaN where a component is missing."""
+        if self.frame_poses is None:
+            return np.array(self.forces_n)
+        rotations, _ = self.frame_poses.at(self.t_s)
+        return np.einsum("sij,sj->si", rotations, self.forces_n)
 
 
 @declaration
@@ -151,6 +182,22 @@ class Obstacle(Grasp):
         results are cached.
         """
         return _contact_surface(body, self)
+
+    @property
+    def measured_forces(self) -> ObstacleForces | None:
+        """Measured forces on the body; None without a sensor."""
+        if self.wrench is None:
+            return None
+        return ObstacleForces(
+            self.wrench.t_s,
+            self.wrench.values[:, :3],
+            sigma_n=self.wrench.sigma_n,
+            frame_poses=None if self.wrench.frame == "world" else self.poses,
+        )
+
+    def couplings_with(self, body: Body) -> SymmetricPattern:
+        """Return the pairs of nodes of a body and the obstacle between which forces can act."""
+        return self.contact_surface(body).points.couplings
 
     @property
     def offset_direction(self) -> Array:

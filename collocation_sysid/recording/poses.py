@@ -24,6 +24,8 @@ from .checked_arrays import float_converter, read_only_floats
 from .sample_times import TIME_TOLERANCE_S, first_unordered_time
 
 Interpolation = Literal["smooth", "linear", "hold"]
+# Axes of a measured vector: those of the world, or of the undeformed body as its grasp carries it.
+Frame = Literal["world", "grasp"]
 # Rotation (3, 3) and translation (3,) of each grasp at one time.
 Poses = tuple[tuple[Array, Array], ...]
 

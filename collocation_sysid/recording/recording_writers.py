@@ -1,6 +1,4 @@
-"""Files of poses, markers, wrenches and custom sensors in the project's own format: CSV in SI
-units.
-"""
+"""Files of poses, markers and custom sensors in the project's own format: CSV in SI units."""
 
 from __future__ import annotations
 
@@ -17,7 +15,6 @@ from ..common.files import replaced_file
 from .marker_files import MarkerTable
 from .pose_files import POSE_COLUMNS
 from .poses import PoseSequence
-from .time_tables import WRENCH_COLUMNS
 
 _DIGITS = "%.12g"
 
@@ -55,22 +52,6 @@ def write_markers_csv(
     ]
     tracks = table.positions_m.reshape(len(table.t_s), -1)
     _write_csv(path, header, values=np.column_stack([table.t_s, tracks]))
-
-
-def write_wrench_csv(
-    path: str | Path, t_s: ArrayLike, values: ArrayLike
-) -> None:
-    """Write wrenches (S, 3) or (S, 6) [N, N m] at times (S,) [s] as `read_wrench` reads them; NaN
-    becomes a blank cell.
-
-    Components without any finite value are left out.
-    """
-    rows = np.asarray(values, dtype=float)
-    there = np.flatnonzero(np.isfinite(rows).any(axis=0))
-    header = ["t_s", *(WRENCH_COLUMNS[k] for k in there)]
-    _write_csv(
-        path, header, values=np.column_stack([np.asarray(t_s), rows[:, there]])
-    )
 
 
 def write_columns_csv(

@@ -14,13 +14,10 @@ from ..errors import InputError, hint_at
 from .formats.columns import (
     DISPLACEMENT,
     DISPLACEMENTS,
-    FORCE,
     FORCES,
     PRESSURE,
     STRAIN,
-    STRESS,
     TENSION,
-    TORQUES,
     Quantity,
     QuantityTable,
     read_columns,
@@ -36,7 +33,6 @@ from .formats.text import (
 from .poses import PoseSequence
 from .sample_times import TIME_TOLERANCE_S, unrounded_s
 
-WRENCH_COLUMNS = tuple(quantity.column for quantity in (*FORCES, *TORQUES))
 # Largest plausible pressure [Pa]: larger ones are likely in another unit.
 LARGEST_PA = 1e8
 # Largest plausible tension [N]: larger ones are likely in another unit, or raw counts of a sensor.
@@ -118,61 +114,7 @@ def _read_limited(
     return table.t_s, values
 
 
-# Wrenches and displacements of a grasp ------------------------------------------------------------
-
-
-def read_wrench(
-    path: str | Path,
-    columns: Mapping[str, str] | None = None,
-    axis: str = "z",
-    sign: int = 1,
-    area_m2: float | None = None,
-    symmetry: int = 1,
-    timed: bool = True,
-) -> tuple[Array, Array]:
-    """Read force and torque of a grasp over time, columns in any order; blank cells are missing.
-
-    Parameters
-    ----------
-    path : str or Path
-    columns : mapping, optional
-        Names of the columns of fx, fy, fz, tx, ty, tz, or of a machine's force or stress, and of t,
-        if their names are not recognised.
-    axis : {"x", "y", "z"}
-        Axis of a machine's force or stress.
-    sign : {1, -1}
-        Factor on the file's values: -1 if a positive value pulls the body against the axis.
-    area_m2 : float, optional
-        Undeformed area that an engineering stress multiplies; given if the file holds a stress.
-    symmetry : int
-        Number of equal parts of the specimen, of which the body is one; loads are divided by it.
-    timed : bool
-        Whether times are required; otherwise rows are numbered in seconds if there are no times.
-
-    Returns
-    -------
-    t_s : (S,) array
-    values : (S, 6) array
-        fx, fy, fz [N], tx, ty, tz [N m]; NaN where missing.
-
-    Raises
-    ------
-    InputError
-        If a column names no unit or a wrong one, is unknown or repeated, a cell is not a number, or
-        time does not increase; the line is named.
-    """
-    quantities = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
-    table = read_columns(
-        path,
-        quantities,
-        column_names=columns,
-        blank_allowed=True,
-        requires_times=timed,
-    )
-    factor = sign * (area_m2 or 1.0) / symmetry
-    return _without_rounding(table.t_s), factor * _axis_components(
-        table, (*FORCES, *TORQUES), axis=axis
-    )
+# Displacements of a grasp ------------------------------------------------------------------------
 
 
 def read_displacement(
@@ -222,7 +164,7 @@ def read_displacement(
         sign
         * scale
         * (length_m or 1.0)
-        * np.nan_to_num(_axis_components(table, DISPLACEMENTS, axis=axis))
+        * np.nan_to_num(axis_components(table, DISPLACEMENTS, axis=axis))
     )
     return PoseSequence(
         table.t_s,
@@ -242,7 +184,7 @@ def displaced_axes(
 
     Arguments and errors are those of `read_displacement`; times are not required.
     """
-    shifts = _axis_components(
+    shifts = axis_components(
         _read_displacements(path, columns, length_m=length_m, timed=False),
         DISPLACEMENTS,
         axis=axis,
@@ -284,7 +226,7 @@ def _read_displacements(
     )
 
 
-def _axis_components(
+def axis_components(
     table: QuantityTable, quantities: Sequence[Quantity], axis: str
 ) -> Array:
     """Return the values (T, n) of n quantities of a table, one for each axis, in the order of
@@ -300,7 +242,7 @@ def _axis_components(
     return values
 
 
-def _without_rounding(t_s: Array) -> Array:
+def without_rounding(t_s: Array) -> Array:
     """Return times without the rounding of the file, see `unrounded_s`; two or fewer stay."""
     return unrounded_s(t_s) if len(t_s) > 2 else t_s
 
@@ -361,7 +303,7 @@ def read_custom_sensor(
         grid, [grid.columns.index(name) for name in names], blank_allowed=True
     )
     return CustomSensorTable(
-        _without_rounding(t_s), np.asarray(values), columns=names
+        without_rounding(t_s), np.asarray(values), columns=names
     )
 
 

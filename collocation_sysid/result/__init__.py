@@ -5,12 +5,12 @@ frames and replaces folders safely, `run_refinement` adds measured discretisatio
 folder, and `synthesis` writes simulated recordings.
 
 Text: `run_sections` describes a run, `probe_sections` its probes, and `check_sections` the findings
-of a check; `report` turns such sections into an HTML page or Markdown, and `solve_progress` shows a
-solve while it runs.
+of a check; `report` turns such sections into an HTML page or Markdown, `picture_captions` adds the
+pictures, and `solve_progress` shows a solve while it runs.
 
 Pictures: the package `pictures` has static figures in the look of `figure_style`; `animation` makes
 films, `interactive_view` an interactive window, and `web_page` a web page with the moving body;
-`parameter_sliders` shows simulations at other parameters in a notebook. `depth_overlays` prepares
-the points of depth cameras for all of these, and `element_fields` evaluates stress and energy in
+`parameter_sliders` shows simulations at other parameters in a notebook. `camera_overlays` prepares
+the points of cameras for all of these, and `element_fields` evaluates stress and energy in
 each element.
 """

@@ -36,6 +36,7 @@ from .figure_style import (
 from .pictures.over_time import rms_over_markers
 from .pictures.projection import ParallelCamera
 from .pictures.scene import (
+    CAMERA_ENTRY,
     BodyDrawing,
     SheetView,
     aspect_ratio,
@@ -513,7 +514,7 @@ class FilmFigure:
         named = ["grasped", "measured", "behind the body"]
         if self.replay.visible_points:
             markers = named[1:] if len(self.replay.marker_names) else []
-            named = ["grasped", *markers, "depth image"]
+            named = ["grasped", *markers, CAMERA_ENTRY]
         draw_legend(
             axes,
             legend_handles(*named),
@@ -537,7 +538,7 @@ class FilmFigure:
                 replay.is_prescribed[sample],
                 markers_m=measured,
                 outlines_m=outlines_m,
-                depth_points_m=replay.depth_points_m(sample),
+                camera_points_m=replay.camera_points_m(sample),
             )
             distances = np.linalg.norm(
                 drawn.markers_m[sample] - measured, axis=1
@@ -563,7 +564,7 @@ def _points_to_show_m(
     replay: MotionRecord, surface_m: Array, samples: NDArray[np.bool_]
 ) -> Array:
     """Return all points (p, 3) [m] that a film has to show: the surface of the body, obstacles near
-    it, measured markers (NaN where missing) and compared points of depth cameras.
+    it, measured markers (NaN where missing) and compared points of cameras.
 
     Parameters
     ----------
@@ -578,7 +579,7 @@ def _points_to_show_m(
     surroundings_m = with_nearby_outlines(
         surface_m, None if outlines_m is None else outlines_m[samples]
     )
-    depth_points_m = [
+    camera_points_m = [
         rows[np.isfinite(rows[:, 4]), 5:]
         for rows in replay.visible_points.values()
     ]
@@ -586,7 +587,7 @@ def _points_to_show_m(
         [
             surroundings_m.reshape(-1, 3),
             replay.measured_m.reshape(-1, 3),
-            *depth_points_m,
+            *camera_points_m,
         ]
     )
 

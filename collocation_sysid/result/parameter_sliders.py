@@ -23,7 +23,6 @@ from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.transcription import Transcription
 from ..recording import Experiment
-from ..recording.measured_wrench import COMPONENTS, UNITS
 from ..runs.forward_simulation import (
     ForwardSimulation,
     simulate_with_parameters,
@@ -314,9 +313,9 @@ class ParameterSliders:
 
     def _figure(self, simulation: ForwardSimulation) -> Figure:
         """Return the picture of the first kind of measurements that the recording has: all markers,
-        the first wrench, or the first custom sensor; without these, the picture of the shapes.
+        else the first sensor; without these, the picture of the shapes.
 
-        Wrenches are those on the complete specimen.
+        Forces of sensors are those on the complete specimen.
         """
         from .pictures.over_time import marker_tracks, sensor_picture
 
@@ -329,25 +328,13 @@ class ParameterSliders:
                 fitted_m=self._fitted_markers_m,
                 simulated_m=simulation.trajectory.markers_m,
             )
-        if experiment.wrenches:
-            sensor = experiment.wrenches[0]
-            columns = _sensor_columns(
-                sensor.t_s,
-                sensor.values,
-                simulated=simulation.predicted.wrenches[0],
-            )
-            columns[:, 1:] *= sensor.symmetry
-            return sensor_picture(columns, COMPONENTS, units=UNITS)
-        if experiment.readings:
-            gauge = experiment.readings[0]
-            predicted = simulation.predicted.readings[gauge.name]
-            columns = _sensor_columns(
-                gauge.sample_times_s, gauge.measured_values, simulated=predicted
-            )
-            count = gauge.measured_values.shape[1]
-            return sensor_picture(
-                columns, [f"{gauge.name} {k + 1}" for k in range(count)]
-            )
+        for feature in FEATURES:
+            for series in feature.simulated_series(
+                experiment, simulation.predicted
+            ):
+                return sensor_picture(
+                    series.columns, series.names, units=series.units
+                )
         return self._shapes_figure(simulation)
 
     def _shapes_figure(self, simulation: ForwardSimulation) -> Figure:
@@ -395,17 +382,6 @@ def _slider(widgets: Any, name: str, values: SliderRange) -> Any:
     step = (values.high - values.low) / STEPS
     return widgets.FloatSlider(
         value=values.value, min=values.low, max=values.high, step=step, **common
-    )
-
-
-def _sensor_columns(t_s: Array, measured: Array, simulated: Array) -> Array:
-    """Return the columns (S, 1 + 3 m) of `sensor_picture`: time, and m values as measured, fitted
-    and simulated; the fitted ones are NaN.
-
-    `t_s` is (S,) [s]; `measured` and `simulated` are (S, m), NaN where missing.
-    """
-    return np.column_stack(
-        [t_s, measured, np.full_like(measured, np.nan), simulated]
     )
 
 

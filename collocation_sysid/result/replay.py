@@ -20,9 +20,11 @@ from numpy.typing import NDArray
 from ..common.array_types import Array
 from ..common.files import RESULT_FILE, damage_refused, require_own
 from ..errors import InputError
+from ..features.measurement_results import SensorSeries
 from ..fem.elements import EDGES
 from ..fem.laws.constants import symbol_of, without_region
 from ..recording.experiment import Experiment
+from ..recording.measured_wrench import COMPONENTS, UNITS
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.specimen_files import specimen_strains
 from ..runs.result_content import Result
@@ -269,7 +271,7 @@ class MotionRecord:
             else self.rolled_out_positions_m
         )
 
-    def depth_points_m(self, sample: int) -> Array:
+    def camera_points_m(self, sample: int) -> Array:
         """Return the points (P, 3) [m] of all depth cameras at the time of the sample with index
         `sample`.
 
@@ -290,6 +292,14 @@ class MotionRecord:
                     points[points[:, 0] == times[differences_s.argmin()], 5:]
                 )
         return np.concatenate(nearest)
+
+    @property
+    def force_series(self) -> list[SensorSeries]:
+        """Forces and torques of each force sensor over time."""
+        return [
+            SensorSeries("wrench", k, columns, COMPONENTS, units=UNITS)
+            for k, columns in enumerate(self.wrenches, start=1)
+        ]
 
     @property
     def has_shapes(self) -> bool:

@@ -7,7 +7,7 @@ gives the arrays of each experiment to pictures and films without a folder.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,8 @@ from ..common.array_types import Array
 from ..common.files import RESULT_FILE, write_text_file
 from ..common.serialisation import as_json
 from ..errors import InputError
-from ..features.depth_feature import fitted_surfaces
 from ..features.registry import FEATURES, merged_fields
 from ..fem.body import Body
-from ..program.depth.depth_comparison import SurfaceComparison
 from ..recording.experiment import Experiment
 from ..runs.forward_simulation import ForwardSimulation
 from ..runs.result_builder import build_result
@@ -303,21 +301,21 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
                 ),
             )
             of_cells = _field_estimates(finished, experiment.body)
-            of_cameras = _depth_rows(finished, experiment)
+            of_cameras = _visible_points(finished, experiment)
             collected.append(
                 replace(replay, fields=of_cells, visible_points=of_cameras)
             )
     return collected
 
 
-def _depth_rows(
+def _visible_points(
     finished: SolvedProblem, experiment: Experiment
 ) -> dict[str, Array]:
     """Return the points of each depth camera of an experiment on the fitted surface, or else on the
     simulated one.
 
     The arrays (k, 8), by name of the camera, have the rows of `MotionRecord.visible_points`. The
-    mapping is empty where neither surface is known, or without depth cameras.
+    mapping is empty where neither surface is known, or without cameras.
 
     Parameters
     ----------
@@ -326,21 +324,11 @@ def _depth_rows(
     experiment : Experiment
         One of its experiments, fitted or for validation.
     """
-    part = finished.solution.part_of(experiment.name)
-    rollout = finished.rollouts[experiment.name]
-    surfaces: Mapping[str, SurfaceComparison] = {}
-    if part is not None:
-        surfaces = fitted_surfaces(part)
-    elif isinstance(rollout, ForwardSimulation):
-        surfaces = rollout.predicted.surfaces
-    if not surfaces:
+    if not experiment.camera_names:
         return {}
-    from .depth_overlays import surface_rows  # which needs matplotlib
+    from .camera_overlays import visible_points  # which needs matplotlib
 
-    return {
-        name: surface_rows(surface, experiment.upward_direction)
-        for name, surface in surfaces.items()
-    }
+    return visible_points(finished, experiment)
 
 
 def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:

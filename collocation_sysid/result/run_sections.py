@@ -16,7 +16,6 @@ from ..common.display import (
     Cards,
     Line,
     Listing,
-    Picture,
     Shown,
     Span,
     Table,
@@ -24,7 +23,6 @@ from ..common.display import (
     flattened_parts,
     millimetres,
     number,
-    own_pictures,
     short,
 )
 from ..common.files import is_own
@@ -40,6 +38,7 @@ from ..statistics.assessment import Assessment
 from ..statistics.budget.uncertainty_budget import main_sources, source_label
 from ..statistics.concerns import Concern, topics_of
 from ..statistics.remedies import remedy_for
+from .picture_captions import captioned_pictures
 from .probe_sections import (
     DEEPER_CHECK_ADVICE,
     STIFFNESS_NAMES,
@@ -70,35 +69,6 @@ SHOWN_REMEDIES = ("platen_slip",)
 SMALLEST_SHOWN_SHARE = 0.01
 # Ratio of combined to statistical standard uncertainty beyond which the sources are named.
 SYSTEMATIC_RATIO = 1.5
-
-PICTURE_CAPTIONS = {
-    "depth": "Points of a depth camera with the outline of the fitted surface, at up to four "
-    "samples, and the distance of each point behind the surface; grey points are not compared.",
-    "shapes": "The fitted body at several times of the recording; orange: measured markers.",
-    "field": "Spatially varying constant between the ends of its 95 % interval; below, a cut "
-    "through the body. Pale colours: the data add little to the prior.",
-    "mesh": "The mesh, its grasped nodes and the estimated positions of the markers.",
-    "pressure": "Contact pressure of obstacles on the body.",
-    "gap": "Gap between the body's surface and obstacles.",
-    "tracks": "Measured, fitted and simulated markers, the residual below.",
-    "wrench": "Wrench of a grasp: measured, fitted and simulated.",
-    "reading": "Custom sensor: measured, fitted and simulated.",
-    "error": "Distance of the markers from their measurements over time.",
-    "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
-    "confidence": "95 % confidence ellipses of pairs of parameters, for the measurement noise "
-    "only.",
-    "correlation": "Correlation of the estimates.",
-    "budget": "Contributions to the variance of each estimate.",
-    "convergence": "Loss, violation of the dynamics and parameters over the iterations.",
-    "scan": "Scan of the stiffness for an initial guess: misfit of the first part of the "
-    "recordings.",
-    "elements": "Size and quality of the elements.",
-    "jacobian": "Structure of the constraints' Jacobian.",
-}
-
-
-# Pictures that show measurement and fit, one of which leads the page.
-LEADING_PICTURES = ("tracks", "wrench", "reading", "depth")
 
 
 def run_summary(
@@ -165,7 +135,7 @@ def run_report(run: str | Path) -> TitledParts:
         verdict = verdict_section(result.trust, linked=True)
         took = f" {result.method}, {result.iterations} iterations; {_elapsed_text(result.elapsed_s)}"
         badge = Span(result.status, f"badge {result.trust.verdict}")
-        pictures = _captioned_pictures(run)
+        pictures = captioned_pictures(run)
         meaning = Line(f"{VERDICT_MEANINGS[result.trust.verdict]}.", "quiet")
         parts: list[Shown] = [
             Line((badge, Span(took)), "quiet"),
@@ -858,42 +828,6 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
                 m,
             ] = 0
     return sorted(worst, key=lambda each: -each[0])[:SHOWN_ERRORS]
-
-
-def _captioned_pictures(run: Path) -> list[Picture]:
-    """Return every PNG file of the folder `run`, also those of other programs, with its caption;
-    links that lead out of the folder are left out.
-
-    A picture that compares measurement and fit is first; then follow the pictures known to
-    `PICTURE_CAPTIONS` in that order, and unknown ones, with their name as caption. Empty without
-    pictures.
-    """
-    order = [*PICTURE_CAPTIONS, ""]
-    pictures: list[Picture] = []
-
-    def kind(file: Path) -> str:
-        """Return the key of `PICTURE_CAPTIONS` with which a name begins; "" if none."""
-        return next(k for k in order if file.stem.startswith(k))
-
-    for file in sorted(
-        own_pictures(run), key=lambda file: (order.index(kind(file)), file.name)
-    ):
-        about = file.stem.removeprefix(kind(file)).strip("_")
-        caption = PICTURE_CAPTIONS.get(kind(file), file.stem)
-        pictures.append(
-            Picture(
-                file, f"{about}: {caption}" if about and kind(file) else caption
-            )
-        )
-    compared = (
-        each for each in pictures if kind(each.file) in LEADING_PICTURES
-    )
-    first = next(compared, None)
-    return (
-        pictures
-        if first is None
-        else [first, *(p for p in pictures if p is not first)]
-    )
 
 
 def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:

@@ -26,13 +26,13 @@ from ..model.schemes import SCHEMES
 from ..problem import Problem
 from ..problem.bench_files import (
     BenchTable,
-    add_wrench,
+    add_loads,
     bench_tables,
     has_displacement_table,
     table_name,
 )
 from ..problem.problem_reading import parse_toml
-from ..problem.recording_schema import ExperimentSection, WrenchSection
+from ..problem.recording_schema import ExperimentSection, ForceSensorSection
 from ..problem.schema import ProblemFile
 from ..problem.specimen_reader import layout_from_section
 from ..problem.specimen_schema import SpecimenSection
@@ -125,7 +125,7 @@ def write_data(
     """Simulate every experiment at the parameters' guesses and write tables of its measurements,
     with noise, and of its poses.
 
-    Images of depth cameras are not written.
+    Images of cameras are not written.
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ def _write_tables(
     The measurements are those of markers, force sensors and custom sensors; on a test bench, tables
     of displacement and load replace those of poses and force sensors. A specimen has one table, of
     its stresses. Components that a force sensor does not measure are left out or NaN. Images of
-    depth cameras are not written.
+    cameras are not written.
 
     Parameters
     ----------
@@ -296,7 +296,7 @@ def _write_tables(
         if (key := _numbered_key("poses", k)) in files:
             write_poses_csv(files[key], grasp.poses)
     layouts = _wrench_layouts(section) or [
-        WrenchSection.model_construct()
+        ForceSensorSection.model_construct()
     ] * len(experiment.wrenches)
     wrenches = []
     for sensor, wrench, layout in zip(
@@ -310,7 +310,7 @@ def _write_tables(
         wrenches.append(measured + sigmas * rng.normal(size=wrench.shape))
     if section is not None and has_displacement_table(section):
         for name, table in bench_tables(
-            section, experiment, wrenches=wrenches
+            section, experiment, loads=wrenches
         ).items():
             write_columns_csv(files[name], table.columns)
     else:
@@ -318,7 +318,7 @@ def _write_tables(
             zip(experiment.wrenches, layouts, strict=True)
         ):
             table = BenchTable(sensor.t_s)
-            add_wrench(table, layout, at_s=sensor.t_s, wrench=wrenches[k])
+            add_loads(table, layout, at_s=sensor.t_s, loads=wrenches[k])
             write_columns_csv(files[_numbered_key("wrench", k)], table.columns)
     for gauge, read in zip(
         experiment.readings, trajectory.custom_sensor_values, strict=True
@@ -371,12 +371,14 @@ def _write_specimen(
     write_columns_csv(file, specimen_columns(experiment, values, layout=layout))
 
 
-def _wrench_layouts(section: ExperimentSection | None) -> list[WrenchSection]:
+def _wrench_layouts(
+    section: ExperimentSection | None,
+) -> list[ForceSensorSection]:
     """Return the table layout of each force sensor, those of grasps before those of obstacles;
     empty if `section` is None, for a problem without a file.
     """
     moved = section.moved_sections if section is not None else []
-    return [each.wrench for each in moved if each.wrench is not None]
+    return [each.sensor for each in moved if each.sensor is not None]
 
 
 def _require_guesses(problem: Problem) -> None:
@@ -487,7 +489,7 @@ def _table_names(
         tables = [
             t
             for each in section.moved_sections
-            for t in (each.displacement, each.wrench)
+            for t in (each.displacement, each.sensor)
             if t
         ]
         bench = [table_name(section, table) for table in tables]

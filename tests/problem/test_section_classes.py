@@ -41,7 +41,7 @@ from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 
 SECTIONS: dict[type, type[Section]] = {
     Field: schema.FieldSection,
-    Wrench: recording_schema.WrenchSection,
+    Wrench: recording_schema.ForceSensorSection,
     Grasp: recording_schema.GraspSection,
     Obstacle: recording_schema.ObstacleSection,
     Markers: recording_schema.MarkersSection,

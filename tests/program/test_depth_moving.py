@@ -80,7 +80,7 @@ def test_all_images_are_kept_for_pictures_and_four_of_them_with_outlines(run):
     points = rows[np.isfinite(rows[:, 4])]
     np.testing.assert_array_equal(np.unique(points[:, 0]), replay.t_s[SEEN])
     assert len(np.unique(rows[np.isnan(rows[:, 3]), 0])) == 4
-    assert [len(replay.depth_points_m(t)) > 0 for t in range(SAMPLES)] == [
+    assert [len(replay.camera_points_m(t)) > 0 for t in range(SAMPLES)] == [
         t in SEEN for t in range(SAMPLES)
     ]
 

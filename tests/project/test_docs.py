@@ -237,7 +237,10 @@ def test_the_core_page_names_classes_that_there_are():
         )
     figure = page.partition("```text\n")[2].partition("```")[0]
     boxes = set(re.findall(r"^ ([A-Z]\w+)", figure, re.MULTILINE))
-    assert boxes - {name for _, name in paths} == {"PointPositions"}
+    assert boxes - {name for _, name in paths} == {
+        "PointPositions",
+        "ReactionResultant",
+    }
 
 
 def test_the_front_page_shows_the_answer_that_the_readme_shows():

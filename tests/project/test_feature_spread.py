@@ -19,7 +19,7 @@ from collocation_sysid.features.registry import FEATURES, merged_fields
 
 PACKAGE = Path(collocation_sysid.__file__).parent
 # Largest number of files that mention a feature.
-LIMITS = {"contact": 52, "depth": 59, "wrench": 79}
+LIMITS = {"contact": 37, "depth": 46, "wrench": 32}
 # Layers that iterate over features or use neutral interfaces, with the files in which a name is
 # part of the output: keys of `check --json` and captions of pictures.
 NEUTRAL = {
@@ -88,6 +88,8 @@ def test_a_feature_without_functions_contributes_nothing():
     nothing = Feature("nothing")
     assert not [*nothing.hypotheses(None)]
     assert not [*nothing.error_texts(None, None)]
+    assert not [*nothing.simulated_series(None, None)]
+    assert not [*nothing.live_limitations(None)]
     assert nothing.simulated_hypotheses(None) == ((), ())
     assert nothing.reason_against_copy(None, None) == ""
     assert nothing.excluded_loss(None) == 0.0

@@ -25,13 +25,19 @@ from kit.problem_files import pictures_drawn, run_command
 from kit.results import a_result
 
 import collocation_sysid as cs
+from collocation_sysid.features.camera_misspecifications import (
+    camera_hypotheses,
+)
 from collocation_sysid.pipeline import run
-from collocation_sysid.program.depth.depth_comparison import SurfaceComparison
+from collocation_sysid.program.depth.depth_comparison import (
+    SurfaceComparison,
+    depth_residuals,
+)
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.result.animation import FilmFigure
-from collocation_sysid.result.depth_overlays import (
+from collocation_sysid.result.camera_overlays import (
     save_overlays,
     surface_rows,
     undeformed_rows,
@@ -41,9 +47,6 @@ from collocation_sysid.result.pictures.depth_comparison_picture import (
     depth_picture,
 )
 from collocation_sysid.result.replay import MotionRecord
-from collocation_sysid.statistics.misspecification.camera_misspecifications import (
-    camera_hypotheses,
-)
 
 UPWARD, INVERTED = np.diag([1.0, -1, -1, 1]), np.linalg.inv(POSE)
 AWAY = np.eye(4) + 5 * np.outer(
@@ -272,7 +275,7 @@ def test_models_are_not_compared_by_what_only_a_depth_camera_sees(tmp_path):
         "compare-models", file, "--materials", both, "--out", tmp_path / "both"
     )
     assert compared.code == 2
-    assert "'hanging' has neither markers nor a measured wrench" in " ".join(
+    assert "'hanging' has neither markers nor a measured force" in " ".join(
         compared.err.split()
     )
     assert not (tmp_path / "both").exists()
@@ -288,7 +291,7 @@ def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(
     found,
 ):
     (part,) = found.collocation.iterates(found.z)
-    ((reading, looked),) = part.depth_residuals
+    ((reading, looked),) = depth_residuals(part)
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
     rows = surface_rows(surface, part.segment.experiment.upward_direction)
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
@@ -324,7 +327,7 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(
     found,
 ):
     (part,) = found.collocation.iterates(found.z)
-    ((reading, looked),) = part.depth_residuals
+    ((reading, looked),) = depth_residuals(part)
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
     rows = surface_rows(surface, part.segment.experiment.upward_direction)
     experiment = part.segment.experiment
@@ -344,13 +347,13 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(
         visible_points={"front": np.vstack([rows, later])},
     )
     count = reading.correspondences.is_compared.sum()
-    assert [len(replay.depth_points_m(t)) for t in range(3)] == [
+    assert [len(replay.camera_points_m(t)) for t in range(3)] == [
         count,
         0,
         count,
     ]
     sparse = replace(replay, visible_points={"front": rows})
-    assert [len(sparse.depth_points_m(t)) > 0 for t in range(3)] == [
+    assert [len(sparse.camera_points_m(t)) > 0 for t in range(3)] == [
         True,
         False,
         False,
@@ -358,9 +361,9 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(
     film = FilmFigure(sparse)
     ((_, _, _, drawn, _),) = film.drawings
     film.show_sample(0)
-    u, _ = drawn.depth_points.get_data()
+    u, _ = drawn.camera_points.get_data()
     assert 0 < len(u) <= reading.correspondences.is_compared.sum()
-    shown = drawn.view.to_sheet_mm(sparse.depth_points_m(0))
+    shown = drawn.view.to_sheet_mm(sparse.camera_points_m(0))
     assert np.isin(np.round(u, 6), np.round(shown[:, 0], 6)).all()
     film.show_sample(2)
-    assert len(drawn.depth_points.get_data()[0]) == 0
+    assert len(drawn.camera_points.get_data()[0]) == 0

@@ -10,6 +10,11 @@ import pytest
 from kit.problems import GUESS
 from kit.wrench_fits import UNKNOWN, swung
 
+from collocation_sysid.features.wrench_at_guess import (
+    WrenchDeviation,
+    has_inertial_wrenches,
+    wrench_deviations,
+)
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
@@ -17,11 +22,6 @@ from collocation_sysid.recording import Experiment, Wrench
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
     Hypothesis,
-)
-from collocation_sysid.statistics.misspecification.wrench_at_guess import (
-    WrenchDeviation,
-    has_inertial_wrenches,
-    wrench_deviations,
 )
 
 OFFSET_N = 0.8

@@ -11,6 +11,10 @@ from kit.problems import GUESS
 from kit.wrench_fits import UNKNOWN, swung
 from wrong_twins import WRENCH_FAULTS
 
+from collocation_sysid.features.wrench_causes import (
+    wrench_causes,
+    wrench_mistakes,
+)
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import (
@@ -24,10 +28,6 @@ from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.assessment import cause_concerns
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
     rank,
-)
-from collocation_sysid.statistics.misspecification.wrench_causes import (
-    wrench_causes,
-    wrench_mistakes,
 )
 
 

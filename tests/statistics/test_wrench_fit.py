@@ -181,7 +181,7 @@ def test_a_run_tells_of_the_wrench(tmp_path: Path):
 def test_methods_that_need_second_derivatives_in_the_parameters_refuse_wrenches():
     exact = ReducedSpace(hessian="exact")
     with pytest.raises(
-        cs.InputError, match="not available for measured wrenches"
+        cs.InputError, match="not available for measured forces"
     ):
         exact(Collocation([swung(steps=12)], GUESS))
 

@@ -13,6 +13,13 @@ import pytest
 from depth_twins import TRUTH, hanging_twin, swinging_twin
 from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
 
+from collocation_sysid.features.camera_clock_misspecifications import (
+    camera_clock_hypotheses,
+)
+from collocation_sysid.features.camera_image_misspecifications import (
+    camera_image_hypotheses,
+    equilibrium_shapes_m,
+)
 from collocation_sysid.features.depth_feature import depth_image_hypotheses
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.problem import Problem
@@ -22,13 +29,6 @@ from collocation_sysid.runs.check import (
 )
 from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.runs.solving import solve
-from collocation_sysid.statistics.misspecification.camera_clock_misspecifications import (
-    camera_clock_hypotheses,
-)
-from collocation_sysid.statistics.misspecification.camera_image_misspecifications import (
-    camera_image_hypotheses,
-    equilibrium_shapes_m,
-)
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
     Hypothesis,
     rank,

@@ -68,7 +68,7 @@ RECORDINGS: dict[str, Callable[[], cs.Experiment]] = {
     "pressure": lambda: replace(driven_bar(4), nuisance=cs.Nuisance.none()),
     "load": bar_with_loads,
     "sensor": cube_with_sensor,
-    "depth": cube_with_camera,
+    "camera": cube_with_camera,
 }
 # Edges need images, whose correspondences `test_depth_outline` checks.
 CHECKED = [row for row in KINDS if row != DEPTH_EDGE]

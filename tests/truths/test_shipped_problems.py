@@ -17,7 +17,7 @@ import pytest
 from collocation_sysid import Problem, run, simulate, solve
 from collocation_sysid.methods.solution import Solution, pooled_wrench_rms
 from collocation_sysid.pipeline import Run
-from collocation_sysid.program.wrench.wrench_residual import (
+from collocation_sysid.program.wrench_residual import (
     without_grasp_sensors,
 )
 from collocation_sysid.recording import Nuisance

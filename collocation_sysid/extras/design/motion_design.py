@@ -252,7 +252,7 @@ class MotionObjective:
         motion, as a start of the search.
 
         Views of cameras are not considered. The result has no coefficients, and an empty history,
-        if a wrench is measured too, the memory would be too large, or the simulation fails. Ctrl-C
+        if a force is measured too, the memory would be too large, or the simulation fails. Ctrl-C
         ends the search with the best so far.
 
         Parameters
@@ -267,7 +267,7 @@ class MotionObjective:
         KeyboardInterrupt
             If it is interrupted before the first evaluation.
         """
-        sensed = self.recording.template.grasps[0].wrench is not None
+        sensed = self.recording.template.grasps[0].has_sensor
         if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:
             return SearchResult()
         middle = self.draws[0]

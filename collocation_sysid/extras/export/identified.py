@@ -391,7 +391,7 @@ class IdentifiedBody:
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """Obstacles with which the body may come into contact; empty without any."""
+        """Obstacles that the body may touch; empty without any."""
         return (
             ()
             if self.experiment_with_obstacles is None

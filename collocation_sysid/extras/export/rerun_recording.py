@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from ...common.array_types import Array
 from ...common.display import as_markdown
 from ...errors import InputError
-from ...recording.measured_wrench import COMPONENTS, UNITS
 from ...result.animation import experiment_named
 from ...result.interactive_view import DEFAULT_FIELD, field_on_faces
 from ...result.replay import MotionRecord, read_run
@@ -267,7 +266,7 @@ class _Recording:
     ) -> None:
         """Write the motion of an experiment into the recording: the deforming surface, grasped
         nodes, markers (measured, fitted, simulated), points of depth cameras, obstacles, residuals
-        and wrenches, each if it exists.
+        and measured forces, each if it exists.
 
         Parameters
         ----------
@@ -310,7 +309,7 @@ class _Recording:
                     radius_m=radius_m,
                 )
         depth_points_m = [
-            replay.depth_points_m(k) for k in range(len(replay.t_s))
+            replay.camera_points_m(k) for k in range(len(replay.t_s))
         ]
         if any(map(len, depth_points_m)):
             path = self._path(name, "depth_points")
@@ -323,7 +322,7 @@ class _Recording:
             )
         self._write_obstacles(replay)
         self._write_residuals(replay)
-        self._write_wrenches(replay)
+        self._write_forces(replay)
 
     def _up_axis(self, up: Array) -> Any:
         """Return the viewer's coordinate system whose axis is nearest to a direction (3,), upwards
@@ -453,23 +452,26 @@ class _Recording:
             path = self._path(replay.name, "residuals_mm", str(marker))
             self._write_curve(path, replay.t_s, values=values)
 
-    def _write_wrenches(self, replay: MotionRecord) -> None:
+    def _write_forces(self, replay: MotionRecord) -> None:
         """Write each component of forces and torques as measured, fitted and simulated, as far as
         they are finite; grasps with a sensor are numbered from 1.
         """
-        for k, columns in enumerate(replay.wrenches, start=1):
-            t_s = columns[:, 0]
-            values = columns[:, 1:].reshape(len(t_s), 3, len(COMPONENTS))
+        for series in replay.force_series:
+            t_s = series.columns[:, 0]
+            values = series.columns[:, 1:].reshape(
+                len(t_s), 3, len(series.names)
+            )
             for kind, each in zip(
                 ("measured", "fitted", "simulated"),
                 np.moveaxis(values, 1, 0),
                 strict=True,
             ):
                 for component, unit, curve in zip(
-                    COMPONENTS, UNITS, each.T, strict=True
+                    series.names, series.units, each.T, strict=True
                 ):
                     label = f"{component} [{unit}]"
-                    path = self._path(replay.name, f"wrench_{k}", label, kind)
+                    sensor = f"{series.kind}_{series.number}"
+                    path = self._path(replay.name, sensor, label, kind)
                     self._write_curve(path, t_s, values=curve)
 
     def _write_curve(

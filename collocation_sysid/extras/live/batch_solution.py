@@ -27,7 +27,7 @@ def recording_from_log(
     """Return the model's experiment with the poses, markers and samples of all rows.
 
     Its times are those of the model's experiment at the same interval, whatever the times of the
-    frames. Samples of a custom sensor or wrench replace its stated series; if fewer than three are
+    frames. Samples of a custom sensor or grasp sensor replace its stated series; if fewer than three are
     within the rows, or all are NaN, the sensor is left out. Missing markers are NaN. Samples after
     the last row are left out.
 
@@ -54,7 +54,7 @@ def recording_from_log(
             tracks_m[round(when)] = tracks
     if len(t_s) < FEWEST or np.isnan(tracks_m).all():
         return None
-    grasps = [replace(grasp, wrench=None) for grasp in experiment.grasps]
+    grasps = list(experiment.grasps)
     for k, number in enumerate(model.moving_grasps):
         matrices = np.tile(np.eye(4), (len(t_s), 1, 1))
         for matrix, row in zip(matrices, at_samples, strict=True):
@@ -64,7 +64,9 @@ def recording_from_log(
         grasps[number] = replace(grasps[number], poses=poses)
     markers = experiment.markers.with_samples(t_s, tracks_m)
     readings = []
-    for number, gauge in enumerate((*experiment.readings, *model.wrenches), 1):
+    sampled_grasps = set()
+    sensors = *experiment.readings, *experiment.sensors_by_grasp
+    for number, gauge in enumerate(sensors, 1):
         samples = {
             when: values
             for of, when, values in intake.all_samples(log)
@@ -81,8 +83,12 @@ def recording_from_log(
         if isinstance(gauge, Gauge):
             readings.append(replace(gauge, **series))
         else:
-            wrench = replace(model.wrenches[gauge], **series)
-            grasps[gauge - 1] = replace(grasps[gauge - 1], wrench=wrench)
+            sampled_grasps.add(gauge - 1)
+            grasps[gauge - 1] = grasps[gauge - 1].with_loads(**series)
+    grasps = [
+        grasp if k in sampled_grasps else grasp.without_sensor()
+        for k, grasp in enumerate(grasps)
+    ]
     return replace(
         experiment, t_s=t_s, grasps=grasps, markers=markers, readings=readings
     )

@@ -325,7 +325,7 @@ class LiveEstimator:
         )
         instrument_samples += parse_wrenches(
             wrench,
-            self.model.wrenches,
+            self.model.experiment.sensors_by_grasp,
             instruments_before=len(gauges),
             t_s=parse_time(t_s),
         )
@@ -546,7 +546,7 @@ class LiveEstimator:
         `samples` and the last known positions are updated.
         """
         notes = []
-        if frame.has_wrench and not self.model.wrenches:
+        if frame.has_wrench and not self.model.experiment.sensors_by_grasp:
             self.counts["with a wrench"] += 1
             if self.counts["with a wrench"] == 1:
                 notes.append(

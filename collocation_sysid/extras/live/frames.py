@@ -19,12 +19,14 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ...errors import InputError
+from ...problem import Problem
+from ...problem.gripper_transforms import gripper_transforms
+from ...program.streaming import StreamingModel
 from ...recording.custom_sensor import Gauge
 from ...recording.formats.text import number_from_text
 from ...recording.formats.topics import POSE
-from ...recording.measured_wrench import Wrench
+from ...recording.measured_wrench import WRENCH_COLUMNS, Wrench
 from ...recording.poses import first_matrix_fault, first_pose_fault
-from ...recording.time_tables import WRENCH_COLUMNS
 
 Pose = Any
 
@@ -398,7 +400,7 @@ class FrameReader:
         Custom sensors of the problem; in a table their columns have the names that the sensors
         state.
     wrenches : mapping of grasp number to Wrench
-        Sensors of grasps of the problem.
+        Sensors of grasps of the problem, by the number of the grasp from 1 on.
     gripper_transforms : sequence of (4, 4) array or None
         Pose of the undeformed body in the frame of each moving grasp's gripper, by which the poses
         in the lines are multiplied; None, and an empty sequence, for poses of the body itself.
@@ -426,6 +428,33 @@ class FrameReader:
         self.wrenches = wrenches
         self.line = 0
         self._columns: list[str] | None = None
+
+    @classmethod
+    def from_model(
+        cls, model: StreamingModel, problem: Problem, source: str = "input"
+    ) -> FrameReader:
+        """Return the reader of frames with the moving grasps, markers and sensors of a model.
+
+        Parameters
+        ----------
+        model : StreamingModel
+            Model of an experiment of the problem.
+        problem : Problem
+            Problem whose file states the poses of grippers, see `gripper_transforms`.
+        source : str
+            Name of the source for messages.
+        """
+        experiment = model.experiment
+        return cls(
+            model.moving_grasps + 1,
+            experiment.markers.names,
+            source=source,
+            gauges=experiment.readings,
+            wrenches=experiment.sensors_by_grasp,
+            gripper_transforms=gripper_transforms(
+                problem, experiment.name, grasps=model.moving_grasps
+            ),
+        )
 
     def read(self, text: str) -> Frame | None:
         """Return the frame of a line; None for an empty line, a comment (``#``) or the header.
@@ -477,7 +506,10 @@ class FrameReader:
             json_object.get("readings"), self.gauges, t_s=t_s
         )
         samples += parse_wrenches(
-            wrench, self.wrenches, instruments_before=len(self.gauges), t_s=t_s
+            wrench,
+            self.wrenches,
+            instruments_before=len(self.gauges),
+            t_s=t_s,
         )
         return Frame(
             t_s,

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...errors import InputError
+from ...features.registry import FEATURES
 from ...methods.stiffness_scan import typical_parameters
 from ...model.point_forces import law_function
 from ...problem import Problem
@@ -107,18 +108,15 @@ def _unsupported_features(
         experiment.actuators,
         "none",
     )
-    yield (
-        "depth cameras, because frames do not contain their images",
-        experiment.depths,
-        "none",
-    )
+    for feature in FEATURES:
+        yield from feature.live_limitations(experiment)
     delayed = experiment.obstacles and nuisance.obstacle_time_s
     yield (
         "an obstacle whose delay is estimated",
         delayed,
         "one whose clock is known",
     )
-    filtered = nuisance.sensor_lag_s and experiment.wrenches
+    filtered = nuisance.sensor_lag_s and experiment.sensors_by_grasp
     yield "a sensor with a low-pass (sensor_lag)", filtered, "one without"
     laws = (
         law_function(each.force, each.points.dofs)

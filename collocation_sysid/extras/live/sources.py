@@ -127,7 +127,8 @@ def frames_of_recording(
         for gauge in experiment.readings
     ]
     series += [
-        (wrench.t_s, wrench.values) for wrench in model.wrenches.values()
+        (sensor.t_s, sensor.values)
+        for sensor in model.experiment.sensors_by_grasp.values()
     ]
     samples = [
         (number, float(at_s), values)

@@ -321,18 +321,18 @@ def plan_models(
     ------
     InputError
         For a model that its problem file does not accept, and for a fitted recording that has
-        neither markers nor a wrench, and is no test of a specimen.
+        neither markers nor a measured force, and is no test of a specimen.
     """
     for each in problem.experiments:
         is_compared = (
             each.markers.sample_count
-            or each.wrenches
+            or each.sensors_by_grasp
             or each.specimen is not None
         )
         if not (each.validation or is_compared):
             raise InputError(
-                f"'{each.name}' has neither markers nor a measured wrench; expected one of these, "
-                "because models are compared by their predictions of these, not of depth images "
+                f"'{each.name}' has neither markers nor a measured force; expected one of these, "
+                "because models are compared by their predictions of these, not of images "
                 "or readings"
             )
     planned = []

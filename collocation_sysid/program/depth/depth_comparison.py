@@ -1,8 +1,8 @@
 """Distances between the points of a depth camera and the surface of a given motion.
 
-For motions that are simulated forward or predicted; a fit has its own association of points with
-the surface, see `surface_correspondences`. Which points are compared is defined by
-`SurfaceComparison`.
+`SurfaceComparison` is for motions that are simulated forward or predicted, and defines which points
+are compared. A fit has its own association of points with the surface, see
+`surface_correspondences`; `depth_residuals` and `outline_distances_px` are its residuals.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from ...common.array_types import Array, root_mean
+from ..experiment_iterate import ExperimentIterate
 from .depth_residual import HUBER, DepthResidual
+from .outline_residual import OutlineResidual
 from .surface_correspondences import SurfaceCorrespondences, initial_gate_m
 
 # Fewest samples of a motion that are interpolated by a cubic spline; fewer are by lines.
@@ -101,7 +103,7 @@ class SurfaceComparison:
         x : (N, 3n) array
             Positions of the fit [m].
         values : (n, e, 3) array
-            Values of the observable, see `ExperimentIterate.depth_residuals`.
+            Values of the observable, see `depth_residuals`.
         phi : (k,) array
             Nuisance parameters.
         """
@@ -188,3 +190,38 @@ def _positions_at_observable(
     if len(t_s) >= FEWEST_FOR_SPLINE:
         return np.asarray(CubicSpline(t_s, position_rows)(at_s))
     return np.array([np.interp(at_s, t_s, each) for each in position_rows.T]).T
+
+
+def depth_residuals(
+    iterate: ExperimentIterate,
+) -> list[tuple[DepthResidual, Array]]:
+    """Return the measurement models of the depth cameras, each with the values (n, e, 3) of its
+    observable: positions of the surface nodes [m].
+    """
+    return surface_residuals(iterate)[: len(iterate.segment.depths)]
+
+
+def surface_residuals(
+    iterate: ExperimentIterate,
+) -> list[tuple[DepthResidual, Array]]:
+    """Return the measurement models of the depth cameras, then of the outlines, each with the
+    values (n, e, 3) of its observable.
+    """
+    readings = (*iterate.segment.depths, *iterate.segment.outlines)
+    values = iterate.observables
+    return [*zip(readings, values[len(values) - len(readings) :], strict=True)]
+
+
+def outline_distances_px(
+    iterate: ExperimentIterate,
+) -> list[tuple[OutlineResidual, Array]]:
+    """Return the measurement models of the outlines, each with the signed distances (n,) of outline
+    points from their edges [pixels]; points without an edge are left out.
+    """
+    distances = []
+    outlines = surface_residuals(iterate)[len(iterate.segment.depths) :]
+    for reading, observation in outlines:
+        assert isinstance(reading, OutlineResidual)
+        distances_px = reading.signed_distances_px(observation, iterate.phi)
+        distances.append((reading, distances_px[np.isfinite(distances_px)]))
+    return distances

@@ -314,6 +314,11 @@ class DepthResidual(MeasurementResidual):
         )
 
     @property
+    def uncompared_count(self) -> int:
+        """Number of points on the body that are left out because they are beside a crease."""
+        return self.correspondences.excluded_counts["crease"]
+
+    @property
     def loss_of_distant_points(self) -> float:
         """Loss of the points beyond the gate of the present correspondences, each counted as if its
         distance were the stated gate.

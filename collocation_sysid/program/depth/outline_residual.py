@@ -54,6 +54,11 @@ class OutlineResidual(DepthResidual):
         )
 
     @property
+    def uncompared_count(self) -> int:
+        """Zero: the points of the image are counted by the camera's own model."""
+        return 0
+
+    @property
     def correspondences_in_use(self) -> Outline:
         """Points of the outline, and planes through the edges in the images."""
         return self.correspondences.outline

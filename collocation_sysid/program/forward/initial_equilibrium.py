@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 from ...common.array_types import Array, Index
 from ...common.step_counting import report_state
 from ...common.time_dependence import scale_loads
-from ...model.contact import Contact
 from ...model.forces import Forces
 from ...model.viscoelasticity import with_start_memory
 from ...recording.experiment import Experiment
@@ -105,11 +104,11 @@ def _solve_equilibrium(
     """
     shape = experiment.rigid_positions([at_s])[0]
     forces = with_start_memory(forces, experiment.loaded_since_s)
-    without_contact = _without_contact(forces, shape)
+    separate = _with_separate_obstacles(forces, shape)
 
     guess = shape.ravel() if start is None and experiment.obstacles else start
     path = SolutionPath(
-        without_contact.ravel(),
+        separate.ravel(),
         halvings=solver.options.max_halvings,
         guess=guess,
     )
@@ -123,7 +122,7 @@ def _solve_equilibrium(
             goals_m
             if share == 1
             else _partial_displacement(
-                experiment, without_contact, time_s=at_s, share=share
+                experiment, separate, time_s=at_s, share=share
             ).ravel()
         )
         try:
@@ -192,19 +191,16 @@ def _describe_state(share: float, force_n: Array) -> str:
     )
 
 
-def _without_contact(forces: Forces, shape: Array) -> Array:
+def _with_separate_obstacles(forces: Forces, shape: Array) -> Array:
     """Return a copy of a shape (n, 3) [m] with the frame of each obstacle moved out of the body by
     its deepest penetration.
 
-    Deep inside a curved obstacle, contact forces are not stable; the obstacle must approach from
+    Deep inside a curved obstacle, its forces are not stable; the obstacle must approach from
     outside.
     """
     places = shape.copy()
     for term in forces.external_terms:
-        if isinstance(term, Contact):
-            frame = term.law_of_contact.obstacle.nodes
-            penetration_m, normal = term.deepest_point(shape.ravel())
-            places[frame] -= max(penetration_m, 0.0) * normal
+        places = term.separate_bodies(places, shape)
     return places
 
 

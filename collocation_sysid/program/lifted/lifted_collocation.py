@@ -1,7 +1,7 @@
 """Program with lifted variables, for methods that need sparse exact matrices.
 
-`with_lifted_variables` returns the program in which history variables, measured wrenches and contact
-pressures are variables with equations of their own, see `lifted_variables`. The optimum and the
+`with_lifted_variables` returns the program in which history variables, measured reactions and
+pressures of obstacles are variables with equations of their own, see `lifted_variables`. The optimum and the
 multipliers of the other constraints are those of the program in which they are eliminated.
 """
 
@@ -200,7 +200,7 @@ def lifted_count(collocation: Collocation, kind: str | None = None) -> int:
     ----------
     collocation : Collocation
         Program.
-    kind : {"memory", "force", "pressure", "wrench"}, optional
+    kind : {"memory", "force", "pressure", "reaction"}, optional
         Kind of lifted variables; None means all.
     """
     return sum(

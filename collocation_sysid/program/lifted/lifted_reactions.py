@@ -18,7 +18,7 @@ import numpy as np
 from ...common.array_types import Array, Index
 from ..experiment_iterate import ExperimentIterate
 from ..motion_jacobian import MotionJacobian
-from ..reaction_forces import reaction_forces
+from ..reactions.reaction_forces import reaction_forces
 from ..transcription import Transcription
 from .lifted_variables import LiftedVariables
 
@@ -26,7 +26,7 @@ from .lifted_variables import LiftedVariables
 class LiftedReactions(LiftedVariables):
     """Lifted reaction forces R of one experiment."""
 
-    kind = "wrench"
+    kind = "reaction"
 
     @property
     def sensed_dofs(self) -> Index:

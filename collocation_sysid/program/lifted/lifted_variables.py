@@ -53,7 +53,7 @@ class LiftedVariables(ABC):
         Index in z where the nuisance parameters of all experiments begin.
     offsets : LiftedOffsets
         Offsets of the variables and equations.
-    kind : {"memory", "force", "pressure", "wrench"}
+    kind : {"memory", "force", "pressure", "reaction"}
         Kind of quantity.
     """
 

@@ -9,8 +9,8 @@ from .lifted_contact_pressures import LiftedContactPressure
 from .lifted_force_histories import LiftedForceHistory
 from .lifted_memory import LiftedMemory
 from .lifted_reactions import LiftedReactions
+from .lifted_resultants import LiftedResultant
 from .lifted_variables import LiftedOffsets, LiftedVariables
-from .lifted_wrenches import LiftedWrench
 
 
 def lift_variables(
@@ -22,7 +22,7 @@ def lift_variables(
 
     For each experiment, in this order: reaction forces of instrumented grasps, memory of the
     material, history variables of forces, contact pressures of complementarity problems, and
-    measured wrenches. Quantities that an experiment does not have are left out.
+    measured resultants of reactions. Quantities that an experiment does not have are left out.
 
     Parameters
     ----------
@@ -46,12 +46,12 @@ def lift_variables(
             "segment_index": number,
             "first_phi": first_phi,
         }
-        wrenches = [
+        resultants = [
             (k, reading)
             for k, reading in enumerate(segment.residuals)
             if reading.observable.local is None and reading.observable.count
         ]
-        if wrenches:
+        if resultants:
             reactions = LiftedReactions(**lift, offsets=offsets)
             groups.append(reactions)
             offsets = reactions.next_offsets
@@ -89,10 +89,10 @@ def lift_variables(
                 )
             )
             offsets = groups[-1].next_offsets
-        for k, reading in wrenches:
+        for k, reading in resultants:
             assert reactions is not None
             groups.append(
-                LiftedWrench(
+                LiftedResultant(
                     **lift,
                     offsets=offsets,
                     residual_index=k,

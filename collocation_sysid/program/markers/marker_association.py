@@ -320,10 +320,10 @@ class MarkerAssociation:
         if self._shape.barycentric(point, np.array([cell])).min() >= 0:
             return False  # no other element contains it better
         best, _ = self._shape.nearest_cell(point)
-        depth = self._shape.barycentric(
+        smallest = self._shape.barycentric(
             np.stack([point, point]), np.array([cell, best])
         ).min(axis=1)
-        return bool(depth[1] > depth[0] + BETTER)
+        return bool(smallest[1] > smallest[0] + BETTER)
 
     def places_of_points(self, nodes_m: Array, points_m: Array) -> Array:
         """Return the places (M, 3) on the undeformed body of points measured in another

@@ -1,6 +1,6 @@
 """Logs of robots: ROS 1 and 2 bags, MCAP files, and LeRobot datasets.
 
-In place of a file, a topic of a log may be given, as in ``run.mcap#/wrench``; it is read as the
+In place of a file, a topic of a log may be given, as in ``run.mcap#/force``; it is read as the
 table that `topics` makes of its messages. Further parts follow after a ``#`` each: two frames, as
 in ``run.mcap#/tf#base>tool``, a robot's description, and the episode of a dataset.
 """

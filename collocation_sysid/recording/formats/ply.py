@@ -1,6 +1,6 @@
 """Points of PLY files (polygon file format): the columns of the element `vertex`.
 
-Files whose first element is `vertex` with numbers only, as depth cameras write them, are read here:
+Files whose first element is `vertex` with numbers only, as scanners write them, are read here:
 the time and memory that this takes are bounded by the size of the file. Others are read by meshio.
 """
 

@@ -1,6 +1,6 @@
 """Pictures of a run, one kind per module; each function takes arrays and returns a Figure.
 
-Over time: `over_time` (markers, wrenches, custom sensors) and `spectrum`. In space: `shapes` (body
+Over time: `over_time` (markers, sensors) and `spectrum`. In space: `shapes` (body
 and markers at several times), `mesh_pictures`, `field_intervals` (a spatially varying constant),
 `depth_comparison_picture` (images of depth cameras) and `instability` (a buckling mode). Of
 specimens: `stress_strain`. Statistics and method: `confidence`, `search_pictures` and `jacobian`.

@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from ...common.array_types import Array
 from ...common.files import replaced_file, safe_name
 from ...common.step_counting import StepUnit, complete_steps, counted_phase
-from ...recording.measured_wrench import COMPONENTS, UNITS
 from ...runs.result_content import Result
 from ..figure_style import RESOLUTION_DPI
 from ..replay import MotionRecord, damaged_run_refused, read_run
@@ -148,11 +147,12 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
                 t_s, measured, fitted_m=fitted, natural_hz=replay.natural_hz
             ),
         )
-    for k, sensed in enumerate(replay.wrenches, start=1):
-        which = "" if len(replay.wrenches) == 1 else f"_{k}"
+    force_series = replay.force_series
+    for series in force_series:
+        which = "" if len(force_series) == 1 else f"_{series.number}"
         yield (
-            f"wrench_{replay.name}{which}",
-            sensor_picture(sensed, COMPONENTS, units=UNITS),
+            f"{series.kind}_{replay.name}{which}",
+            sensor_picture(series.columns, series.names, units=series.units),
         )
     for name, values in replay.readings.items():
         places = values.shape[1] // 3

@@ -1,4 +1,4 @@
-"""Pictures over time of markers, wrenches and custom sensors: measured, fitted, simulated,
+"""Pictures over time of markers and sensors: measured, fitted, simulated,
 residual.
 """
 
@@ -350,7 +350,7 @@ def sensor_picture(
     samples: Array, names: Sequence[str], units: Sequence[str] = ()
 ) -> Figure:
     """Return a figure of the numbers of a sensor over time, three in a row, as the force above the
-    torque of a wrench.
+    torque.
 
     A row of three numbers without any measurement is left out; at least one must be measured.
 

@@ -38,7 +38,9 @@ _MARKER_STYLE = {
     "mec": VERMILION,
     "mew": 0.7,
 }
-_DEPTH_POINT_STYLE = {
+# Name of points of depth cameras in a legend.
+CAMERA_ENTRY = "depth image"
+_CAMERA_POINT_STYLE = {
     "ls": "",
     "marker": ".",
     "ms": 2.4,
@@ -46,7 +48,7 @@ _DEPTH_POINT_STYLE = {
     "mfc": BLUE,
 }
 # Largest number of drawn points of depth cameras; more only take longer to draw.
-MAX_DEPTH_POINTS = 1000
+MAX_CAMERA_POINTS = 1000
 _GRASPED_STYLE = {
     "ls": "",
     "marker": "s",
@@ -218,8 +220,8 @@ class BodyDrawing:
         self.outlines = axes.add_line(
             Line2D([], [], zorder=0.5, lw=0.6, color=BLACK)
         )
-        self.depth_points = axes.add_line(
-            Line2D([], [], zorder=3.5, **_DEPTH_POINT_STYLE)
+        self.camera_points = axes.add_line(
+            Line2D([], [], zorder=3.5, **_CAMERA_POINT_STYLE)
         )
         self.hidden_markers = axes.add_line(
             Line2D([], [], mfc="none", zorder=4, **_MARKER_STYLE)
@@ -235,7 +237,7 @@ class BodyDrawing:
         markers_m: Array,
         colours: Array | None = None,
         outlines_m: Array | None = None,
-        depth_points_m: Array | None = None,
+        camera_points_m: Array | None = None,
     ) -> None:
         """Update the drawing.
 
@@ -255,7 +257,7 @@ class BodyDrawing:
             Colours of the triangles, from 0 to 1; those of their parts by default.
         outlines_m : (o, 3), optional
             Outlines of obstacles [m], NaN between lines; unchanged by default.
-        depth_points_m : (P, 3), optional
+        camera_points_m : (P, 3), optional
             Points of depth cameras [m]; unchanged by default.
         """
         camera = self.view.camera
@@ -284,11 +286,11 @@ class BodyDrawing:
         )
         if outlines_m is not None:
             self.outlines.set_data(*self.view.to_sheet_mm(outlines_m).T)
-        if depth_points_m is not None:
-            few_m = depth_points_m[
-                :: 1 + len(depth_points_m) // MAX_DEPTH_POINTS
+        if camera_points_m is not None:
+            few_m = camera_points_m[
+                :: 1 + len(camera_points_m) // MAX_CAMERA_POINTS
             ]
-            self.depth_points.set_data(
+            self.camera_points.set_data(
                 *self.view.to_sheet_mm(
                     few_m[
                         ~camera.are_hidden(
@@ -374,7 +376,7 @@ def legend_handles(*entries: str) -> list[Line2D]:
     styles = {
         "grasped": {**_GRASPED_STYLE, "ms": 3.0},
         "behind the body": {**_MARKER_STYLE, "mfc": "none"},
-        "depth image": {**_DEPTH_POINT_STYLE, "ms": 4.0},
+        CAMERA_ENTRY: {**_CAMERA_POINT_STYLE, "ms": 4.0},
     }
     return [
         Line2D(

@@ -475,7 +475,7 @@ def _program_fields(
         "variables": collocation.variable_count,
         "constraints": collocation.constraint_count,
         "overstresses": lifted_count(lifted, "memory"),
-        "wrenches": lifted_count(lifted, "wrench"),
+        "wrenches": lifted_count(lifted, "reaction"),
         "jacobian_nonzeros": jacobian,
         "hessian_nonzeros": hessian,
         "method": name,

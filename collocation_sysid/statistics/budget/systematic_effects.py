@@ -34,7 +34,7 @@ from ...model.force_term import States
 from ...model.parameters import Parameters
 from ...program.collocation import ExperimentIterate
 from ...program.contact.contact_summary import surface_gaps_and_pressures
-from ...program.reaction_forces import forces_on_dofs, reaction_forces
+from ...program.reactions.reaction_forces import forces_on_dofs, reaction_forces
 from ...recording.grasp import free_rigid_motions
 from ...recording.homogeneous_deformation import (
     STRESS_PER_FORCE,
@@ -1116,7 +1116,7 @@ class Assumptions(Options):
         A constant offset of each displacement along each of its axes [m].
     obstacle_offset_m
         A constant offset of each obstacle along its normal, or along the axis of its displacement,
-        which changes the beginning of the contact [m].
+        which changes when it touches the body [m].
     obstacle_tilt_rad
         A constant tilt of each obstacle that is a plane or a box, about its point or middle [rad].
     obstacle_time_s
@@ -1135,9 +1135,9 @@ class Assumptions(Options):
         Delay with which each point mass or force begins or ends, if it does so within the recording
         [s].
     tare
-        A constant offset of each component of a wrench, in multiples of its sigma [σ].
+        A constant offset of each component of a force sensor, in multiples of its sigma [σ].
     sensor_time_s
-        Delay of the measured wrenches; at most three standard deviations [s].
+        Delay of the force sensors; at most three standard deviations [s].
     sensor_lag_s
         Time constant of a first-order low-pass in the sensor; between zero and three
         standard deviations of its prior [s].

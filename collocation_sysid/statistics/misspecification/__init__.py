@@ -4,9 +4,9 @@
 - `plausibility`: contradictions that no simulation is needed for; `placement_causes`: loose parts,
   and bodies inside obstacles; `modal_misspecifications`: predictions by natural modes;
   `initial_motion`: bodies that were not at rest at the beginning.
-- `wrench_causes`, `wrench_at_guess`: force sensors; `obstacle_misspecifications`: obstacles and
-  their loads;
-  `camera_misspecifications`, `camera_image_misspecifications`, `camera_clock_misspecifications`:
-  depth cameras, their images and times; `specimen_misspecifications`: homogeneous tests.
+- `obstacle_misspecifications`: obstacles and their loads; `specimen_misspecifications`: homogeneous
+  tests.
 - `fit_misspecifications`: hypotheses after a fit.
+
+Hypotheses about force sensors and cameras are in the package `features`.
 """

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...recording.experiment import Experiment
-from ...recording.obstacle import Obstacle
+from ...recording.obstacle import Obstacle, ObstacleForces
 from ...recording.obstacle_solids import Plane
 from .misspecification_hypothesis import Hypothesis
 
@@ -39,14 +39,15 @@ def obstacle_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     for obstacle in experiment.obstacles:
         strokes = list(_long_stroke(experiment, obstacle))
         yield from strokes
-        if obstacle.wrench is None or strokes:
+        forces = obstacle.measured_forces
+        if forces is None or strokes:
             continue
-        yield from _pulling(experiment, obstacle)
-        yield from _outside_friction_cone(experiment, obstacle)
+        yield from _pulling(experiment, obstacle, forces)
+        yield from _outside_friction_cone(experiment, obstacle, forces)
         if experiment.is_static and not experiment.actuators:
-            yield from _undriven_load(experiment, obstacle)
+            yield from _undriven_load(experiment, obstacle, forces)
             if not experiment.gravity_m_s2.any():
-                yield from _load_without_contact(experiment, obstacle)
+                yield from _load_without_contact(experiment, obstacle, forces)
 
 
 def signed_distances_m(obstacle: Obstacle, points_m: Array) -> Array:
@@ -71,41 +72,27 @@ def _subject(experiment: Experiment, obstacle: Obstacle) -> str:
     return f"obstacle '{obstacle.name}' of '{experiment.name}'"
 
 
-def _world_forces_n(obstacle: Obstacle) -> Array:
-    """Return the measured forces (S, 3) of an obstacle on the body in world axes [N], NaN where a
-    component is missing.
-    """
-    wrench = obstacle.wrench
-    assert wrench is not None
-    forces_n = wrench.values[:, :3]
-    if wrench.frame == "world":
-        return np.array(forces_n)
-    rotations, _ = obstacle.poses.at(wrench.t_s)
-    return np.einsum("sij,sj->si", rotations, forces_n)
-
-
-def _noise_n(experiment: Experiment, obstacle: Obstacle) -> float:
+def _noise_n(experiment: Experiment, forces: ObstacleForces) -> float:
     """Return the force that noise and tare explain [N]."""
-    wrench = obstacle.wrench
-    assert wrench is not None
     tare = experiment.nuisance.tare or 0.0
-    return LOADED * float(np.hypot(1.0, tare)) * wrench.sigma_n
+    return LOADED * float(np.hypot(1.0, tare)) * forces.sigma_n
 
 
-def _normal_and_tangential_n(obstacle: Obstacle) -> tuple[Array, Array]:
+def _normal_and_tangential_n(
+    obstacle: Obstacle, forces: ObstacleForces
+) -> tuple[Array, Array]:
     """Return the component of the measured force on the body along the normal of a plane, positive
     if the plane pushes, and the magnitude across it, (S,) each [N].
 
-    S counts the samples of the wrench with all components of the force; others are left out. Both
-    are empty for other shapes, and without a wrench.
+    S counts the samples with all components of the force; others are left out. Both are empty for
+    other shapes.
     """
     shape = obstacle.shape
-    wrench = obstacle.wrench
-    if not isinstance(shape, Plane) or wrench is None:
+    if not isinstance(shape, Plane):
         return np.zeros(0), np.zeros(0)
-    forces_n = _world_forces_n(obstacle)
+    forces_n = forces.world_forces_n
     complete = np.isfinite(forces_n).all(axis=1)
-    rotations, _ = obstacle.poses.at(wrench.t_s[complete])
+    rotations, _ = obstacle.poses.at(forces.t_s[complete])
     normals = rotations @ shape.normal
     normal_n = np.sum(forces_n[complete] * normals, axis=1)
     across_n = forces_n[complete] - normal_n[:, None] * normals
@@ -113,15 +100,15 @@ def _normal_and_tangential_n(obstacle: Obstacle) -> tuple[Array, Array]:
 
 
 def _pulling(
-    experiment: Experiment, obstacle: Obstacle
+    experiment: Experiment, obstacle: Obstacle, forces: ObstacleForces
 ) -> Iterator[Hypothesis]:
     """Yield the hypothesis that the load of an obstacle has a wrong sign or zero, because it pulls
     at the body.
     """
-    limit_n = _noise_n(experiment, obstacle)
-    pushing_n, _ = _normal_and_tangential_n(obstacle)
+    limit_n = _noise_n(experiment, forces)
+    pushing_n, _ = _normal_and_tangential_n(obstacle, forces)
     if not len(pushing_n):
-        pushing_n = _load_along_motion_n(experiment, obstacle)
+        pushing_n = _load_along_motion_n(experiment, obstacle, forces)
     if not len(pushing_n):
         return
     largest_n = float(np.abs(pushing_n).max())
@@ -141,18 +128,18 @@ def _pulling(
     )
 
 
-def _load_along_motion_n(experiment: Experiment, obstacle: Obstacle) -> Array:
+def _load_along_motion_n(
+    experiment: Experiment, obstacle: Obstacle, forces: ObstacleForces
+) -> Array:
     """Return the load (S,) on the body along the axis of the world along which an obstacle moves
     most [N], positive in the direction of this motion, thus if the obstacle pushes.
 
-    S counts the samples of the wrench with this component; others are left out. Empty if the
-    obstacle has no wrench, does not move or also moves back along the axis, or the experiment is
-    not static.
+    S counts the samples with this component; others are left out. Empty if the obstacle does not
+    move or also moves back along the axis, or the experiment is not static.
     """
-    wrench = obstacle.wrench
-    if wrench is None or not experiment.is_static:
+    if not experiment.is_static:
         return np.zeros(0)
-    _, shifts_m = obstacle.poses.at(wrench.t_s)
+    _, shifts_m = obstacle.poses.at(forces.t_s)
     stroke_m = shifts_m[-1] - shifts_m[0]
     axis = int(np.abs(stroke_m).argmax())
     monotonic = np.abs(np.diff(shifts_m[:, axis])).sum() <= 1.01 * np.abs(
@@ -160,20 +147,20 @@ def _load_along_motion_n(experiment: Experiment, obstacle: Obstacle) -> Array:
     )
     if not stroke_m[axis] or not monotonic:
         return np.zeros(0)
-    load_n = np.sign(stroke_m[axis]) * _world_forces_n(obstacle)[:, axis]
+    load_n = np.sign(stroke_m[axis]) * forces.world_forces_n[:, axis]
     return load_n[np.isfinite(load_n)]
 
 
 def _outside_friction_cone(
-    experiment: Experiment, obstacle: Obstacle
+    experiment: Experiment, obstacle: Obstacle, forces: ObstacleForces
 ) -> Iterator[Hypothesis]:
     """Yield the hypothesis that the friction of a plane is stated too small for its load."""
     if isinstance(obstacle.friction, str):
         return
-    normal_n, tangential_n = _normal_and_tangential_n(obstacle)
+    normal_n, tangential_n = _normal_and_tangential_n(obstacle, forces)
     if not len(normal_n):
         return
-    limit_n = _noise_n(experiment, obstacle)
+    limit_n = _noise_n(experiment, forces)
     excess_n = tangential_n - obstacle.friction * np.maximum(normal_n, 0.0)
     is_loaded = normal_n > limit_n
     outside = is_loaded & (excess_n > limit_n + CALIBRATION * normal_n)
@@ -190,14 +177,12 @@ def _outside_friction_cone(
 
 
 def _undriven_load(
-    experiment: Experiment, obstacle: Obstacle
+    experiment: Experiment, obstacle: Obstacle, forces: ObstacleForces
 ) -> Iterator[Hypothesis]:
     """Yield the hypothesis that an obstacle moves, because its load changes although nothing
     does.
     """
-    wrench = obstacle.wrench
-    assert wrench is not None
-    times_s = wrench.t_s
+    times_s = forces.t_s
     motions = [
         part for grasp in experiment.grasps for part in grasp.poses.at(times_s)
     ]
@@ -209,10 +194,10 @@ def _undriven_load(
         np.ptp(each, axis=0).max(initial=0.0) > 1e-9
         for each in (*motions, *loads)
     )
-    forces_n = wrench.values[:, :3]
+    forces_n = forces.forces_n
     measured = np.isfinite(forces_n).all(axis=0)
     change_n = float(np.ptp(forces_n[:, measured], axis=0).max(initial=0.0))
-    limit_n = 2 * LOADED * wrench.sigma_n
+    limit_n = 2 * LOADED * forces.sigma_n
     if not changes and change_n > limit_n:
         yield Hypothesis(
             "obstacle-fixed",
@@ -249,25 +234,23 @@ def _stroke_m(obstacle: Obstacle, times_s: Array) -> float:
 
 
 def _load_without_contact(
-    experiment: Experiment, obstacle: Obstacle
+    experiment: Experiment, obstacle: Obstacle, forces: ObstacleForces
 ) -> Iterator[Hypothesis]:
     """Yield the hypothesis that an obstacle is elsewhere, because it has loads far from the
     undeformed body, none deep inside, or loads without ever pressing.
     """
-    wrench = obstacle.wrench
-    assert wrench is not None
     spread = np.linspace(
-        0, len(wrench.t_s) - 1, min(len(wrench.t_s), MOST_SAMPLES)
+        0, len(forces.t_s) - 1, min(len(forces.t_s), MOST_SAMPLES)
     )
     samples = np.unique(spread.astype(int))
-    forces_n = wrench.values[samples, :3]
+    forces_n = forces.forces_n[samples]
     load_n = np.sqrt(np.nansum(forces_n**2, axis=1))
     is_measured = np.isfinite(forces_n).any(axis=1)
-    gaps_m = _smallest_gaps_m(experiment, obstacle, times_s=wrench.t_s[samples])
-    limit_n = _noise_n(experiment, obstacle)
+    gaps_m = _smallest_gaps_m(experiment, obstacle, times_s=forces.t_s[samples])
+    limit_n = _noise_n(experiment, forces)
     far_m = PLACE * _diagonal_m(experiment)
     loaded = is_measured & (load_n > limit_n)
-    stroke_m = _stroke_m(obstacle, wrench.t_s)
+    stroke_m = _stroke_m(obstacle, forces.t_s)
     never_presses = bool(-gaps_m.min() < PRESSING * stroke_m)
     cases = {
         "far": (loaded & (gaps_m > far_m), float(gaps_m.max())),

@@ -27,6 +27,7 @@ from ...program.modes.modal_prediction import carrying_grasp
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.obstacle import Obstacle
+from ...recording.poses import Frame
 from .misspecification_hypothesis import Hypothesis
 
 # Densities of soft objects [kg/m³].
@@ -136,7 +137,7 @@ def _excess_factor(value: float, limits: tuple[float, float]) -> float:
 AGAINST = -0.8
 # Fewest samples for this correlation.
 FEWEST_SAMPLES = 3
-# Loads of an obstacle below this share of the largest may be those of no contact.
+# Loads of an obstacle below this share of the largest may be those before it touches the body.
 TOUCHING = 0.05
 
 
@@ -150,16 +151,19 @@ def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     for k, grasp in enumerate(
         experiment.grasps if experiment.is_static else (), start=1
     ):
-        if grasp.wrench is None:
+        sensor = experiment.sensors_by_grasp.get(k)
+        if sensor is None:
             continue
-        shifts_m = grasp.poses.at(grasp.wrench.t_s)[1]
-        for axis in grasp.zero or _pushing_axis(grasp, shifts_m):
+        shifts_m = grasp.poses.at(sensor.t_s)[1]
+        for axis in grasp.zero or _pushing_axis(
+            grasp, shifts_m, frame=sensor.frame
+        ):
             axis_index = "xyz".index(axis)
             displacement_m = shifts_m[:, axis_index]
-            load_n = grasp.wrench.values[:, axis_index]
+            load_n = sensor.values[:, axis_index]
             is_measured = np.isfinite(load_n)
             if isinstance(grasp, Obstacle):
-                # Before contact the load is noise.
+                # Before the obstacle touches the body, the load is noise.
                 is_measured &= np.abs(load_n) > TOUCHING * np.nanmax(
                     np.abs(load_n), initial=0.0
                 )
@@ -181,14 +185,14 @@ def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
                 )
 
 
-def _pushing_axis(grasp: Grasp, shifts_m: Array) -> str:
+def _pushing_axis(grasp: Grasp, shifts_m: Array, frame: Frame) -> str:
     """Return the world axis along which an obstacle moves most, from its shifts (S, 3) [m]; "" for
-    a grasp, if the obstacle does not move, or if its force is not in world axes.
+    a grasp, if the obstacle does not move, or if the frame of its force is not the world.
     """
     moved_m = np.ptp(shifts_m, axis=0)
-    if not isinstance(grasp, Obstacle) or grasp.wrench is None:
+    if not isinstance(grasp, Obstacle):
         return ""
-    if not moved_m.any() or grasp.wrench.frame != "world":
+    if not moved_m.any() or frame != "world":
         return ""
     return "xyz"[int(moved_m.argmax())]
 

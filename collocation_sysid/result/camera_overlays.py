@@ -1,23 +1,26 @@
 """Points of depth cameras and outlines of the body's surface, as pictures and films need them.
 
-`surface_rows` is for a fitted or simulated surface, `undeformed_rows` for the undeformed body
-before anything is fitted. Both give the rows of `MotionRecord.visible_points`.
+`visible_points` and `surface_rows` are for a fitted or simulated surface, `undeformed_rows` for the
+undeformed body before anything is fitted. All give the rows of `MotionRecord.visible_points`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..common.array_types import Array
+from ..features.depth_feature import fitted_surfaces
 from ..model.nuisance_map import NuisanceMap
 from ..program.depth.depth_camera_model import DepthCameraModel
 from ..program.depth.depth_comparison import SurfaceComparison
 from ..program.depth.visible_surface import VisibleSurface
 from ..recording.experiment import Experiment
+from ..runs.forward_simulation import ForwardSimulation
+from ..runs.solved_problem import SolvedProblem
 from .pictures.album import save_pictures, with_unique_names
 from .pictures.depth_comparison_picture import depth_picture
 from .pictures.projection import ParallelCamera
@@ -241,6 +244,27 @@ def surface_rows(surface: SurfaceComparison, up: Array) -> Array:
         if samples
     ]
     return np.vstack(rows)
+
+
+def visible_points(
+    finished: SolvedProblem, experiment: Experiment
+) -> dict[str, Array]:
+    """Return the points of each depth camera on the fitted surface, or else on the simulated one.
+
+    The arrays (k, 8), by name of the camera, have the rows of `MotionRecord.visible_points`. The
+    mapping is empty where neither surface is known, or without depth cameras.
+    """
+    part = finished.solution.part_of(experiment.name)
+    rollout = finished.rollouts[experiment.name]
+    surfaces: Mapping[str, SurfaceComparison] = {}
+    if part is not None:
+        surfaces = fitted_surfaces(part)
+    elif isinstance(rollout, ForwardSimulation):
+        surfaces = rollout.predicted.surfaces
+    return {
+        name: surface_rows(surface, experiment.upward_direction)
+        for name, surface in surfaces.items()
+    }
 
 
 def undeformed_rows(experiment: Experiment) -> dict[str, Array]:

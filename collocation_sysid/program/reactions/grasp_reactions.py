@@ -1,7 +1,7 @@
 """Reaction forces of instrumented grasps, one time step after the other.
 
 The reaction is the residual of the equations of motion at the grasped dofs (see
-`program.reaction_forces`). It is available one time step late: the midpoint rule evaluates
+`reaction_forces`). It is available one time step late: the midpoint rule evaluates
 forces between two steps, and the acceleration of a tool needs the next pose.
 """
 
@@ -16,21 +16,21 @@ from ...common.array_types import Array, Index
 from ...model.equations_at_parameters import EquationsAtParameters
 from ...recording.poses import Poses
 from ..observables import ReactionForces
-from ..reaction_forces import GraspForces
-from .wrench_observable import GraspWrench, ReactionGrid
+from .reaction_forces import GraspForces
+from .reaction_resultant import ReactionGrid, ReactionResultant
 
-# Number of time steps after which the wrench of a time is available.
+# Number of time steps after which the resultant of a time is available.
 DELAY_STEPS = 1
 
-# Wrench of a grasp, and the index of the grasp.
-Sensor = tuple[GraspWrench, int]
+# Resultant of a grasp's reactions, and the index of the grasp.
+Sensor = tuple[ReactionResultant, int]
 # Weights of the forces and of the positions: two matrices (rows, rows) of the template.
 Weights = tuple[Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
-class StreamedWrench(GraspWrench):
-    """Wrench of a grasp at consecutive time steps.
+class StreamedResultant(ReactionResultant):
+    """Resultant of the reactions of a grasp at consecutive time steps.
 
     Attributes
     ----------
@@ -49,17 +49,17 @@ class StreamedWrench(GraspWrench):
     @classmethod
     def from_poses(
         cls,
-        channel: GraspWrench,
+        channel: ReactionResultant,
         rotations: Array,
         shifts: Array,
         step_s: float,
-    ) -> StreamedWrench:
-        """Return the wrench of a grasp at n consecutive time steps.
+    ) -> StreamedResultant:
+        """Return the resultant of the reactions of a grasp at n consecutive time steps.
 
         Parameters
         ----------
-        channel : GraspWrench
-            Wrench in the still recording, whose other properties are copied; generated functions
+        channel : ReactionResultant
+            Resultant in the still recording, whose other properties are copied; generated functions
             are shared.
         rotations : (n + 2, 3, 3)
             Rotations of the grasp at these steps, and at the ones before and after.
@@ -70,17 +70,17 @@ class StreamedWrench(GraspWrench):
         """
         properties = {
             name: getattr(channel, name)
-            for name in GraspWrench.__dataclass_fields__
+            for name in ReactionResultant.__dataclass_fields__
         }
         properties["reaction_grid"] = ReactionGrid.from_times(
             step_s * np.arange(len(rotations) - 2, dtype=np.float64)
         )
-        wrench = cls(
+        resultant = cls(
             **properties, rotations=rotations, shifts=shifts, step_s=step_s
         )
         if len(channel.tool_parameters):
-            vars(wrench)["tool"] = channel.tool
-        return wrench
+            vars(resultant)["tool"] = channel.tool
+        return resultant
 
     def poses_at(self, rows: Index) -> tuple[Array, Array]:
         """Return rotations (k, 3, 3) and translations (k, 3) [m] at k of the n time steps, given by
@@ -211,15 +211,15 @@ class GraspReactions:
             shifts=self.shifts.copy(),
         )
 
-    def wrenches(
+    def resultants(
         self,
         sensors: Sequence[Sensor],
         setting: EquationsAtParameters,
         x: Array,
         weights: Weights,
         rows: Index,
-    ) -> tuple[ReactionForces, list[StreamedWrench]]:
-        """Return the reactions at some time steps with derivatives, and the wrenches of the
+    ) -> tuple[ReactionForces, list[StreamedResultant]]:
+        """Return the reactions at some time steps with derivatives, and the resultants of the
         sensors.
 
         Forces, sensitivities and poses are those that this object has stored; nothing is changed.
@@ -244,7 +244,7 @@ class GraspReactions:
         -------
         ReactionForces
             Reactions and positions (n, g) of the sensed dofs, and their sensitivities (n, g, m).
-        list of StreamedWrench
+        list of StreamedResultant
             In the order of the sensors.
         """
         dynamics = setting.dynamics
@@ -267,7 +267,7 @@ class GraspReactions:
         by += setting.inertia_derivatives(0, acceleration, dofs=dofs)
         pose_rows = slice(at[0] - 1, at[-1] + 2)
         channels = [
-            StreamedWrench.from_poses(
+            StreamedResultant.from_poses(
                 channel,
                 self.rotations[pose_rows, grasp],
                 shifts=self.shifts[pose_rows, grasp],

@@ -15,14 +15,14 @@ from itertools import chain, combinations, product
 import numpy as np
 from scipy.spatial import KDTree
 
-from ...common.array_types import Array
-from ...errors import InputError
-from ...program.depth.camera_alignment import thinned
-from ...program.depth.surface_correspondences import initial_gate_m
-from ...program.depth.visible_surface import VisibleSurface
-from ...recording.depth_camera import Depth, points_from_image
-from ...recording.experiment import Experiment
-from .misspecification_hypothesis import Hypothesis
+from ..common.array_types import Array
+from ..errors import InputError
+from ..program.depth.camera_alignment import thinned
+from ..program.depth.surface_correspondences import initial_gate_m
+from ..program.depth.visible_surface import VisibleSurface
+from ..recording.depth_camera import Depth, points_from_image
+from ..recording.experiment import Experiment
+from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
 
 # Share of the surface with points nearby below which the body is hardly visible.
 HARDLY = 0.1

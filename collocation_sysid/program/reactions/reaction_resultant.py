@@ -1,10 +1,11 @@
-"""Wrench of a grasp at its force–torque sensor, on the time grid, as an observable.
+"""Resultant of the reactions of a grasp, force and torque at a sensor, as an observable on the time
+grid.
 
 In the frame of the sensor with axes Q_k and origin o_k,
 
-    W_k = Σ_g (Q_kᵀ R_g, Q_kᵀ (x_g − o_k) × R_g) + wrench of the tool,
+    W_k = Σ_g (Q_kᵀ R_g, Q_kᵀ (x_g − o_k) × R_g) + load of the tool,
 
-with the reaction forces R of `reaction` and the grasped nodes x_g. A tool of mass m between sensor
+with the reaction forces R of `reaction_forces` and the grasped nodes x_g. A tool of mass m between sensor
 and body, with its centre at c in the frame of the grasp, adds the force m (a_c − g) at its centre,
 a_c being the acceleration of the centre and g gravity. Values are Y = L W, where L is a first-order
 low-pass with an estimated time constant, or the identity.
@@ -28,7 +29,6 @@ from ...model.nuisance_map import NuisanceMap
 from ...model.recursion import Recursion, RecursionTrajectory
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
-from ...recording.measured_wrench import Frame
 from ...recording.nuisance import (
     SENSOR_LAG,
     SENSOR_TIME,
@@ -37,17 +37,20 @@ from ...recording.nuisance import (
     NuisanceRow,
     cayley_rotation,
 )
+from ...recording.poses import Frame
 from ..observables import (
     ObservableDerivatives,
     ObservedMotion,
     ReactionForces,
     VectorJacobianProduct,
 )
-from ..reaction_forces import centred_rows
+from .reaction_forces import centred_rows
 
 # Sizes of the data of the tool: the sensor's axes Q, the grasp's rotation and its second time
 # derivative, its translation from the sensor's origin, and the second derivative of that.
 TOOL_DATA = (9, 9, 9, 3, 3)
+# Grid times that a sample is interpolated from: an error of (ωΔt)⁴ / 40 of a swing.
+TIMES_PER_SAMPLE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +68,7 @@ class ReactionGrid:
     reach : int
         Row t depends on the grasp from time t − reach on.
     is_static : bool
-        Whether the rows are equilibria, at times that need not be evenly spaced; the wrench is then
+        Whether the rows are equilibria, at times that need not be evenly spaced; the resultant is then
         linear between them.
     """
 
@@ -111,8 +114,8 @@ class ReactionGrid:
 
 
 @dataclass(frozen=True, eq=False)
-class GraspWrench:
-    """Force and torque (n, 2, 3) of one grasp, as an observable.
+class ReactionResultant:
+    """Force and torque (n, 2, 3) by which one grasp acts on the body, as an observable.
 
     Attributes
     ----------
@@ -121,9 +124,9 @@ class GraspWrench:
     grasp : Grasp
         The grasp.
     frame : str
-        Frame of the sensor, see `Wrench`.
+        Frame of the sensor, in whose axes components are expressed.
     point_m : (3,) array
-        Origin of the sensor, see `Wrench` [m].
+        Point of the torque [m]: fixed in the world, or in the frame "grasp" on the undeformed body.
     reaction_grid : ReactionGrid
         Times at which reaction forces are known.
     nuisance : NuisanceMap
@@ -166,17 +169,17 @@ class GraspWrench:
 
     @cached_property
     def known_rows(self) -> Index:
-        """Indices (n,) of the grid times whose wrench is known, ascending."""
+        """Indices (n,) of the grid times whose resultant is known, ascending."""
         return self.reaction_grid.reaction_times(self.grasp)
 
     @property
     def count(self) -> int:
-        """Number n of grid times whose wrench is known."""
+        """Number n of grid times whose resultant is known."""
         return len(self.known_rows)
 
     @cached_property
     def t_s(self) -> Array:
-        """Grid times (n,) with a known wrench [s]."""
+        """Grid times (n,) with a known resultant [s]."""
         return self.reaction_grid.t_s[self.known_rows]
 
     @property
@@ -216,7 +219,7 @@ class GraspWrench:
         grid: ReactionGrid,
         nuisance: NuisanceMap,
         number: int = -1,
-    ) -> GraspWrench:
+    ) -> ReactionResultant:
         """Build the observable of one grasp of an experiment.
 
         Parameters
@@ -226,7 +229,7 @@ class GraspWrench:
         grasp : Grasp
             One of its grasps.
         frame : str
-            Frame of the sensor, see `Wrench`.
+            Frame of the sensor, in whose axes components are expressed.
         point_m : (3,) array
             Origin of the sensor [m].
         grid : ReactionGrid
@@ -312,7 +315,7 @@ class GraspWrench:
     def reaction_jacobians(
         self, reactions: ReactionForces
     ) -> tuple[Array, Array]:
-        """Return A and B (n, 6, d) of the change dW = A dR + B dx of the wrench without tool and
+        """Return A and B (n, 6, d) of the change dW = A dR + B dx of the resultant without tool and
         without low-pass, by the reaction forces and positions of the d dofs of the grasp.
         """
         by_u = MOMENT.evaluate_with_jacobian(*self.moment_inputs(reactions))[1]
@@ -320,7 +323,7 @@ class GraspWrench:
         return _by_dof(by_u[..., 3:]), _by_dof(by_u[..., :3])
 
     def evaluate_without_tool(self, reactions: ReactionForces) -> Array:
-        """Return the wrench W (n, 6) without that of the tool and without low-pass [N, N m]."""
+        """Return the resultant W (n, 6) without the load of the tool and without low-pass [N, N m]."""
         return MOMENT.evaluate(*self.moment_inputs(reactions)).sum(axis=2).T
 
     # The tool ---------------------------------------------------------------------------------
@@ -337,18 +340,18 @@ class GraspWrench:
 
     @cached_property
     def tool(self) -> GeneratedFunction:
-        """Generated wrench (6,) of the tool, m (a_c − g) at c, as a function of `tool_parameters`,
+        """Generated force and torque (6,) of the tool, m (a_c − g) at c, as a function of `tool_parameters`,
         see `tool_inputs`.
         """
         return GeneratedFunction(
-            self._tool_wrench,
+            self._tool_load,
             len(self.tool_parameters),
             data_size=sum(TOOL_DATA),
         )
 
-    def _tool_wrench(self, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the expression of the wrench (6,) of the tool in the sensor's axes [N, N m], from
-        its parameters φ and the data of `tool_inputs`.
+    def _tool_load(self, phi: ca.SX, data: ca.SX) -> ca.SX:
+        """Return the expression of force and torque (6,) of the tool in the sensor's axes
+        [N, N m], from its parameters φ and the data of `tool_inputs`.
         """
         axes, turn, turn_rate, shift, shift_rate = ca.vertsplit(
             data, np.cumsum([0, *TOOL_DATA])
@@ -410,7 +413,7 @@ class GraspWrench:
     def evaluate_unfiltered(
         self, reactions: ReactionForces, phi: Array
     ) -> Array:
-        """Return the wrench W (n, 6) [N, N m] of reaction forces at φ including the tool if its
+        """Return the resultant W (n, 6) [N, N m] of reaction forces at φ including the tool if its
         mass is estimated, before the low-pass.
         """
         value = self.evaluate_without_tool(reactions)
@@ -427,7 +430,7 @@ class GraspWrench:
         """Index in φ of the time constant of the low-pass; empty without a low-pass."""
         return self.parameter_indices(SENSOR_LAG)
 
-    def filter_wrench(
+    def filter_resultant(
         self, value: Array, phi: Array
     ) -> RecursionTrajectory | None:
         """Return the low-pass filtered W (n, 6) at φ (k,) as a recursion with derivatives; None
@@ -457,11 +460,11 @@ class GraspWrench:
     # As channels are --------------------------------------------------------------------------
 
     def evaluate(self, motion: ObservedMotion, phi: Array) -> Array:
-        """Return the measured wrench Y = L W (n, 2, 3), force [N] and torque [N m], of a motion at
-        φ, at the n times whose reaction forces the motion covers.
+        """Return the measured resultant Y = L W (n, 2, 3), force [N] and torque [N m], of a motion
+        at φ, at the n times whose reaction forces the motion covers.
         """
         value = self.evaluate_unfiltered(_reactions_of(motion), phi)
-        evolution = self.filter_wrench(value, phi)
+        evolution = self.filter_resultant(value, phi)
         return (evolution.states[0] if evolution else value).reshape(-1, 2, 3)
 
     def linearise(
@@ -505,7 +508,7 @@ class GraspWrench:
             slope[..., first + self.tool_parameters] += np.moveaxis(
                 by_phi, 2, 0
             )
-        if evolution := self.filter_wrench(value, phi):
+        if evolution := self.filter_resultant(value, phi):
             by_lag = (
                 np.arange(size) == first + self.low_pass_parameters[:, None]
             )
@@ -536,7 +539,7 @@ class GraspWrench:
         by_x = np.zeros_like(motion.x)
         by_reaction = np.zeros_like(forced.reaction)
         by_w = by_values.reshape(-1, 6)
-        if evolution := self.filter_wrench(
+        if evolution := self.filter_resultant(
             self.evaluate_unfiltered(forced, phi), phi
         ):
             (by_w,), by_phi[self.low_pass_parameters] = (
@@ -566,7 +569,7 @@ class GraspWrench:
         rotations: Array,
     ) -> Array | float:
         """Return the changes (n, 2, 3, c) of Y due to pose errors that move the frame of the
-        sensor; the reaction forces and the wrench of the tool are constant.
+        sensor; the reaction forces and the load of the tool are constant.
 
         Parameters
         ----------
@@ -597,7 +600,7 @@ class GraspWrench:
         k = self.known_rows[: len(value)]
         pose_changes = np.concatenate([rotations[k], shifts[k]], axis=2)
         change = np.einsum("abn,ncb->nac", slopes, pose_changes)
-        if evolution := self.filter_wrench(value, phi):
+        if evolution := self.filter_resultant(value, phi):
             (change,) = evolution.jacobian_vector_product(
                 change[None], np.zeros((1, change.shape[2]))
             )
@@ -622,7 +625,7 @@ def _reactions_of(motion: ObservedMotion) -> ReactionForces:
         If the motion has none.
     """
     if motion.reactions is None:
-        raise ValueError("a wrench needs the reaction forces of the motion")
+        raise ValueError("a resultant needs the reaction forces of the motion")
     return motion.reactions
 
 
@@ -638,7 +641,7 @@ def _moment(u: ca.SX, data: ca.SX) -> ca.SX:
 
 
 def _in_moved_frame(offset: ca.SX, data: ca.SX) -> ca.SX:
-    """Return the expression of a wrench (6,) in a frame that is rotated and translated by an
+    """Return the expression of force and torque (6,) in a frame that is rotated and translated by an
     offset.
 
     Parameters

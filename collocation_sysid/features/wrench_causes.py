@@ -16,22 +16,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...common.array_types import Array
-from ...errors import InputError, SimulationError
-from ...methods.continuation import first_samples
-from ...methods.reduced_space import ReducedSpace
-from ...methods.solution import Solution
-from ...program.collocation import Collocation, ExperimentIterate
-from ...program.observables import ReactionForces
-from ...program.transcription import Transcription
-from ...program.wrench.wrench_residual import (
+from ..common.array_types import Array
+from ..errors import InputError, SimulationError
+from ..methods.continuation import first_samples
+from ..methods.reduced_space import ReducedSpace
+from ..methods.solution import Solution
+from ..program.collocation import Collocation, ExperimentIterate
+from ..program.observables import ReactionForces
+from ..program.transcription import Transcription
+from ..program.wrench_residual import (
     WrenchResidual,
     without_grasp_sensors,
 )
-from ...recording.measured_wrench import Frame, Wrench
-from ...recording.nuisance import TOOL_CENTRE, TOOL_MASS
-from ..axes import OTHER_AXES
-from .misspecification_hypothesis import Hypothesis, HypothesisTest
+from ..recording.measured_wrench import Wrench
+from ..recording.nuisance import TOOL_CENTRE, TOOL_MASS
+from ..recording.poses import Frame
+from ..statistics.axes import OTHER_AXES
+from ..statistics.misspecification.misspecification_hypothesis import (
+    Hypothesis,
+    HypothesisTest,
+)
 
 # RMS residual in standard deviations that needs an explanation; a correct description must leave
 # less.

@@ -25,12 +25,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.array_types import Array, Index
-from ..model.dynamics import Dynamics
-from ..model.equations_at_parameters import EquationsAtParameters
-from ..model.internal_variables import AnyHistory
-from .linear_algebra.block_band import Submatrix
-from .observables import ReactionForces
+from ...common.array_types import Array, Index
+from ...model.dynamics import Dynamics
+from ...model.equations_at_parameters import EquationsAtParameters
+from ...model.internal_variables import AnyHistory
+from ..linear_algebra.block_band import Submatrix
+from ..observables import ReactionForces
 
 
 def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:

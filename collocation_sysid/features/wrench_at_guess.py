@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...common.array_types import Array
-from ...program.collocation import ExperimentIterate
-from ...recording.experiment import Experiment
-from ...recording.measured_wrench import COMPONENTS, UNITS
-from ..axes import OTHER_AXES
-from .misspecification_hypothesis import Hypothesis
+from ..common.array_types import Array
+from ..program.collocation import ExperimentIterate
+from ..recording.experiment import Experiment
+from ..recording.measured_wrench import COMPONENTS, UNITS
+from ..statistics.axes import OTHER_AXES
+from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
 
 # RMS deviation in standard deviations of the noise below which nothing is tested: guesses err.
 SMALLEST_MISFIT = 5.0

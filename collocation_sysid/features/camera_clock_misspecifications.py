@@ -15,12 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ...common.array_types import Array
-from ...program.collocation import ExperimentIterate
-from ...program.depth.camera_alignment import thinned
-from ...program.depth.depth_residual import DepthResidual
-from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
-from .misspecification_hypothesis import Hypothesis, HypothesisTest
+from ..common.array_types import Array
+from ..program.collocation import ExperimentIterate
+from ..program.depth.camera_alignment import thinned
+from ..program.depth.depth_residual import DepthResidual
+from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
+from ..statistics.misspecification.misspecification_hypothesis import (
+    Hypothesis,
+    HypothesisTest,
+)
 
 # Fewest images whose order can be tested.
 FEWEST_IMAGES = 3

@@ -1,9 +1,9 @@
-"""Wrenches at a force–torque sensor on the time grid, as variables of the program.
+"""Resultants of the reactions of a grasp on the time grid, as variables of the program.
 
     W_k − Σ_g moment(x_g, R_g) − tool(φ) = 0,  variables W_k,
     Y_k − e Y_{k−1} − a W_{k−1} − b W_k = 0,   variables Y_k, where a low-pass is estimated,
 
-see `wrench_observable`; without a low-pass Y is W. The loss is a function of Y, whose Hessian
+see `reaction_resultant`; without a low-pass Y is W. The loss is a function of Y, whose Hessian
 couples only the few grid times around a sample. R are the lifted reaction forces of
 `lifted_reactions`. W and Y are scaled by their measurement uncertainty, so that the loss has
 similar curvature by them as by positions; their equations are scaled like other equations.
@@ -23,18 +23,18 @@ from ...model.generated_functions import GeneratedFunction
 from ..experiment_iterate import ExperimentIterate
 from ..measurement_residual import MeasurementResidual
 from ..motion_transcription import RowWeights
-from ..wrench.wrench_observable import LOW_PASS, MOMENT, GraspWrench
+from ..reactions.reaction_resultant import LOW_PASS, MOMENT, ReactionResultant
 from .expression_patterns import ExpressionPattern, PatternIndices
 from .lifted_reactions import LiftedReactions
 from .lifted_variables import LiftedVariables
 
-# Identity: the value (6,) of a wrench.
+# Identity: the value (6,) of a resultant.
 ITSELF = GeneratedFunction(lambda u, _: u, 6, data_size=0)
 
 
 @dataclass(frozen=True, eq=False)
-class LiftedWrench(LiftedVariables):
-    """Lifted wrenches W and filtered wrenches Y of one sensor.
+class LiftedResultant(LiftedVariables):
+    """Lifted resultants W and low-pass filtered resultants Y of one sensor.
 
     Attributes
     ----------
@@ -49,15 +49,15 @@ class LiftedWrench(LiftedVariables):
     residual_index: int
     residual: MeasurementResidual
     reactions: LiftedReactions
-    kind = "wrench"
+    kind = "reaction"
 
     @property
-    def observable(self) -> GraspWrench:
-        """Wrench of the grasp as an observable."""
-        return cast(GraspWrench, self.residual.observable)
+    def observable(self) -> ReactionResultant:
+        """Resultant of the grasp's reactions as an observable."""
+        return cast(ReactionResultant, self.residual.observable)
 
     @property
-    def _wrench_size(self) -> int:
+    def _resultant_size(self) -> int:
         """Number of components of W at all grid times."""
         return 6 * self.observable.count
 
@@ -96,22 +96,24 @@ class LiftedWrench(LiftedVariables):
     def with_lifted(
         self, iterate: ExperimentIterate, z: Array
     ) -> ExperimentIterate:
-        """Return a copy of the iterate with the measured wrench Y (times, 2, 3) [N, N m] taken from
+        """Return a copy of the iterate with the measured resultant Y (times, 2, 3) [N, N m] taken from
         z, W without a low-pass.
         """
-        wrench = z[self._observable_columns].reshape(-1, 6) * self._unit
+        resultant = z[self._observable_columns].reshape(-1, 6) * self._unit
         return replace(
             iterate,
             lifted_observables={
                 **iterate.lifted_observables,
-                self.residual_index: wrench.reshape(-1, 2, 3),
+                self.residual_index: resultant.reshape(-1, 2, 3),
             },
         )
 
     @property
     def _observable_columns(self) -> slice:
         """Slice of Y in z, of W without a low-pass."""
-        return slice(self.columns.stop - self._wrench_size, self.columns.stop)
+        return slice(
+            self.columns.stop - self._resultant_size, self.columns.stop
+        )
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
         """Return the scaled W and, with a low-pass, Y (count,) that follow from the iterate's
@@ -120,7 +122,7 @@ class LiftedWrench(LiftedVariables):
         own = [
             self.observable.evaluate_unfiltered(iterate.reactions, iterate.phi)
         ]
-        if evolution := self.observable.filter_wrench(own[0], iterate.phi):
+        if evolution := self.observable.filter_resultant(own[0], iterate.phi):
             own += [*evolution.states]
         return (np.stack(own) / self._unit).ravel()
 
@@ -131,16 +133,16 @@ class LiftedWrench(LiftedVariables):
         """Expressions of the equations: W itself, moments of the nodes, tool, and low-pass."""
         channel = self.observable
         indices = np.arange(self.count).reshape(self.shape)
-        wrench = self.offsets.variable + indices[0].T
-        of_wrench = indices[0].T
+        resultant = self.offsets.variable + indices[0].T
+        of_resultant = indices[0].T
         unit = self._unit[:, None]
         minus = -self._row_unit[:, None]
-        own = PatternIndices(of_wrench, -minus)
+        own = PatternIndices(of_resultant, -minus)
         terms = [
             ExpressionPattern.from_arrays(
                 ITSELF,
                 np.zeros((0, 1)),
-                inputs=[PatternIndices(wrench, unit)],
+                inputs=[PatternIndices(resultant, unit)],
                 rows=own,
             )
         ]
@@ -158,7 +160,7 @@ class LiftedWrench(LiftedVariables):
             )
         ]
         reaction_indices = PatternIndices(
-            of_wrench[..., None], minus[..., None]
+            of_resultant[..., None], minus[..., None]
         )
         terms.append(
             ExpressionPattern.from_arrays(
@@ -178,7 +180,7 @@ class LiftedWrench(LiftedVariables):
                     channel.tool,
                     data,
                     inputs=[by_phi],
-                    rows=PatternIndices(of_wrench, minus),
+                    rows=PatternIndices(of_resultant, minus),
                 )
             )
         if len(lag := channel.low_pass_parameters):
@@ -217,7 +219,7 @@ class LiftedWrench(LiftedVariables):
         """
         own = np.zeros(self.count)
         by_observables, _ = iterate.loss_gradients[self.residual_index]
-        own[self.count - self._wrench_size :] = (
+        own[self.count - self._resultant_size :] = (
             by_observables.reshape(-1, 6) * self._unit
         ).ravel()
         return own
@@ -274,7 +276,7 @@ class LiftedWrench(LiftedVariables):
             weights=weights,
         )
         rows, columns = self._loss_entries
-        size = self._wrench_size + len(iterate.phi)
+        size = self._resultant_size + len(iterate.phi)
         observables = iterate.observables[self.residual_index]
         of_loss = self.residual.hessian(
             observables,

@@ -2,9 +2,10 @@
 
     ŷ(s) = Σ_k ℓ_k(s + τ) Y_k + tare,
 
-where Y is the wrench on the grid (`wrench_observable`), τ the shift of the sensor's clock, and ℓ
-are the cubic weights of the four grid times around the sample. Each sample is compared at its own
-time, however many there are in a step, so that no averaging hides a motion.
+where Y is the resultant of the reactions on the grid (`reactions.reaction_resultant`), τ the shift
+of the sensor's clock, and ℓ are the cubic weights of the four grid times around the sample. Each
+sample is compared at its own time, however many there are in a step, so that no averaging hides a
+motion.
 """
 
 from __future__ import annotations
@@ -15,23 +16,24 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.array_types import Array, Index
-from ...model.nuisance_map import NuisanceMap
-from ...recording.experiment import Experiment
-from ...recording.measured_wrench import Wrench
-from ...recording.nuisance import SENSOR_TIME, TARE
-from ...recording.sample_times import TIME_TOLERANCE_S
-from ..measurement_residual import (
+from ..common.array_types import Array, Index
+from ..model.nuisance_map import NuisanceMap
+from ..recording.experiment import Experiment
+from ..recording.measured_wrench import Wrench
+from ..recording.nuisance import SENSOR_TIME, TARE
+from ..recording.sample_times import TIME_TOLERANCE_S
+from .measurement_residual import (
     MeasurementResidual,
     RowStencil,
     lagrange_weights,
     neighbouring_times,
 )
-from ..observables import ObservedMotion, ReactionForces
-from .wrench_observable import GraspWrench, ReactionGrid
-
-# Grid times that a sample is interpolated from: an error of (ωΔt)⁴ / 40 of a swing.
-NEIGHBOURS = 4
+from .observables import ObservedMotion, ReactionForces
+from .reactions.reaction_resultant import (
+    TIMES_PER_SAMPLE,
+    ReactionGrid,
+    ReactionResultant,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,13 +42,13 @@ class WrenchResidual(MeasurementResidual):
 
     Attributes
     ----------
-    observable : GraspWrench
-        Wrench on the grid as an observable.
+    observable : ReactionResultant
+        Resultant of the reactions on the grid as an observable.
     wrench : Wrench
         Measured samples.
     """
 
-    observable: GraspWrench
+    observable: ReactionResultant
     wrench: Wrench
 
     sigma_key = "sigma_n"
@@ -56,7 +58,7 @@ class WrenchResidual(MeasurementResidual):
     @classmethod
     def from_sensor(
         cls,
-        observable: GraspWrench,
+        observable: ReactionResultant,
         wrench: Wrench,
         label: str = "",
         huber: float | None = None,
@@ -67,8 +69,8 @@ class WrenchResidual(MeasurementResidual):
 
         Parameters
         ----------
-        observable : GraspWrench
-            Wrench on the grid as an observable.
+        observable : ReactionResultant
+            Resultant of the reactions on the grid as an observable.
         wrench : Wrench
             Measured samples.
         label : str
@@ -121,7 +123,8 @@ class WrenchResidual(MeasurementResidual):
         known: at most four, and two for equilibria.
         """
         return min(
-            2 if self.observable.reaction_grid.is_static else NEIGHBOURS, known
+            2 if self.observable.reaction_grid.is_static else TIMES_PER_SAMPLE,
+            known,
         )
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
@@ -209,7 +212,7 @@ class WrenchResidual(MeasurementResidual):
 
 
 def _is_covered(
-    observable: GraspWrench, t_s: Array, known: int
+    observable: ReactionResultant, t_s: Array, known: int
 ) -> NDArray[np.bool_]:
     """Return the mask (S,) of the samples at times `t_s` (S,) [s] that lie within the first `known`
     times of the observable for any admissible shift of the clock; all false if none are known.
@@ -253,7 +256,7 @@ def wrench_residuals(
     sensors = [(g, g.wrench) for g in experiment.grasps if g.wrench is not None]
     for number, (grasp, wrench) in enumerate(sensors):
         label = "" if len(sensors) == 1 else f" {number + 1}"
-        channel = GraspWrench.from_experiment(
+        channel = ReactionResultant.from_experiment(
             experiment,
             grasp,
             frame=wrench.frame,
@@ -274,6 +277,6 @@ def without_grasp_sensors(experiment: Experiment) -> Experiment:
     """Return the experiment without force–torque sensors and without custom sensors of grasps;
     custom sensors of points are kept.
     """
-    grasps = [replace(grasp, wrench=None) for grasp in experiment.grasps]
+    grasps = [grasp.without_sensor() for grasp in experiment.grasps]
     readings = [gauge for gauge in experiment.readings if gauge.grasp is None]
     return replace(experiment, grasps=grasps, readings=readings)
