@@ -1,10 +1,9 @@
 """Interior point beside reduced space on shipped problems, from the default start and warm.
 
-For each problem: reduced space, interior point from the default start, interior point from the
-answer of reduced space, as with `--start`, and from the default start with IPOPT also where its
-conditions hold at the initial point. Prints processor time of the solves, without error bars, and
-its ratio to that of reduced space, sweeps and iterations of IPOPT, and the largest difference of a
-parameter (most are logarithms). A solve that is not measured loads the kernels before.
+For each problem: reduced space, interior point from the default start, and interior point from the
+answer of reduced space, as with `--start`. Prints processor time of the solves, without error bars,
+and its ratio to that of reduced space, sweeps and iterations of IPOPT, and the largest difference
+of a parameter (most are logarithms).
 
     python scripts/benchmark_shipped.py
     python scripts/benchmark_shipped.py poked_block laid_block/problem.toml --cases warm
@@ -35,10 +34,8 @@ DEFAULT = (
     "poked_block",
     "wrist_sensor",
 )
-# "default": from the start that interior point chooses; "warm": from the answer of reduced space;
-# "ipopt": like "default", with an own option of IPOPT, so that IPOPT is started in any case.
-CASES = ("default", "warm", "ipopt")
-IPOPT_OPTIONS = {"print_level": 0}
+# "default": from the start that interior point chooses; "warm": from the answer of reduced space.
+CASES = ("default", "warm")
 
 
 def problem_file(name: str) -> Path:
@@ -47,9 +44,7 @@ def problem_file(name: str) -> Path:
     return path / "problem.toml" if path.is_dir() else path
 
 
-def measure(
-    name: str, cases: tuple[str, ...], max_time_s: float, *, loads_kernels: bool
-) -> None:
+def measure(name: str, cases: tuple[str, ...], max_time_s: float) -> None:
     """Solve a shipped problem by reduced space and in each of the cases, and print the results.
 
     Parameters
@@ -60,12 +55,8 @@ def measure(
         Some of `CASES`.
     max_time_s : float
         Wall time after which interior point ends [s].
-    loads_kernels : bool
-        Whether another solve comes first, which is not measured.
     """
     problem = Problem.read(problem_file(name))
-    if loads_kernels:
-        solve(problem, ReducedSpace())
     began_s = time.process_time()
     reference = solve(problem, ReducedSpace())
     reference_s = time.process_time() - began_s
@@ -77,11 +68,9 @@ def measure(
     for case in cases:
         start = WarmStart.of(reference) if case == "warm" else None
         began_s = time.process_time()
-        method = InteriorPoint(
-            max_time_s=max_time_s,
-            ipopt=IPOPT_OPTIONS if case == "ipopt" else {},
+        solution = solve(
+            problem, InteriorPoint(max_time_s=max_time_s), start=start
         )
-        solution = solve(problem, method, start=start)
         solution_s = time.process_time() - began_s
         apart = np.abs(solution.q - reference.q).max(initial=0.0)
         print(
@@ -104,17 +93,9 @@ def main() -> None:
     parser.add_argument("problems", nargs="*", default=list(DEFAULT))
     parser.add_argument("--cases", nargs="*", default=CASES, choices=CASES)
     parser.add_argument("--max-time-s", type=float, default=1e6)
-    parser.add_argument(
-        "--cold", action="store_true", help="no solve that loads the kernels"
-    )
     options = parser.parse_args()
     for name in options.problems:
-        measure(
-            name,
-            tuple(options.cases),
-            options.max_time_s,
-            loads_kernels=not options.cold,
-        )
+        measure(name, tuple(options.cases), options.max_time_s)
 
 
 if __name__ == "__main__":

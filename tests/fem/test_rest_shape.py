@@ -20,13 +20,13 @@ from kit.rest_shapes import (
     recorded,
     straight_bar,
 )
-from kit.started_ipopt import started_ipopt
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.selection import Indices
 from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem.problem_options import UncertaintyOptions
 from collocation_sysid.program.collocation import Collocation
@@ -300,7 +300,7 @@ def test_interior_point_and_reduced_space_find_the_same_optimum(static):
     experiment = measured(as_scanned(hung_mesh()), static=static, steps=steps)
     problem = problem_of(experiment, **({} if static else ONE_STEP))
     collocation = Collocation(problem.experiments, problem.parameters)
-    answers = [cs.ReducedSpace()(collocation), started_ipopt()(collocation)]
+    answers = [cs.ReducedSpace()(collocation), InteriorPoint()(collocation)]
     values = [
         collocation.parameter_values(answer.z)["young_pa"] for answer in answers
     ]

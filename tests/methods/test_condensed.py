@@ -10,7 +10,6 @@ import pytest
 from kit.checks import assert_derivative
 from kit.memories import TWO, guesses, recorded
 from kit.problems import GUESS, bar_let_go, hung_cube, noisy, with_markers
-from kit.started_ipopt import started_ipopt
 from kit.static import HANGING, block
 from kit.wrenches import sensing, wristed_cube
 from scipy.interpolate import CubicSpline
@@ -19,6 +18,7 @@ from collocation_sysid.methods.condensed_program import (
     CondensedCollocation,
     condense,
 )
+from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
@@ -258,7 +258,7 @@ def test_steps_take_slopes_as_they_are_at_the_nearest_sample(rng):
 def test_a_recording_by_a_clock_that_is_late_has_the_optimum_of_reduced_space():
     collocation = Collocation([late_cube(DEFAULT, samples=0.7)], GUESS)
     expected = ReducedSpace(tolerance=1e-10)(collocation)
-    found = started_ipopt(tolerance=1e-10)(expected.collocation)
+    found = InteriorPoint(tolerance=1e-10)(expected.collocation)
     assert found.status.converged
     np.testing.assert_allclose(found.q, expected.q, atol=1e-4)
     assert found.kkt_residual < 1e-8

@@ -28,17 +28,15 @@ from kit.problems import (
     relative_errors,
     released_cube,
 )
-from kit.started_ipopt import started_ipopt
 from kit.wrenches import sensed, wristed_cube
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.laws.moduli import engineering_constants
-from collocation_sysid.methods import initial_point, interior_point
+from collocation_sysid.methods import initial_point
 from collocation_sysid.methods.condensed_program import condense
 from collocation_sysid.methods.initial_point import (
     LARGEST_CORRECTION,
     adjoint_multipliers,
-    optimality_error,
 )
 from collocation_sysid.methods.initial_trajectories import (
     associated_at_guess,
@@ -47,11 +45,7 @@ from collocation_sysid.methods.initial_trajectories import (
 )
 from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.solution import (
-    Iteration,
-    Solution,
-    Status,
-)
+from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.model.parameters import Parameter, Parameters, Unknown
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
@@ -251,7 +245,7 @@ def note_of(solution: Solution) -> str:
 
 def test_ipopt_starts_near_the_optimum_and_the_notes_tell_how():
     seen: list[Iteration] = []
-    solution = started_ipopt(tolerance=1e-11)(cube(), watch=seen.append)
+    solution = PRECISE(cube(), watch=seen.append)
     assert re.fullmatch(
         r"initial point: \d+ sweeps of reduced space, which determined the parameters to 1e-08 %; "
         "IPOPT solved the complete program from there",
@@ -339,95 +333,12 @@ def test_a_parameter_at_its_bound_needs_no_iteration_from_the_answer():
     assert found.parameters["mu_pa"] == pytest.approx(low_pa, rel=1e-6)
 
 
-@pytest.mark.parametrize("method", [InteriorPoint(), started_ipopt()])
-def test_an_answer_that_meets_the_conditions_is_not_factorised(method):
+def test_an_answer_that_meets_the_conditions_is_not_factorised():
     answer = ReducedSpace()(cube())
-    found = method(cube(), start=answer.z)
+    found = InteriorPoint()(cube(), start=answer.z)
     assert found.status is Status.CONVERGED
     assert found.iterations == 0
     assert found.kkt_residual < 1e-8
-
-
-def without_ipopt(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make a start of IPOPT an error."""
-
-    def start(*_: object, **__: object) -> None:
-        raise AssertionError("IPOPT was started")
-
-    monkeypatch.setattr(interior_point.nlpsol, "solve", start)
-
-
-@pytest.mark.parametrize("name", ["cube", "bound", "memory", "wrench"])
-def test_ipopt_agrees_where_it_is_not_started(
-    name: str, monkeypatch: pytest.MonkeyPatch
-):
-    """Started from the same point, IPOPT has the same multipliers and takes no iteration, except
-    where it moves a parameter away from its bound first.
-    """
-    if name == "bound":
-        low_pa = 1.5 * TRUTH["mu_pa"]
-        stiff = Parameter("mu_pa", 2 * TRUTH["mu_pa"], low_pa, 1e5)
-        others = (s for s in GUESS.scalars if s.name != "mu_pa")
-        collocation = Collocation(
-            [measured(hung_cube())], Parameters((stiff, *others))
-        )
-    elif name == "cube":
-        collocation = cube()
-    else:
-        make, truth, _ = UNKNOWN[name]
-        given = {k: Unknown(v, 0.1 * v, 10 * v) for k, v in truth.items()}
-        collocation = Problem([make()], given, scheme="midpoint").collocation()
-    expected = started_ipopt()(collocation)
-    without_ipopt(monkeypatch)
-    found = InteriorPoint()(collocation)
-    assert found.status is expected.status is Status.CONVERGED
-    assert expected.iterations <= (name == "bound")
-    np.testing.assert_allclose(found.z, expected.z, atol=1e-6)
-    scale = np.abs(expected.multipliers).max()
-    np.testing.assert_allclose(
-        found.multipliers, expected.multipliers, atol=1e-6 * scale
-    )
-    assert re.search("IPOPT was not started, because its", note_of(found))
-    numbers = [line.number for line in found.history]
-    assert numbers == sorted(numbers)
-    loss = collocation.objective(found.z) / collocation.loss_scale
-    assert found.history[-1].loss == pytest.approx(loss)
-
-
-@pytest.mark.parametrize(
-    "changed",
-    ["nothing", "parameter", "position", "multipliers", "bound", "nan"],
-)
-def test_the_optimality_error_contains_every_condition(changed: str):
-    collocation = Collocation([noisy(hung_cube(15))], GUESS)
-    answer = ReducedSpace(tolerance=1e-10)(collocation)
-    z, multipliers = answer.z.copy(), answer.multipliers.copy()
-    lower, upper = collocation.bounds()
-    (free, *_) = np.flatnonzero(lower < upper)[collocation.nq :]
-    if changed == "parameter":
-        z[0] += 1e-3
-    elif changed == "position":
-        z[free] += 1e-3
-    elif changed == "multipliers":
-        multipliers += 1e-3 * np.abs(multipliers).max()
-    elif changed == "bound":
-        z[np.flatnonzero(lower == upper)[-1]] += 1e-3
-    elif changed == "nan":
-        z[free] = np.nan
-    error = optimality_error(collocation, z, multipliers)
-    assert (error < 1e-8) == (changed == "nothing")
-    assert np.isnan(error) == (changed == "nan")
-
-
-@pytest.mark.parametrize(
-    "options", [{"tolerance": 1e-17}, {"ipopt": {"print_level": 0}}]
-)
-def test_ipopt_is_started_where_its_conditions_may_not_hold(
-    options: dict, monkeypatch: pytest.MonkeyPatch
-):
-    without_ipopt(monkeypatch)
-    with pytest.raises(AssertionError, match="IPOPT was started"):
-        InteriorPoint(**options)(cube())
 
 
 def test_a_refinement_that_fails_keeps_the_coarse_point(
@@ -737,10 +648,7 @@ def test_every_status_has_a_sentence(status: Status):
 
 
 def test_the_message_holds_the_sentence_and_what_ipopt_said():
-    sentence = Status.CONVERGED.sentence
-    expected = f"{sentence} (IPOPT: Solve_Succeeded)"
-    assert started_ipopt()(cube()).message == expected
-    expected = f"{sentence} (IPOPT's conditions hold at the initial point)"
+    expected = f"{Status.CONVERGED.sentence} (IPOPT: Solve_Succeeded)"
     assert solved_cube().message == expected
 
 

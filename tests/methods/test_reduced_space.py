@@ -23,7 +23,6 @@ from kit.problems import (
     relative_errors,
     released_cube,
 )
-from kit.started_ipopt import started_ipopt
 
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.fem.laws.moduli import engineering_constants
@@ -33,6 +32,7 @@ from collocation_sysid.methods.initial_trajectories import (
     rigid_trajectory,
     simulate_trajectories,
 )
+from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.loss_curvature import (
     secant_update,
     with_curvature,
@@ -83,7 +83,7 @@ def test_the_true_parameters_are_recovered(experiment: str, scheme: str):
 def test_with_noise_it_is_the_optimum_of_interior_point(make):
     collocation = Collocation([noisy(make(15))], GUESS)
     solution = ReducedSpace()(collocation)
-    reference = started_ipopt(tolerance=1e-12)(collocation)
+    reference = InteriorPoint(tolerance=1e-12)(collocation)
     assert solution.status.converged
     assert reference.status.converged
     np.testing.assert_allclose(solution.theta, reference.theta, rtol=1e-6)
@@ -163,7 +163,7 @@ def test_a_bound_that_excludes_the_truth_is_active_at_the_answer(bound: dict):
     )
     collocation = Collocation([measured(hung_cube())], parameters)
     solution = ReducedSpace()(collocation)
-    reference = started_ipopt(tolerance=1e-11)(collocation)
+    reference = InteriorPoint(tolerance=1e-11)(collocation)
     assert solution.status is Status.CONVERGED
     assert solution.parameters["mu_pa"] == pytest.approx(
         next(iter(bound.values())), rel=1e-12
@@ -176,7 +176,7 @@ def test_a_prior_pulls_as_it_does_in_interior_point():
     parameters = with_parameter("lambda_pa", prior=(220.0, 0.01))
     collocation = Collocation([measured(hung_cube())], parameters)
     solution = ReducedSpace()(collocation)
-    reference = started_ipopt(tolerance=1e-12)(collocation)
+    reference = InteriorPoint(tolerance=1e-12)(collocation)
     np.testing.assert_allclose(solution.theta, reference.theta, rtol=1e-6)
     assert 201 < solution.parameters["lambda_pa"] < 220
     assert solution.kkt_residual < KKT

@@ -8,13 +8,13 @@ from kit.checks import relative_error
 from kit.lifted import REGIONS, explicit, of_branches, of_regions, swung
 from kit.memories import ONE, guesses, recorded, truth
 from kit.problems import GUESS, hung_cube, with_markers
-from kit.started_ipopt import started_ipopt
 
 from collocation_sysid.methods.comparison.casadi_nlp import SqpMethod
 from collocation_sysid.methods.comparison.penalty import (
     AugmentedLagrangian,
     Penalty,
 )
+from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.program.collocation import Collocation, convert_variables
@@ -81,7 +81,7 @@ def test_interior_point_finds_the_optimum_of_reduced_space(
 ):
     collocation = fitted(branches, 16, noise_m)
     expected = ReducedSpace(tolerance=1e-10)(collocation)
-    found = started_ipopt(tolerance=1e-10)(collocation)
+    found = InteriorPoint(tolerance=1e-10)(collocation)
     assert_same(found, expected, 1e-6)
     assert found.kkt_residual < 1e-9
     assert found.collocation is collocation
@@ -97,18 +97,18 @@ def test_regions_with_branches_of_their_own_are_told_apart():
     collocation = Collocation(
         [swung(of_regions(), REGIONS, 16)], guesses(REGIONS, 1.2)
     )
-    found = started_ipopt(tolerance=1e-10)(collocation)
+    found = InteriorPoint(tolerance=1e-10)(collocation)
     assert_same(found, ReducedSpace(tolerance=1e-10)(collocation), 1e-6)
     for name, value in REGIONS.items():
         assert found.parameters[name] == pytest.approx(value, rel=1e-5), name
 
 
-EXACT = started_ipopt(tolerance=1e-10)
+EXACT = InteriorPoint(tolerance=1e-10)
 METHODS = [
     ("undeformed", EXACT, 1e-5),
     ("loaded", EXACT, 1e-5),
     ("let-go", EXACT, 1e-5),
-    ("relaxed", started_ipopt(hessian="gauss-newton"), 1e-4),
+    ("relaxed", InteriorPoint(hessian="gauss-newton"), 1e-4),
     ("relaxed", SqpMethod(), 1e-4),
     ("relaxed", AugmentedLagrangian(tolerance=1e-9), 1e-3),
 ]

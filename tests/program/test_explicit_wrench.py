@@ -12,7 +12,6 @@ from kit.lifted import explicit, of_branches
 from kit.lifted_wrenches import ALL_UNKNOWN, free_density, weighed
 from kit.memories import ONE, guesses
 from kit.problems import GUESS, TRUTH, hung_cube
-from kit.started_ipopt import started_ipopt
 from kit.static import ELASTIC_ONLY, HANGING, block
 from kit.wrenches import sensed, sensing, with_wrenches, wristed_cube
 
@@ -22,6 +21,7 @@ from collocation_sysid.methods.comparison.penalty import (
     Penalty,
 )
 from collocation_sysid.methods.continuation import Continuation
+from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.program.collocation import Collocation, convert_variables
@@ -112,8 +112,8 @@ def problem(name: str) -> tuple[Collocation, Solution]:
 
 
 METHODS = [
-    *((name, started_ipopt(tolerance=1e-10), 1e-6) for name in PROBLEMS),
-    ("memory", started_ipopt(hessian="gauss-newton"), 1e-5),
+    *((name, InteriorPoint(tolerance=1e-10), 1e-6) for name in PROBLEMS),
+    ("memory", InteriorPoint(hessian="gauss-newton"), 1e-5),
     ("density", Continuation(), 1e-4),
     ("sensor", SqpMethod(), 1e-5),
     ("density", AugmentedLagrangian(tolerance=1e-4), 1e-4),
@@ -147,7 +147,7 @@ def test_methods_find_the_optimum_of_reduced_space(
 
 def test_the_multipliers_are_those_of_the_program_given():
     collocation, expected = problem("sensor")
-    found = started_ipopt(tolerance=1e-10)(collocation)
+    found = InteriorPoint(tolerance=1e-10)(collocation)
     assert found.kkt_residual < 1e-7
     scale = np.abs(expected.multipliers).max()
     np.testing.assert_allclose(

@@ -25,10 +25,10 @@ from kit.sensors import (
     noisy,
     strain_gauge,
 )
-from kit.started_ipopt import started_ipopt
 from kit.static import HANGING, block
 
 from collocation_sysid.errors import InputError
+from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
@@ -85,7 +85,7 @@ def test_an_accelerometer_at_rest_reads_gravity_and_follows_a_carried_body():
 
 
 @pytest.mark.parametrize(
-    "method", [ReducedSpace(), started_ipopt()], ids=lambda m: m.name
+    "method", [ReducedSpace(), InteriorPoint()], ids=lambda m: m.name
 )
 def test_the_truth_is_found_from_an_accelerometer_and_a_foil_alone(method):
     solution = method(Collocation([swung()], GUESS))
@@ -271,7 +271,7 @@ def test_a_load_cell_in_the_clamp_reads_what_a_sensor_there_does():
 
 
 @pytest.mark.parametrize(
-    "method", [ReducedSpace(), started_ipopt()], ids=lambda m: m.name
+    "method", [ReducedSpace(), InteriorPoint()], ids=lambda m: m.name
 )
 def test_the_truth_is_found_from_a_load_cell_and_a_foil_alone(method):
     solution = method(Collocation([clamped()], GUESS))

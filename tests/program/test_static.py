@@ -20,7 +20,6 @@ from kit.problems import (
     nodes_where,
     vertex_markers,
 )
-from kit.started_ipopt import started_ipopt
 from kit.static import ELASTIC_ONLY, HANGING, PRESSED_M, TIMES, block, pressed
 from scipy.optimize import brentq
 
@@ -31,6 +30,7 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.comparison.shooting import Shooting
 from collocation_sysid.methods.initial_trajectories import initial_variables
+from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.pipeline import run
@@ -222,7 +222,7 @@ def test_interior_point_reduced_space_and_shooting_find_the_same_static_optimum(
     )
     found = [
         method(collocation).parameters
-        for method in (ReducedSpace(), started_ipopt(), Shooting())
+        for method in (ReducedSpace(), InteriorPoint(), Shooting())
     ]
     for other in found[1:]:
         assert other == pytest.approx(found[0], rel=1e-6)
@@ -233,7 +233,7 @@ def test_static_and_dynamic_experiments_share_their_parameters():
     moving = noisy(hung_cube(6))
     collocation = Collocation([static, moving], GUESS)
     found = ReducedSpace()(collocation).parameters
-    assert started_ipopt()(collocation).parameters["mu_pa"] == pytest.approx(
+    assert InteriorPoint()(collocation).parameters["mu_pa"] == pytest.approx(
         found["mu_pa"], rel=1e-5
     )
     assert found["mu_pa"] == pytest.approx(TRUTH["mu_pa"], rel=0.05)

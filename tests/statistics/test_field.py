@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from kit.checks import assert_derivative
 from kit.problems import IDEAL, point_markers, smooth_poses, times
-from kit.started_ipopt import started_ipopt
 from matplotlib.figure import Figure
 
 import collocation_sysid as cs
@@ -227,7 +226,9 @@ def test_a_hidden_stiff_half_is_found():
     assert 5 < field.identified_modes <= 20
 
 
-@pytest.mark.parametrize("method", [started_ipopt(), cs.Shooting()], ids=type)
+@pytest.mark.parametrize(
+    "method", [cs.InteriorPoint(), cs.Shooting()], ids=type
+)
 def test_other_methods_find_the_same_field(method):
     expected = cs.solve(problem(2.0, steps=3, modes=3))
     solution = cs.solve(problem(2.0, steps=3, modes=3), method)

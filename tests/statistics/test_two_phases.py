@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from kit.checks import assert_derivative
 from kit.problems import IDEAL, point_markers, smooth_poses, times
-from kit.started_ipopt import started_ipopt
 
 import collocation_sysid as cs
 from collocation_sysid.extras.live.estimator import LiveEstimator
@@ -129,7 +128,7 @@ def test_an_even_body_shows_no_second_material():
     assert np.mean((low < np.log(YOUNG_PA)) & (np.log(YOUNG_PA) < high)) >= 0.9
 
 
-@pytest.mark.parametrize("method", [started_ipopt()], ids=type)
+@pytest.mark.parametrize("method", [cs.InteriorPoint()], ids=type)
 def test_other_methods_find_the_same_contrast(method):
     body = answer(3.0).collocation.transcriptions[0].body
     (field,) = (part.field for part in body.parts)

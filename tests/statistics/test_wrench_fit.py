@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kit.problems import GUESS, TRUTH, relative_errors
-from kit.started_ipopt import started_ipopt
 from kit.static import HANGING, block
 from kit.wrench_fits import UNKNOWN, swung
 from kit.wrenches import SIGMA_N, SIGMA_NM, sensing
@@ -18,6 +17,7 @@ import collocation_sysid as cs
 from collocation_sysid.methods.comparison.shooting import Shooting
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.initial_trajectories import initial_variables
+from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
@@ -215,7 +215,7 @@ def test_interior_point_finds_the_body_in_its_grasp_too():
     )
     collocation = Collocation([swung(nuisance=nuisance, steps=12)], GUESS)
     reduced = ReducedSpace()(collocation)
-    found = started_ipopt()(collocation)
+    found = InteriorPoint()(collocation)
     assert found.status.converged
     np.testing.assert_allclose(found.q, reduced.q, atol=1e-5)
 
