@@ -5,8 +5,7 @@ as dozens of sweeps of reduced space. Far from the optimum its steps also move n
 by many prior deviations, because the equations of motion hold only at the end. So reduced space
 first brings the parameters near the optimum, along motions that satisfy the equations of motion,
 and then to its own tolerance, as long as that takes few sweeps. IPOPT solves the whole program from
-these positions, parameters and multipliers, unless they satisfy its conditions already, see
-`optimality_error`.
+these positions, parameters and multipliers; where they satisfy its conditions it factorises nothing.
 """
 
 from __future__ import annotations
@@ -52,8 +51,7 @@ class InitialPoint:
     is_close : bool
         Whether the optimum is within about `LARGEST_CORRECTION`, so that Newton's method converges.
     note : str
-        Explanation for the user how the point was computed; if it is usable, a clause about what
-        follows from there may be added.
+        Explanation for the user how the point was computed.
     """
 
     coarse: Solution
@@ -111,13 +109,16 @@ def compute_initial_point(
         if count
         else ("the given initial values")
     )
+    continuation = "IPOPT solved the complete program from there"
     if is_close:
         note = (
             f"initial point: {sweeps}, which determined the parameters to "
-            f"{100 * precision:g} %"
+            f"{100 * precision:g} %; {continuation}"
         )
     elif is_usable:
-        note = f"initial point: {sweeps} ({coarse.status.value})"
+        note = (
+            f"initial point: {sweeps} ({coarse.status.value}); {continuation}"
+        )
     else:
         note = f"initial point: the method reduced-space found none ({coarse.message.rstrip('.')})"
     return InitialPoint(coarse, is_usable, is_close=is_close, note=note)
@@ -263,41 +264,6 @@ def adjoint_multipliers(
         if np.isfinite(constraints).all() and np.isfinite(bounds).all()
         else None
     )
-
-
-def optimality_error(
-    collocation: Collocation, z: Array, multipliers: Array
-) -> float:
-    """Return the largest violation of the conditions by which IPOPT ends, in the scaling of the
-    program and without IPOPT's further scaling, which only makes it smaller; NaN if a value is not
-    finite.
-
-    The conditions are those of the constraints, of the bounds, of stationarity in every variable
-    that is not prescribed, and of complementarity of bounds and multipliers. They are those of the
-    program with lifted variables too, as these follow from the others.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        Program in which history variables and reaction forces may be eliminated.
-    z : (variables,) array
-        Variables.
-    multipliers : (constraints,) array
-        Multipliers of the constraints.
-    """
-    slope = collocation.gradient(z) + collocation.jacobian_vjp(z, multipliers)
-    lower, upper = collocation.bounds()
-    is_free = lower < upper
-    of_bounds = _bound_multipliers(collocation, z, slope)
-    is_active = of_bounds != 0
-    distance = np.where(of_bounds < 0, z - lower, upper - z)[is_active]
-    violations = (
-        collocation.constraint_values(z),
-        np.maximum(lower - z, z - upper).clip(min=0.0),
-        (slope + of_bounds)[is_free],
-        of_bounds[is_active] * distance,
-    )
-    return float(np.max([np.abs(each).max(initial=0.0) for each in violations]))
 
 
 def _bound_multipliers(

@@ -24,7 +24,7 @@ from ..common.validated_types import (
     StrictInteger,
     Text,
 )
-from ..errors import SimulationError, located
+from ..errors import located
 from ..program.collocation import Collocation
 from ..program.lifted.lifted_collocation import (
     lifted_count,
@@ -39,9 +39,8 @@ from .initial_point import (
     InitialPoint,
     adjoint_multipliers,
     compute_initial_point,
-    optimality_error,
 )
-from .solution import Solution, Status, Watch, constraint_multipliers
+from .solution import Solution, Status, Watch
 from .solve_recorder import Recorder
 
 
@@ -111,8 +110,6 @@ SHORTEST_S = 1e-9
 DAMPING_CHANGE = (0.1, 10.0)
 # Share of the initial damping that is considered negligible.
 NO_DAMPING = 1e-2
-# Linear solvers that CasADi's wheel contains, so that IPOPT can be set up with them.
-WHEEL_SOLVERS = ("mumps", "spral")
 
 
 @dataclass(frozen=True)
@@ -127,10 +124,10 @@ class InteriorPoint(Options):
         IPOPT's own approximation ("limited-memory").
     initial : {"reduced-space", "simulation"}
         Where IPOPT starts. "reduced-space": near the optimum, after a solution of the same program
-        by reduced space, with multipliers of its adjoint; IPOPT is not started if its conditions
-        hold there to `tolerance`, unless `ipopt` has options or `linear_solver` is not in CasADi's
-        wheel. "simulation": from a simulation at the guess, or from the given start, with
-        multipliers of zero; this is also the fallback if reduced space finds no motion.
+        by reduced space, with multipliers of its adjoint; IPOPT takes no iteration if its
+        conditions hold there. "simulation": from a simulation
+        at the guess, or from the given start, with multipliers of zero; this is also the fallback
+        if reduced space finds no motion.
     warm_up : float
         While an iteration still changes a parameter by more than this share (or a nuisance
         parameter by more than this many prior deviations), the exact Hessian is replaced by that of
@@ -240,8 +237,8 @@ class InteriorPoint(Options):
         recorder.stopwatch.add(
             spent.build, spent.evaluations, linear_algebra=spent.linear_algebra
         )
+        recorder.notes.append(initial.note)
         if coarse.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
-            recorder.notes.append(initial.note)
             recorder.collocation = coarse.collocation
             return recorder.solution(
                 coarse.status,
@@ -252,62 +249,11 @@ class InteriorPoint(Options):
                 evaluations=coarse.evaluations,
             )
         if not initial.is_usable:
-            recorder.notes.append(initial.note)
             return self._solve_by_ipopt(recorder, start)
         recorder.collocation = coarse.collocation
-        if optimum := self._optimum_at(recorder, initial):
-            return optimum
-        recorder.notes.append(
-            f"{initial.note}; IPOPT solved the complete program from there"
-        )
         solution = self._solve_by_ipopt(recorder, coarse.z, initial=initial)
         return replace(
             solution, evaluations=solution.evaluations + coarse.evaluations
-        )
-
-    def _optimum_at(
-        self, recorder: Recorder, initial: InitialPoint
-    ) -> Solution | None:
-        """Return the initial point as the solution if IPOPT would end there without an iteration;
-        None if its conditions do not hold to `tolerance`, or if IPOPT has to be started to find out.
-
-        If they hold, the recorder gets a note and an entry of its history. Neither the complete
-        program nor IPOPT is set up: that takes longer than the conditions, because of the sparsity
-        patterns of the matrices.
-
-        Parameters
-        ----------
-        recorder : Recorder
-            Record of the solve, with the collocation of the initial point.
-        initial : InitialPoint
-            Usable initial point.
-        """
-        # Only IPOPT knows its options, and whether another linear solver is installed.
-        has_own_settings = self.ipopt or self.linear_solver not in WHEEL_SOLVERS
-        if has_own_settings or not initial.is_close:
-            return None
-        z = initial.coarse.z
-        collocation = recorder.collocation
-        try:
-            with recorder.stopwatch.evaluating():
-                multipliers = constraint_multipliers(collocation, z)
-                error = optimality_error(collocation, z, multipliers)
-        except SimulationError:
-            return None
-        if not error <= self.tolerance:
-            return None
-        recorder.notes.append(
-            f"{initial.note}; IPOPT was not started, because its conditions hold there to {error:.0e}"
-        )
-        loss = collocation.objective(z) / collocation.loss_scale
-        recorder.add_variables(recorder.history[-1].number + 1, z, loss=loss)
-        return recorder.solution(
-            Status.CONVERGED,
-            f"{Status.CONVERGED.sentence} (IPOPT's conditions hold at the initial point)",
-            z=z,
-            multipliers=multipliers,
-            iterations=0,
-            evaluations=initial.coarse.evaluations + 1,
         )
 
     def _solve_by_ipopt(
