@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
+from ..common.unique_codes import unique_codes
 
 
 class FullEntries(NamedTuple):
@@ -65,9 +66,8 @@ class SymmetricPattern:
         columns, and the diagonal; repetitions are merged.
         """
         size = 3 * nodes
-        codes = np.unique(
-            np.append(columns * size + rows, np.arange(size) * (size + 1))
-        )
+        diagonal = np.arange(size) * (size + 1)
+        codes = unique_codes([columns * size + rows, diagonal])
         return cls(size, codes % size, columns=codes // size)
 
     @property

@@ -26,7 +26,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
+from ..common.unique_codes import unique_codes
 from ..program.collocation import Collocation
+from ..program.linear_algebra.sparse_assembly import SparseAssembly
 from ..program.transcription import Transcription
 from ..recording.nuisance import TIME
 
@@ -148,7 +150,7 @@ class EliminatedColumns:
     entries : array of int
         Indices of the columns' entries among the values of the matrix.
     rows : (r,) array of int
-        Row indices in which the columns have entries, and further rows.
+        Row indices in which the columns have entries, and further rows; ascending.
     row : array of int
         Index in `rows` of each entry.
     column : array of int
@@ -161,36 +163,29 @@ class EliminatedColumns:
     column: Index
 
     @classmethod
-    def select(
-        cls,
-        entries: Index,
-        rows: Index,
-        columns: Index,
-        selected: Index,
-        further_rows: Index,
+    def from_entries(
+        cls, entries: ColumnEntries, rows: Index, further_rows: Index
     ) -> EliminatedColumns:
-        """Select columns of a matrix.
+        """Return the columns with their entries in numbered rows.
 
         Parameters
         ----------
-        entries : (e,) array of int
-            Index of each entry among the values.
-        rows : (e,) array of int
-            Row of each entry.
-        columns : (e,) array of int
-            Column of each entry.
-        selected : (h,) array of int
-            Columns to select, ascending.
+        entries : ColumnEntries
+            Entries of the eliminated columns.
+        rows : (rows of the matrix,) array of int
+            Number of each row of the matrix, −1 for rows that are left out.
         further_rows : array of int
-            Rows that are included even if they have no entries.
+            Numbers of rows that are included even if they have no entries.
         """
-        selected_entries = np.flatnonzero(np.isin(columns, selected))
-        selected_rows = np.union1d(rows[selected_entries], further_rows)
+        numbers = rows[entries.rows]
+        is_included = numbers >= 0
+        numbers = numbers[is_included]
+        selected_rows = unique_codes([numbers, further_rows])
         return cls(
-            entries[selected_entries],
+            entries.positions[is_included],
             selected_rows,
-            row=np.searchsorted(selected_rows, rows[selected_entries]),
-            column=np.searchsorted(selected, columns[selected_entries]),
+            row=np.searchsorted(selected_rows, numbers),
+            column=entries.columns[is_included],
         )
 
     def times(self, values: Array, slopes: Array) -> Array:
@@ -207,60 +202,161 @@ class EliminatedColumns:
 
 
 @dataclass(frozen=True, eq=False)
+class ColumnEntries:
+    """Entries of some columns of a sparse matrix in compressed columns.
+
+    Attributes
+    ----------
+    positions : (e,) array of int
+        Index of each entry among the values of the matrix.
+    rows : (e,) array of int
+        Row of each entry.
+    columns : (e,) array of int
+        Index of the column of each entry among the selected ones.
+    """
+
+    positions: Index
+    rows: Index
+    columns: Index
+
+    @classmethod
+    def select(
+        cls, structure: tuple[Index, Index], selected: Index
+    ) -> ColumnEntries:
+        """Return the entries of the columns `selected` of a matrix, whose structure is (column
+        pointers, row indices).
+        """
+        indptr, indices = structure
+        counts = indptr[selected + 1] - indptr[selected]
+        shifts = indptr[selected] - (np.cumsum(counts) - counts)
+        positions = np.arange(counts.sum()) + np.repeat(shifts, counts)
+        return cls(
+            positions,
+            indices[positions],
+            columns=np.repeat(np.arange(len(selected)), counts),
+        )
+
+    @classmethod
+    def select_symmetric(
+        cls, structure: tuple[Index, Index], selected: Index
+    ) -> ColumnEntries:
+        """Return the entries of the columns `selected` of a symmetric matrix, ascending, from the
+        structure of its upper triangle.
+
+        The entries in the columns come first, then those of the lower triangle, which are entries
+        of the upper one in the selected rows.
+        """
+        indptr, indices = structure
+        upper = cls.select(structure, selected)
+        is_selected = np.zeros(len(indptr) - 1, dtype=bool)
+        is_selected[selected] = True
+        positions = np.flatnonzero(is_selected[indices])
+        columns = np.searchsorted(indptr, positions, side="right") - 1
+        is_below = columns != indices[positions]
+        positions = positions[is_below]
+        numbers = np.searchsorted(selected, indices[positions])
+        return cls(
+            np.concatenate([upper.positions, positions]),
+            np.concatenate([upper.rows, columns[is_below]]),
+            columns=np.concatenate([upper.columns, numbers]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class CondensedPattern:
     """Sparsity pattern of a condensed matrix, and the origin of its values.
 
     Attributes
     ----------
-    structure : tuple of two arrays of int
-        Column pointers and row indices.
-    remaining : array of int
-        Indices of the complete matrix's values that remain.
-    targets : sequence of arrays of int
-        Indices in the condensed values: first of the remaining values, then of the contributions by
-        each experiment's eliminated dofs.
+    assembly : SparseAssembly
+        Structure, with the values that remain as initial ones, and the contributions by each
+        experiment's eliminated dofs as groups.
+    is_remaining : array of bool
+        Mask of the complete matrix's values that remain; they keep their order.
+    remaining_count : int
+        Number of these values.
     eliminated : sequence of EliminatedColumns
-        Columns of the complete matrix that give these contributions.
+        Columns of the complete matrix that give the contributions of each experiment.
     """
 
-    structure: tuple[Index, Index]
-    remaining: Index
-    targets: Sequence[Index]
+    assembly: SparseAssembly
+    is_remaining: NDArray[np.bool_]
+    remaining_count: int
     eliminated: Sequence[EliminatedColumns]
 
     @classmethod
-    def from_pairs(
+    def from_complete(
         cls,
-        shape: tuple[int, int],
-        remaining: Index,
-        pairs: Sequence[tuple[Index, Index]],
+        structure: tuple[Index, Index],
+        row_numbers: Index,
+        column_numbers: Index,
+        is_remaining: NDArray[np.bool_],
+        groups: Sequence[tuple[Index, Index]],
         eliminated: Sequence[EliminatedColumns],
     ) -> CondensedPattern:
-        """Return the union of several sets of entries.
+        """Return the pattern of a matrix without some rows and columns, and with further entries.
 
         Parameters
         ----------
-        shape : (rows, columns)
-            Shape of the condensed matrix.
-        remaining : array of int
-            Indices of the complete matrix's values that remain.
-        pairs : sequence of (rows, columns)
-            Entries: first those that remain, then those of `eliminated`.
+        structure : (array, array)
+            Column pointers and row indices of the complete matrix.
+        row_numbers, column_numbers : arrays of int
+            Index of each row and of each column of the complete matrix in the condensed one, which
+            ascends; −1 for those that are eliminated.
+        is_remaining : (entries,) array of bool
+            Entries that remain; those of eliminated rows and columns must not.
+        groups : sequence of (rows, columns)
+            Entries of the condensed matrix by each of `eliminated`.
         eliminated : sequence of EliminatedColumns
             Columns that give contributions.
         """
-        codes = [(column * shape[0] + row).ravel() for row, column in pairs]
-        unique_codes = np.unique(np.concatenate(codes))
-        indptr = np.searchsorted(
-            unique_codes, np.arange(shape[1] + 1) * shape[0]
+        indptr, indices = structure
+        # Rows and columns keep their order, and so do the entries: nothing is sorted.
+        before = np.concatenate([[0], np.cumsum(is_remaining)])[indptr]
+        counts = np.diff(before)[column_numbers >= 0]
+        remaining_structure = (
+            np.concatenate([[0], np.cumsum(counts)]),
+            row_numbers[indices[is_remaining]],
         )
-        places = [np.searchsorted(unique_codes, each) for each in codes]
+        shape = tuple(
+            int(np.count_nonzero(numbers >= 0))
+            for numbers in (row_numbers, column_numbers)
+        )
         return cls(
-            (indptr, unique_codes % shape[0]),
-            remaining,
-            targets=places,
+            SparseAssembly.from_groups(
+                remaining_structure, (shape[0], shape[1]), groups=groups
+            ),
+            is_remaining,
+            remaining_count=int(before[-1]),
             eliminated=eliminated,
         )
+
+    def assemble(
+        self, complete: Array, out: Array | None, groups: Sequence[Array]
+    ) -> Array:
+        """Return the values of the condensed matrix.
+
+        Parameters
+        ----------
+        complete : array
+            Values of the complete matrix.
+        out : array or None
+            Overwritten with the result and returned if given.
+        groups : sequence of arrays
+            Contributions of each group of entries, flat.
+        """
+        values, initial = self.assembly.allocate(out, self.remaining_count)
+        np.compress(self.is_remaining, complete, out=initial)
+        self.assembly.assemble(values, initial, groups=groups)
+        return values
+
+    def positions_of(self, positions: Index) -> Index:
+        """Return the positions among the condensed values of those of the complete values at
+        `positions` that remain, in their order.
+        """
+        before = np.cumsum(self.is_remaining)
+        kept = positions[self.is_remaining[positions]]
+        return self.assembly.positions_of(before[kept] - 1)
 
 
 class CondensedCollocation(Collocation):
@@ -417,11 +513,25 @@ class CondensedCollocation(Collocation):
         through the eliminated positions on φ.
         """
         slope = self.complete.gradient(self.complete_variables(z))
+        return self.condense_gradient(z, slope)
+
+    def condense_gradient(self, z: Array, complete_gradient: Array) -> Array:
+        """Return the gradient (variables,) of a function of the complete variables by the remaining
+        ones z, including the dependence through the eliminated positions on φ.
+
+        Parameters
+        ----------
+        z : (variables,) array
+            Variables.
+        complete_gradient : (complete variables,) array
+            Gradient by the complete variables at z; not modified.
+        """
+        gradient = complete_gradient.copy()
         for each, (_, by_phi) in zip(
             self.eliminated, self._prescribed(z), strict=True
         ):
-            slope[each.phi] += by_phi.T @ slope[each.variables]
-        return slope[self._remaining[0]]
+            gradient[each.phi] += by_phi.T @ gradient[each.variables]
+        return gradient[self._remaining[0]]
 
     def constraint_values(self, z: Array) -> Array:
         """Return the scaled values (constraints,) of the constraints g that remain, at z
@@ -436,39 +546,33 @@ class CondensedCollocation(Collocation):
     @cached_property
     def _jacobian(self) -> CondensedPattern:
         """Pattern of ∂g/∂z, and how its values follow from those of the complete program."""
+        structure = self.complete.jacobian_structure
         of_variable, of_row = self._condensed_indices
-        rows, columns = _entries(self.complete.jacobian_structure)
-        remaining = np.flatnonzero(of_row[rows] >= 0)
-        of_free_variables = remaining[of_variable[columns[remaining]] >= 0]
-        pairs = [
-            (
-                of_row[rows[of_free_variables]],
-                of_variable[columns[of_free_variables]],
-            )
-        ]
-        through = []
+        is_remaining = np.repeat(of_variable >= 0, np.diff(structure[0]))
+        is_remaining &= (of_row >= 0)[structure[1]]
+        eliminated = []
+        groups = []
         for each in self.eliminated:
-            through.append(
-                EliminatedColumns.select(
-                    remaining,
-                    rows=of_row[rows[remaining]],
-                    columns=columns[remaining],
-                    selected=each.variables,
-                    further_rows=np.zeros(0, dtype=int),
-                )
+            columns = EliminatedColumns.from_entries(
+                ColumnEntries.select(structure, each.variables),
+                of_row,
+                further_rows=np.zeros(0, dtype=np.int64),
             )
-            pairs.append((through[-1].rows[:, None], of_variable[each.phi]))
-        return CondensedPattern.from_pairs(
-            (self.constraint_count, self.variable_count),
-            of_free_variables,
-            pairs=pairs,
-            eliminated=through,
+            eliminated.append(columns)
+            groups.append(_products(columns.rows, of_variable[each.phi]))
+        return CondensedPattern.from_complete(
+            structure,
+            row_numbers=of_row,
+            column_numbers=of_variable,
+            is_remaining=is_remaining,
+            groups=groups,
+            eliminated=eliminated,
         )
 
     @property
     def jacobian_structure(self) -> tuple[Index, Index]:
         """Column pointers and row indices of ∂g/∂z, by compressed columns."""
-        return self._jacobian.structure
+        return self._jacobian.assembly.structure
 
     def constraints_and_jacobian(
         self, z: Array, out: Array | None = None
@@ -483,94 +587,92 @@ class CondensedCollocation(Collocation):
         out : array, optional
             Memory for the values of ∂g/∂z; it is overwritten.
         """
-        layout = self._jacobian
-        values = np.empty(len(layout.structure[1])) if out is None else out
-        values[:] = 0
+        pattern = self._jacobian
         rows, complete_values = self.complete.constraints_and_jacobian(
             self.complete_variables(z)
         )
-        values[layout.targets[0]] = complete_values[layout.remaining]
-        parts = zip(
-            layout.targets[1:],
-            layout.eliminated,
-            self._prescribed(z),
-            strict=True,
+        groups = [
+            columns.times(complete_values, slopes).ravel()
+            for columns, (_, slopes) in zip(
+                pattern.eliminated, self._prescribed(z), strict=True
+            )
+        ]
+        return rows[self._remaining[1]], pattern.assemble(
+            complete_values, out, groups=groups
         )
-        for places, through, (_, slopes) in parts:
-            values[places] += through.times(complete_values, slopes).ravel()
-        return rows[self._remaining[1]], values
 
     @cached_property
     def _hessian(self) -> CondensedPattern:
         """Pattern of the upper triangle of the Hessian, and how its values follow from those of the
         complete program.
         """
-        number, _ = self._condensed_indices
-        rows, columns = _entries(self.complete.hessian_structure)
-        are_remaining = (number[rows] >= 0) & (number[columns] >= 0)
-        remaining = np.flatnonzero(
-            are_remaining & ~self._is_loss_coupling(rows, columns)
-        )
-        pairs = [(number[rows[remaining]], number[columns[remaining]])]
-        through = []
-        # Of the lower triangle too, whose diagonal is that of the upper one.
-        below = np.flatnonzero(rows != columns)
-        entries = np.concatenate([np.arange(len(rows)), below])
-        row = np.concatenate([rows, columns[below]])
-        column = np.concatenate([columns, rows[below]])
+        structure = self.complete.hessian_structure
+        numbers, _ = self._condensed_indices
+        has_number = numbers >= 0
+        is_remaining = ~self._is_loss_coupling(structure)
+        is_remaining &= np.repeat(has_number, np.diff(structure[0]))
+        is_remaining &= has_number[structure[1]]
+        eliminated = []
+        groups = []
+        every_row = np.arange(self.complete.variable_count)
         for each in self.eliminated:
-            own = np.concatenate([each.variables, each.phi])
-            through.append(
-                EliminatedColumns.select(
-                    entries,
-                    row,
-                    columns=column,
-                    selected=each.variables,
-                    further_rows=own,
-                )
+            columns = EliminatedColumns.from_entries(
+                ColumnEntries.select_symmetric(structure, each.variables),
+                every_row,
+                further_rows=np.concatenate([each.variables, each.phi]),
             )
-            i = number[through[-1].rows[:, None]]
-            j = number[each.phi]
-            pairs.append(
-                (np.minimum(i, j)[i[:, 0] >= 0], np.maximum(i, j)[i[:, 0] >= 0])
+            eliminated.append(columns)
+            rows = numbers[columns.rows]
+            first, second = _products(rows[rows >= 0], numbers[each.phi])
+            groups.append(
+                (np.minimum(first, second), np.maximum(first, second))
             )
-        size = self.variable_count
-        return CondensedPattern.from_pairs(
-            (size, size), remaining, pairs=pairs, eliminated=through
+        return CondensedPattern.from_complete(
+            structure,
+            row_numbers=numbers,
+            column_numbers=numbers,
+            is_remaining=is_remaining,
+            groups=groups,
+            eliminated=eliminated,
         )
 
     def _is_loss_coupling(
-        self, rows: Index, columns: Index
+        self, structure: tuple[Index, Index]
     ) -> NDArray[np.bool_]:
-        """Return a mask (entries,) of those entries of the complete Hessian, by rows and columns,
-        that couple positions at times so distant that no equation of motion contains both.
+        """Return a mask (entries,) of those entries of the complete Hessian, by its column pointers
+        and row indices, that couple positions at times so distant that no equation of motion
+        contains both.
         """
+        indptr, rows = structure
         mask = np.zeros(len(rows), dtype=bool)
         for segment in self.transcriptions:
-            time = np.full(self.complete.variable_count, -1)
-            time[segment.columns] = (
-                np.arange(segment.variable_count) // segment.dof_count
+            first = segment.columns.start
+            # Entries of other columns are not couplings; rows of positions come after those of q.
+            entries = slice(indptr[first], indptr[segment.columns.stop])
+            times = np.arange(segment.variable_count) // segment.dof_count
+            # The first time that an equation of motion contains together with that of the column.
+            earliest = times - segment.dynamics.largest_lag
+            first_rows = first + np.maximum(earliest, 0) * segment.dof_count
+            counts = np.diff(indptr[first : segment.columns.stop + 1])
+            own_rows = rows[entries]
+            mask[entries] = (own_rows >= first) & (
+                own_rows < np.repeat(first_rows, counts)
             )
-            first = time[rows]
-            second = time[columns]
-            are_distant = np.abs(first - second) > segment.dynamics.largest_lag
-            mask |= (first >= 0) & (second >= 0) & are_distant
         return mask
 
     @property
     def hessian_structure(self) -> tuple[Index, Index]:
         """Column pointers and row indices of the upper triangle of ∇²_z (w L + yᵀ g)."""
-        return self._hessian.structure
+        return self._hessian.assembly.structure
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
         """Indices, in the values of the Hessian's upper triangle, of the diagonal entries of q
         (nq,), and of those of the positions that remain.
         """
-        places = np.full(len(self.complete.hessian_structure[1]), -1)
-        places[self._hessian.remaining] = self._hessian.targets[0]
-        of_q, of_x = (places[each] for each in self.complete.hessian_diagonals)
-        return of_q, of_x[of_x >= 0]
+        of_q, of_x = self.complete.hessian_diagonals
+        positions = self._hessian.positions_of(np.concatenate([of_q, of_x]))
+        return positions[: len(of_q)], positions[len(of_q) :]
 
     def hessian_values(
         self,
@@ -592,10 +694,8 @@ class CondensedCollocation(Collocation):
         out : array, optional
             Memory for the values; it is overwritten.
         """
-        layout = self._hessian
-        number, _ = self._condensed_indices
-        values = np.empty(len(layout.structure[1])) if out is None else out
-        values[:] = 0
+        pattern = self._hessian
+        numbers, _ = self._condensed_indices
         if multipliers is not None:
             multipliers = self.complete_multipliers(
                 z, loss_weight, multipliers=multipliers
@@ -603,27 +703,23 @@ class CondensedCollocation(Collocation):
         complete_values = self._complete_hessian(
             self.complete_variables(z), loss_weight, multipliers=multipliers
         )
-        values[layout.targets[0]] = complete_values[layout.remaining]
-        parts = zip(
+        groups = []
+        for each, columns, (_, slopes) in zip(
             self.eliminated,
-            layout.targets[1:],
-            layout.eliminated,
+            pattern.eliminated,
             self._prescribed(z),
             strict=True,
-        )
-        for each, places, through, (_, slopes) in parts:
-            product = through.times(complete_values, slopes)
+        ):
+            product = columns.times(complete_values, slopes)
             eliminated_rows, phi_rows = (
-                np.searchsorted(through.rows, a)
+                np.searchsorted(columns.rows, a)
                 for a in (each.variables, each.phi)
             )
             # An entry of φ by φ comes twice, from either side; one of the diagonal once.
             product[phi_rows] += slopes.T @ product[eliminated_rows] / 2
             product[phi_rows, np.arange(len(phi_rows))] *= 2
-            np.add.at(
-                values, places, product[number[through.rows] >= 0].ravel()
-            )
-        return values
+            groups.append(product[numbers[columns.rows] >= 0].ravel())
+        return pattern.assemble(complete_values, out, groups=groups)
 
     def _complete_hessian(
         self, z: Array, loss_weight: float, multipliers: Array | None
@@ -672,9 +768,8 @@ class CondensedCollocation(Collocation):
         return values
 
 
-def _entries(structure: tuple[Index, Index]) -> tuple[Index, Index]:
-    """Return the row and the column of each entry of a matrix by compressed columns, whose
-    structure is (indptr, rows).
+def _products(rows: Index, columns: Index) -> tuple[Index, Index]:
+    """Return rows and columns (r · c,) of the entries of every row of `rows` (r,) in every column
+    of `columns` (c,), row by row.
     """
-    indptr, rows = structure
-    return rows, np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
+    return np.repeat(rows, len(columns)), np.tile(columns, len(rows))

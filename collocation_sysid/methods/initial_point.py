@@ -245,19 +245,18 @@ def adjoint_multipliers(
     variables = convert_variables(z, collocation, target=complete)
     constraints = np.zeros(complete.constraint_count)
     constraints[: len(of_motion)] = of_motion
-    gradient = complete.gradient(variables)
     jacobian = complete.jacobian(variables)
+    slope = complete.gradient(variables) + jacobian.T @ constraints
     if added := lifted_count(complete):
         # As many rows as variables: their multipliers follow from those of all other rows.
-        slope = gradient + jacobian.T @ constraints
         lifted_jacobian = jacobian[-added:, -added:].T.tocsc()
         constraints[-added:] = -spla.spsolve(lifted_jacobian, slope[-added:])
+        slope += jacobian[-added:].T @ constraints[-added:]
     if isinstance(program, CondensedCollocation):
         constraints = constraints[program.remaining_rows]
         variables = convert_variables(z, collocation, target=program)
-        gradient = program.gradient(variables)
-        jacobian = program.jacobian(variables)
-    slope = gradient + jacobian.T @ constraints
+        # Constraints of eliminated positions do not depend on the remaining variables.
+        slope = program.condense_gradient(variables, slope)
     bounds = _bound_multipliers(program, variables, slope)
     multipliers = InitialMultipliers(constraints, bounds)
     return (

@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from ..common.array_types import Array, Index
+from ..common.unique_codes import unique_codes
 from .measurement_residual import MeasurementResidual
 from .observables import PointPositions, SparseEntries
 
@@ -45,14 +46,14 @@ class LocalLoss:
         each once.
         """
         none = np.zeros(self.nuisance_count)
-        codes = [np.zeros(0, dtype=np.int64)]
+        codes = []
         for reading, points in self.residuals:
             slopes = points.derivative_matrix(
                 None, none, position_count=self.position_count
             )
             codes.append(self._codes(*reading.hessian_structure(slopes)))
-        unique_codes = np.unique(np.concatenate(codes))
-        return unique_codes % self._height, unique_codes // self._height
+        columns, rows = np.divmod(unique_codes(codes), self._height)
+        return rows, columns
 
     @property
     def _height(self) -> int:

@@ -328,29 +328,29 @@ class ReleasedGrasps:
         scale : float
             Factor of the rows, `length_m` / `force_n`.
         """
-        is_prescribed = dynamics.is_temporarily_prescribed
-        nothing = np.zeros(0, dtype=np.int64)
+        is_prescribed = dynamics.is_temporarily_prescribed.copy()
+        is_prescribed[: dynamics.first_row] = False
         place = np.full(pattern.size, -1)
         place[row_dofs] = np.arange(len(row_dofs))
-        times, dofs = np.nonzero(is_prescribed)
-        has_row = times >= dynamics.first_row
-        times = times[has_row]
-        dofs = dofs[has_row]
-        zeros = np.flatnonzero(
-            np.isin(band.indices, row_starts[times] + place[dofs])
+        times = np.flatnonzero(is_prescribed.any(axis=1))
+        dofs = np.flatnonzero(is_prescribed.any(axis=0))
+        is_prescribed = is_prescribed[np.ix_(times, dofs)]
+        rows = row_starts[times][:, None] + place[dofs]
+        is_constant_row = np.zeros(
+            int(row_starts.max()) + len(row_dofs), dtype=bool
         )
-        ones = [
-            band.positions(
-                np.array([t]), 0, rows=place[[dof]], columns=np.array([dof])
-            ).ravel()
-            for t, dof in zip(times, dofs, strict=True)
-        ]
+        is_constant_row[rows[is_prescribed]] = True
+        diagonal = band.positions(times, 0, rows=place[dofs], columns=dofs)
         dropped = tuple(
             _dropped_forces(
                 dynamics, band, pattern=pattern, place=place, scale=scale
             )
         )
-        return cls(dropped, zeros, ones=np.concatenate([nothing, *ones]))
+        return cls(
+            dropped,
+            np.flatnonzero(is_constant_row[band.indices]),
+            ones=diagonal[is_prescribed],
+        )
 
     def correct(
         self,

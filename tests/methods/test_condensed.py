@@ -132,6 +132,60 @@ def test_derivatives_go_through_the_dofs_that_are_held(name: str, rng):
         assert_derivative(slope, lambda d: hessian @ d, z, rng, **options)
 
 
+def times_of_positions(program: Collocation) -> np.ndarray:
+    """Grid time of each variable, by experiment; −1 for all that are no positions."""
+    times = np.full(program.variable_count, -1)
+    for number, segment in enumerate(program.transcriptions):
+        own = np.arange(segment.variable_count) // segment.dof_count
+        times[segment.columns] = own + 1_000_000 * number
+    return times
+
+
+@pytest.mark.parametrize("nuisance", [DEFAULT, ON_TIME], ids=["clock", "none"])
+@pytest.mark.parametrize("name", CASES)
+def test_patterns_are_those_of_dense_products(name: str, nuisance: Nuisance):
+    """The chain rule with dense matrices of ones has the same entries as the sparse patterns."""
+    _, whole, program = made(name, nuisance)
+    columns, rows = program._remaining
+    identity = np.eye(whole.variable_count)[:, columns]
+    through = np.zeros_like(identity)
+    of_phi = np.zeros((len(columns), len(columns)))
+    for each in program.eliminated:
+        phi = np.searchsorted(columns, each.phi)
+        through[np.ix_(each.variables, phi)] = 1
+        of_phi[np.ix_(phi, phi)] = 1
+    jacobian = ones(whole.jacobian_structure, whole.constraint_count)
+    expected = (jacobian @ (identity + through))[rows]
+    found = ones(program.jacobian_structure, program.constraint_count)
+    np.testing.assert_array_equal(found > 0, expected > 0)
+
+    upper = ones(whole.hessian_structure, whole.variable_count)
+    hessian = upper + upper.T
+    times = times_of_positions(whole)
+    apart = np.abs(times[:, None] - times)
+    lags = [s.dynamics.largest_lag for s in whole.transcriptions]
+    assert len(set(lags)) == 1
+    is_position = times >= 0
+    is_coupled = (apart > lags[0]) & is_position[:, None] & is_position
+    kept = identity.T @ np.where(is_coupled, 0, hessian) @ identity
+    mixed = identity.T @ hessian @ through
+    both = through.T @ hessian @ through
+    expected = np.triu(kept + mixed + mixed.T + both + of_phi)
+    found = ones(program.hessian_structure, program.variable_count)
+    np.testing.assert_array_equal(found > 0, expected > 0)
+
+
+def ones(structure: tuple[np.ndarray, np.ndarray], height: int) -> np.ndarray:
+    """The dense matrix with a one at each entry of compressed columns."""
+    indptr, rows = structure
+    dense = np.zeros((height, len(indptr) - 1))
+    np.add.at(
+        dense, (rows, np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))), 1
+    )
+    assert dense.max() <= 1
+    return dense
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_held_dofs_are_where_the_grasps_are_and_multipliers_balance_them(
     name: str, rng

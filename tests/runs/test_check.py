@@ -51,6 +51,7 @@ from collocation_sysid.runs.check.cost import (
     MethodCost,
     cost_concerns,
     cost_notes,
+    nonzeros,
     search_factor,
 )
 from collocation_sysid.runs.check.derivatives import shortened_problem
@@ -405,6 +406,18 @@ def test_nonzeros_are_those_of_the_whole_program(
     whole = Problem.read(tiny / "problem.toml", overrides).collocation()
     assert findings.jacobian_nonzeros == len(whole.jacobian_structure[1])
     assert findings.hessian_nonzeros == len(whole.hessian_structure[1])
+
+
+def test_nonzeros_are_estimated_for_a_problem_without_guesses(tiny: Path):
+    """A scan of the stiffness gives the program its guesses, and the problem none."""
+    unguessed = ["parameters.mu_pa={}", "parameters.lambda_pa={}"]
+    problem = Problem.read(tiny / "problem.toml")
+    program = problem.collocation()
+    expected = nonzeros(problem, program)
+    without = Problem.read(tiny / "problem.toml", unguessed)
+    assert without.collocation().parameters.names_without_guess
+    assert nonzeros(without, program) == expected
+    assert min(expected) > 0
 
 
 def test_every_method_has_a_cost_and_the_chosen_one_counts(tiny: Path):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.array_types import Array, Index
+from ...common.unique_codes import unique_codes
 
 
 class EntryBlock(NamedTuple):
@@ -89,9 +90,7 @@ class SparseAssembly:
         indptr, indices = structure
         height, width = shape
         group_codes = [columns * height + rows for rows, columns in groups]
-        codes = np.unique(
-            np.concatenate([np.zeros(0, dtype=np.int64), *group_codes])
-        )
+        codes = unique_codes(group_codes)
         before, absent = _locate(structure, height, codes=codes)
         own = before + np.cumsum(absent) - absent
         added = own[absent]
@@ -205,9 +204,10 @@ def _locate(
         return np.full(len(codes), len(indices)), np.ones(
             len(codes), dtype=bool
         )
-    own = (
-        np.repeat(np.arange(len(indptr) - 1) * height, np.diff(indptr))
-        + indices
-    )
+    own = np.repeat(np.arange(len(indptr) - 1) * height, np.diff(indptr))
+    own += indices
     before = np.searchsorted(own, codes)
-    return before, np.append(own, -1)[before] != codes
+    absent = np.ones(len(codes), dtype=bool)
+    is_among = before < len(own)
+    absent[is_among] = own[before[is_among]] != codes[is_among]
+    return before, absent

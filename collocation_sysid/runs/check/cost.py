@@ -95,11 +95,13 @@ def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
     Parameters
     ----------
     problem : Problem
-        Problem with a guess of every parameter.
+        Problem; its parameters may lack guesses.
     lifted : Collocation
-        Program of the problem with lifted variables, as interior point needs it.
+        Program of the problem with lifted variables, as interior point needs it, and with a guess of
+        every parameter.
     """
     further = lifted_nonzeros(lifted)
+    problem = replace(problem, parameters=lifted.parameters)
     short = shortened_problem(problem)
     total = least = _count_nonzeros(short)
     for k, experiment in enumerate(problem.experiments):
@@ -121,7 +123,7 @@ def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
 
 def _count_nonzeros(problem: Problem) -> NDArray[np.int64]:
     """Return the numbers of nonzeros of the Jacobian and of the Hessian's upper triangle of a
-    problem, as int array (2,), by laying out its program without lifted variables.
+    problem with guesses, as int array (2,), by laying out its program without lifted variables.
 
     That takes memory in proportion to the length of the recordings.
     """
