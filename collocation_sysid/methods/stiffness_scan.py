@@ -420,7 +420,7 @@ def _misfit(
     positions : sequence of (rows, 3n) array
         First rows of each trajectory [m].
     """
-    # Depth cameras are compared by `rough_residuals`, which need no correspondences.
+    # Cameras are compared by `rough_residuals`, which need no correspondences.
     collocation, p = collocation.place_unknown_markers(
         p, positions, only_poses=True
     )

@@ -346,7 +346,7 @@ class SensorTimePrior(NuisancePriorSection):
 
 class SensorLagPrior(NuisancePriorSection):
     """Prior of a nuisance parameter: time constant of a first-order low-pass in the sensor;
-    between zero and three standard deviations.
+    between zero and three standard deviations of its prior.
 
     Attributes
     ----------

@@ -502,7 +502,8 @@ class ReadingSection(NamedSection):
     points_m : list
         Places [x, y, z] on the undeformed body whose motion the sensor measures.
     unknowns : mapping of name to float
-        Prior standard deviation of each unknown of the sensor, about zero, by the argument's name.
+        Prior standard deviation of each unknown of the sensor, about zero, by the argument's name;
+        none by default. Write an unknown factor as ``1 + gain``. In a simulation unknowns are zero.
     grasp : int, optional
         Instead of points: the number of the grasp, from 1, whose force and torque the sensor
         measures.

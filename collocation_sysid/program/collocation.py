@@ -440,7 +440,7 @@ class Collocation:
         positions : sequence of (rows, 3n) arrays
             First rows of each experiment [m].
         only_poses : bool
-            Whether to keep the correspondences of depth cameras and align their poses alone.
+            Whether to keep the correspondences of cameras and align their poses alone.
 
         Returns
         -------

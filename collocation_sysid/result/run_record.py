@@ -311,7 +311,7 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
 def _visible_points(
     finished: SolvedProblem, experiment: Experiment
 ) -> dict[str, Array]:
-    """Return the points of each depth camera of an experiment on the fitted surface, or else on the
+    """Return the points of each camera of an experiment on the fitted surface, or else on the
     simulated one.
 
     The arrays (k, 8), by name of the camera, have the rows of `MotionRecord.visible_points`. The

@@ -323,7 +323,7 @@ def _solve_once(
     """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier solution.
 
     A coarse start is tried first if the method asks for one and there is no earlier solution, then
-    a start with thinned clouds of depth cameras. If the search from guesses fails, a scan follows;
+    a start with thinned clouds of cameras. If the search from guesses fails, a scan follows;
     if it converges near ν = ½ in reduced space and without an earlier solution, a second start is
     tried.
 
@@ -368,7 +368,7 @@ def _solve_once(
                 problem, solver, watch=watch, workers=workers
             )
         except NoThinnedStartError as reason:
-            notes.append(f"no start with fewer depth points: {reason}")
+            notes.append(f"no start with fewer points: {reason}")
         if solution is not None:
             return replace(solution, notes=(*notes, *solution.notes))
     warm_start = (
@@ -433,7 +433,7 @@ def _solve_by_thinned_start(
     watch: Watch | None,
     workers: ExperimentExecutor | None,
 ) -> Solution | None:
-    """Solve a problem with thinned clouds of its depth cameras first, and from there with all
+    """Solve a problem with thinned clouds of its cameras first, and from there with all
     points; None if no cloud has many points.
 
     The result counts the sweeps with all points only, but the times of both searches. After an
@@ -451,7 +451,7 @@ def _solve_by_thinned_start(
     if thinned is None:
         return None
     tolerance = max(solver.tolerance, COARSE_TOLERANCE)
-    with search_activity("search with fewer depth points"):
+    with search_activity("search with fewer points"):
         rough = _solve_once(
             thinned,
             None,

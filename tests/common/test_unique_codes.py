@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 
 from collocation_sysid.common.unique_codes import unique_codes
@@ -22,13 +20,3 @@ def test_codes_of_all_groups_ascend_and_occur_once(rng):
 def test_without_codes_there_are_none():
     assert unique_codes([]).dtype == np.int64
     assert len(unique_codes([np.zeros(0, dtype=np.int64)])) == 0
-
-
-def test_ascending_groups_take_far_less_time_than_a_hash_table():
-    groups = [3 * np.arange(1_000_000), 2 * np.arange(1_000_000)]
-    seconds = []
-    for function in (unique_codes, lambda g: np.unique(np.concatenate(g))):
-        began_s = time.process_time()
-        function(groups)
-        seconds.append(time.process_time() - began_s)
-    assert seconds[0] < seconds[1] / 3

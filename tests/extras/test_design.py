@@ -262,7 +262,7 @@ BAD_LIMITS = {
     "too fast": (
         "speed_m_s = 1.0",
         "frequency_hz = 51.0\nspeed_m_s = 1.0",
-        "at most 50, half the",
+        "at most 50 Hz, half the",
     ),
     "no toml": ("speed_m_s =", "speed_m_s", "line 2: not valid TOML"),
 }

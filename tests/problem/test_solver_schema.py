@@ -114,7 +114,7 @@ def test_tables_of_several_methods_stand_side_by_side():
         ),
         (
             "solver.penalty.rho_max=1",
-            "solver.penalty.rho_max: found 1 with rho = 100; expected",
+            "solver.penalty.rho_max: found 1, which is less than rho = 100; expected",
         ),
         (
             "solver.penalty.rho_factor=1",
