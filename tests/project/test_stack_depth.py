@@ -14,10 +14,10 @@ from types import FrameType
 from typing import Any
 
 import pytest
+from kit.problems import TRUTH, hung_cube, measured
 
 import collocation_sysid as cs
 from collocation_sysid.fem.kernels import choose_evaluator, run_in_slices, simd
-from tests.kit.problems import TRUTH, hung_cube, measured
 
 PACKAGE = str(Path(cs.__file__).parent)
 # Largest number of frames.
