@@ -33,6 +33,9 @@ def merged_fields(contributions: Iterable[Fields]) -> dict[str, Any]:
     merged: dict[str, Any] = {}
     for fields in contributions:
         if twice := merged.keys() & fields.keys():
-            raise ValueError(f"two features have the field {min(twice)!r}")
+            raise ValueError(
+                f"two features contribute the field {min(twice)!r} to one object; expected "
+                "different names of fields"
+            )
         merged |= fields
     return merged

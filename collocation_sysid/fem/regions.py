@@ -344,17 +344,18 @@ def _densities(
             )
         default_density = (float(mass_kg or 0.0) - known_kg) / remaining_m3
         key = "mass_kg"
+        expected = (
+            f"more than {known_kg:.4g} kg, the mass of the regions with a density of their own"
+            if known_kg
+            else "a positive number"
+        )
     else:
         default_density = density_kg_m3
         key = "density_kg_m3"
-        known_kg = 0.0
+        expected = "a positive number"
     if not default_density > 0:
-        hint = (
-            f"; the densities of the regions account for {known_kg:.4g} kg of it"
-            if known_kg
-            else ""
-        )
-        raise InputError(f"{key} must be positive{hint}")
+        found = density_kg_m3 if mass_kg is None else mass_kg
+        raise InputError(f"{key} is {found:g}; expected {expected}")
     region_densities = [
         default_density
         if region.density_kg_m3 is None

@@ -335,7 +335,10 @@ def complete_parameter(
             and user_statement.upper is not None
         ):
             raise
-        message = f"{error.message}; where lower or upper is not given, these bounds are assumed"
+        message = (
+            f"{error.message}; a bound that is not stated has a default value, which lower or "
+            "upper replaces"
+        )
         raise InputError(message, None, where=name) from error
 
 

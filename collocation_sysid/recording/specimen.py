@@ -169,7 +169,7 @@ class Specimen:
             if (lowest := values.min(initial=0.0)) <= -1.0:
                 raise InputError(
                     f"found a strain of {lowest:g} in row {int(values.argmin()) + 1}, in which the "
-                    "length is negative; expected more than −1. If these are percent, divide them "
+                    "length is zero or negative; expected more than −1. If these are percent, divide them "
                     'by 100, or call the column "strain (%)"',
                     None,
                     where=name,

@@ -416,7 +416,10 @@ class MotionRecord:
                 f"{len(stored['marker_places_m'])} markers"
             )
         if parts.min() < 0 or parts.max() >= len(stored["part_names"]):
-            raise ValueError("surface_parts contains parts that do not exist")
+            raise ValueError(
+                f"surface_parts has part numbers {parts.min()} to {parts.max()}; expected 0 to "
+                f"{len(stored['part_names']) - 1}, the indices of part_names"
+            )
         return cls(name=name, **stored)
 
 

@@ -214,9 +214,9 @@ def test_weighed_mass_is_kept(small_mesh):
             {"density_kg_m3": 30.0, "mass_kg": 0.02},
             "exactly one of density_kg_m3 and mass_kg",
         ),
-        ({"density_kg_m3": -30.0}, "density_kg_m3 must be positive"),
-        ({"mass_kg": 0.0}, "mass_kg must be positive"),
-        ({"mass_kg": np.nan}, "mass_kg must be positive"),
+        ({"density_kg_m3": -30.0}, "density_kg_m3 is -30; expected a positive"),
+        ({"mass_kg": 0.0}, "mass_kg is 0; expected a positive"),
+        ({"mass_kg": np.nan}, "mass_kg is nan; expected a positive"),
         (
             {"mass_kg": 1.0, "material": "rubber"},
             "no material 'rubber'; available: ",

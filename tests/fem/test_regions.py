@@ -499,9 +499,9 @@ def test_names_that_cannot_be_told_apart_are_refused(slab):
     [
         (
             {"mass_kg": 1e-3},
-            r"mass_kg must be positive; the densities of the regions account for 0\.1 kg",
+            r"mass_kg is 0\.001; expected more than 0\.1 kg, the mass of the regions",
         ),
-        ({"density_kg_m3": 0.0}, "density_kg_m3 must be positive"),
+        ({"density_kg_m3": 0.0}, "density_kg_m3 is 0; expected a positive"),
         ({}, "exactly one of density_kg_m3 and mass_kg"),
     ],
 )

@@ -120,6 +120,7 @@ ARRAYS = [
     of_result("texts", array("measured_m", lambda x: x.astype(str))),
     of_result("huge", array("markers_m", lambda x: x + 1e300)),
     of_result("foreign nodes", array("surface", lambda x: x + 1000)),
+    of_result("foreign parts", array("surface_parts", lambda x: x + 7)),
     of_result("standing time", array("t_s", np.zeros_like)),
     of_result("no samples", array("is_prescribed", lambda x: x[:0])),
 ]

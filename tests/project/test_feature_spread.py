@@ -84,7 +84,9 @@ def test_only_the_registry_lists_the_features():
 
 def test_features_have_different_fields():
     assert merged_fields([{"a": 1}, {}, {"b": 2}]) == {"a": 1, "b": 2}
-    with pytest.raises(ValueError, match="two features have the field 'a'"):
+    with pytest.raises(
+        ValueError, match="two features contribute the field 'a'"
+    ):
         merged_fields([{"a": 1, "b": 2}, {"a": 3}])
 
 

@@ -234,7 +234,8 @@ def run_ftetwild(
         )
     except Failed as error:
         raise InputError(
-            f"pytetwild could not fill the surface ({error})"
+            f"pytetwild could not fill the surface ({error}); repair the surface in a mesh editor, "
+            "try another edge_length_m, or give a tetrahedral mesh"
         ) from error
     if not len(mesh["tetrahedra"]):
         raise InputError(
