@@ -194,9 +194,10 @@ def _endless(
 def compare_long_recording(samples: int, options: LiveOptions) -> None:
     """Stream a long recording, then solve it as a batch, and print latency, memory and differences.
 
-    The block moves at random from beginning to end, so that all frames contain information. The
-    recording and its frames exist before the first frame; the growth of memory from frame 1,000 to
-    the last is that of the estimator.
+    The block moves at random from beginning to end, so that all frames contain information, and is
+    simulated with the scheme and the steps of the estimator. The recording and its frames exist
+    before the first frame; the growth of memory from frame 1,000 to the last is that of the
+    estimator.
 
     Parameters
     ----------
@@ -204,7 +205,15 @@ def compare_long_recording(samples: int, options: LiveOptions) -> None:
         Camera frames at 100 Hz, above 1,000.
     options : LiveOptions
     """
-    problem = twin("block", SOFT, seed=0, samples=samples)
+    short = LiveEstimator(twin("block", SOFT, seed=0), options)
+    problem = twin(
+        "block",
+        SOFT,
+        seed=0,
+        samples=samples,
+        integrator="midpoint",
+        substeps=short.model.substeps,
+    )
     live = LiveEstimator(problem, options, time.thread_time)
     frames = list(frames_of_recording(problem.experiments[0], live.model))
     latencies_s = np.zeros(len(frames))

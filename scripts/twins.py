@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -75,8 +76,11 @@ def twin(
     seed: int,
     samples: int = SAMPLES,
     integrator: str = "newmark",
+    substeps: int | Literal["auto"] = "auto",
 ) -> Problem:
-    """A body that is described rightly."""
+    """A body that is described rightly; simulated with so many steps per sample, or as many as are
+    necessary.
+    """
     rng = np.random.default_rng(seed)
     size_m, divisions = BODIES[name]
     body, t_s = block(size_m, divisions), STEP_S * np.arange(samples)
@@ -87,7 +91,9 @@ def twin(
     experiment = Experiment(
         body, t_s, [Grasp(held, random_poses(t_s, rng))], markers, name="swing"
     )
-    tracks = simulate(experiment, truth, integrator).markers_m
+    tracks = simulate(
+        experiment, truth, integrator, substeps=substeps
+    ).markers_m
     noise = rng.normal(scale=NOISE_M, size=tracks.shape)
     return Problem([with_markers(experiment, tracks + noise)], GUESS)
 
