@@ -291,7 +291,7 @@ PARAMETERS = [
         options=settings("parameters.mu_pa.guess=1"),
     ),
     bad(
-        "guess-out-of-the-assumed-bounds", "mu_pa", "guess = 1e+10", "1e+09", "assumed",
+        "guess-out-of-the-assumed-bounds", "mu_pa", "guess = 1e+10", "1e+09", "default value",
         edit=replace_text(MU, "mu_pa = { guess = 1e10 }"),
     ),
     bad(
