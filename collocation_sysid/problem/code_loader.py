@@ -37,7 +37,10 @@ def existing_file(folder: Path, name: str, key: str) -> Path:
         fault = "is a folder" if file.is_dir() else "does not exist"
         hint = folder / "README.md"
         see = f"; {hint} explains how to get it" if hint.is_file() else ""
-        message = f"{file} {fault}; expected a file, named from the problem file's folder{see}"
+        message = (
+            f"{file} {fault}; expected a file: the path is relative to the folder of the problem "
+            f"file{see}"
+        )
         raise InputError(message, where=key)
     return file
 
@@ -119,10 +122,10 @@ class CodeLoader:
         if isinstance(loaded, NodeForce):
             if carries not in (0, loaded.internal_variable_count):
                 message = (
-                    f"found {carries}, but the number of internal variables of the force "
-                    f"{name!r} is"
+                    f"found {carries}, but the force {name!r} has "
+                    f"{loaded.internal_variable_count} internal variables; expected no carries: omit "
+                    "this key"
                 )
-                message += f" {loaded.internal_variable_count}; expected the key to be omitted"
                 raise InputError(message, where=f"{key}.carries")
             return loaded if nodes is None else replace(loaded, nodes=nodes)
         with located(file):
@@ -214,7 +217,8 @@ class CodeLoader:
             names = runpy.run_path(str(file))
         except (Exception, SystemExit) as error:
             raise InputError(
-                f"running it failed: {reason(error)}", file
+                f"this Python file raised an error when it was run: {reason(error)}",
+                file,
             ) from error
         if not is_kind(names.get(value_name)):
             known_names = [
