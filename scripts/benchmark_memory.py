@@ -1,8 +1,8 @@
-"""What branches of memory cost a sweep of the paper's size: 171 nodes, 100 timesteps.
+"""Cost of viscoelastic branches in a sweep of the paper's size: 171 nodes, 100 time steps.
 
-Sweeps with none, one and two branches take turns in one run, on one thread, by processor time, so
-that other work on the machine moves the ratio little. A branch has two parameters, and with them
-two more columns to solve for; the second table has them fixed.
+Sweeps with no, one and two branches alternate in one run on one thread and are timed by processor
+time, so that other work on the machine changes the ratios little. A branch has two parameters, each
+of which adds a column of sensitivities; in the second table the parameters of the branches are fixed.
 
     python scripts/benchmark_memory.py
 """

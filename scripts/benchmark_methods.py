@@ -74,7 +74,7 @@ STEPS = (50, 100, 200, 400, 800, 1600)
 
 @dataclass(frozen=True)
 class Row:
-    """One run."""
+    """Measurements of one run of one method: sizes, iterations, times [s] and peak memory [MB]."""
 
     method: str
     nodes: int
@@ -241,7 +241,7 @@ def identified(
 
 
 def show_unknown(mesh: str, steps: int) -> None:
-    """What interior point takes for what is not known, over what it takes without."""
+    """Print the time of interior point with nuisance parameters, divided by the time without."""
     for case in UNKNOWN:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             ideal, whole = (

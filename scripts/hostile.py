@@ -1,11 +1,12 @@
-"""How the command line ends on damaged and hostile input: counts by kind of input and outcome.
+"""Outcomes of the command line for damaged and hostile input, counted by kind of input.
 
     nice -n 19 python scripts/hostile.py [--count 100] [--seed 0] [--only toml urdf] [--keep FOLDER]
 
-A case is a small problem of the tests, a file of which is damaged in a way drawn from the seed, the
-kind and the case's number, and a command that reads it. Files are cut, some of their bytes are
-replaced, repeated or exchanged, and what the format gives a meaning is put in. A case is run in a
-process of its own, with limits of time and memory. It is
+A case is a small problem of the tests with one damaged file, and a command that reads this file. The
+damage is drawn at random from the seed, the kind and the number of the case: files are truncated,
+some of their bytes are replaced, repeated or exchanged, and values with a special meaning in the
+format are inserted. Each case is run in a separate process with limits of time and memory. Its
+outcome is
 
     refused     exit code 2, one message of one line, and nothing written
     accepted    exit code 0 or 1
@@ -78,7 +79,7 @@ COUNTS = (b"-1", b"0", b"4294967295", b"1e308", b"nan", b"99999999999999999999")
 
 @dataclass(frozen=True)
 class Ended:
-    """How a process ended: code, negative number of a signal, or None after the limit."""
+    """End of a process: exit code, negative signal number, or None after the time limit; its output."""
 
     code: int | None
     out: str
@@ -129,7 +130,7 @@ class Running:
         return Ended(code, self.said(self.out), self.said(self.err))
 
     def said(self, stream: Any) -> str:
-        """What it has written so far; the fork shares the place in the file."""
+        """Return all text written to a stream so far, without moving the position that forks share."""
         size = os.fstat(stream.fileno()).st_size
         return os.pread(stream.fileno(), size, 0).decode("utf-8", "replace")
 
@@ -703,7 +704,7 @@ FILES = (
 
 @dataclass(frozen=True)
 class Cases:
-    """What all kinds share.
+    """Settings that all kinds of cases share.
 
     Attributes
     ----------
@@ -727,7 +728,7 @@ class Cases:
     kept: Path | None = None
 
     def rng(self, kind: str, number: int) -> Rng:
-        """Of a case; the same whichever others are run."""
+        """Return the random generator of a case, independent of the other cases that are run."""
         return np.random.default_rng([self.seed, number, *kind.encode()])
 
     def keep(

@@ -44,7 +44,7 @@ def lowered(t_s: np.ndarray) -> PoseSequence:
 
 
 def grid(step_s: float) -> np.ndarray:
-    """Times of the recording."""
+    """Return the times of the recording at a distance of `step_s` [s]."""
     return step_s * np.arange(round(DURATION_S / step_s) + 1)
 
 

@@ -45,7 +45,7 @@ SIZES_M = (30.0, 90.0)
 def ticks(
     cells: int, fine_m: float, size_m: float, growth: float
 ) -> np.ndarray:
-    """So many equal cells to `fine_m`, then ever larger ones to `size_m`."""
+    """Return coordinates of nodes: equal cells up to `fine_m`, then growing cells up to `size_m` [m]."""
     found, step = list(np.linspace(0, fine_m, cells + 1)), fine_m / cells
     while found[-1] < size_m:
         step *= growth
@@ -181,7 +181,7 @@ def sphere_on_half_space(cells: int) -> float:
 def cylinder(
     cells: float, kappa: float = 100.0, delta: float = 0.002
 ) -> tuple[float, int]:
-    """The same of a long cylinder, of which half is there."""
+    """Return force ratio and number of nodes, as `sphere` does, for half of a long cylinder."""
     edge_m = 1 / cells
     wide = ticks(round(FINE_M * cells), FINE_M, 30.0, 2.0)
     deep = ticks(max(1, round(FINE_M * cells / 2)), FINE_M / 2, 30.0, 2.0)
@@ -197,7 +197,7 @@ def cylinder(
 
 @dataclass(frozen=True)
 class Twin:
-    """What was found of one: E with its interval, by the model and by Hertz' formula.
+    """Young's modulus of one twin with its interval, by finite elements and by Hertz's formula.
 
     Attributes
     ----------
@@ -213,7 +213,7 @@ class Twin:
 
 
 def hertz_pa(depths_m: np.ndarray, force_n: np.ndarray) -> float:
-    """E by F = 4/3 E/(1 − ν²) √R d^1.5, with d from where the fit is best."""
+    """Return E of F = 4/3 E/(1 − ν²) √R d^1.5, with the onset of the depth d fitted too [Pa]."""
     (radius_m, poisson) = 0.0032, gel.TRUTH["poisson"]
 
     def missed(unknown: np.ndarray) -> np.ndarray:
@@ -225,7 +225,7 @@ def hertz_pa(depths_m: np.ndarray, force_n: np.ndarray) -> float:
 
 
 def twins(count: int) -> Iterator[Twin]:
-    """Of the problem as it ships, each solved from the answer to the one before."""
+    """Yield the results of twins of the shipped problem; each solve starts from the previous answer."""
     guess = f"parameters.young_pa.guess={gel.TRUTH['young_pa']}"
     problem = cs.Problem.read(gel.FOLDER / "problem.toml", [guess])
     reach_m = np.arange(-5e-4, 2.5e-3, 2e-5)

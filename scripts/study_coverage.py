@@ -1,14 +1,14 @@
-"""How often the 95 % intervals of a whole identification hold the truth: many noisy twins.
+"""Coverage of the 95 % intervals of complete identifications, for twins with different noise.
 
-A cylinder hangs from a swung hand; its tracks come from the scheme that also fits them, so that
-nothing but noise is wrong. Every twin gets noise of its own, and where nuisance
-parameters are estimated (offsets of the markers, a shift of their clock) values drawn from the
-priors. It is solved from the truth in the reduced space, and counted is how often an interval
-holds the truth: of the four parameters, of Young's modulus and Poisson's ratio, and of the
-nuisance parameters pooled. A share beyond 91–98 % is marked with a star. Noise is white, or
-autoregressive with a coefficient of 0.85 and the same deviation; error bars for independent errors
-must fail then. The second table has the errors of the logarithms over their standard deviations,
-mean ± standard deviation: 0 ± 1 if all is well.
+A cylinder hangs from a swung hand. The tracks are simulated with the scheme of the fit, so that
+noise is the only error. Each twin has its own noise and, if nuisance parameters are estimated
+(offsets of the markers, a delay of their clock), values of these drawn from their priors. It is
+solved by reduced space, starting from the true values. The coverage is the share of intervals that
+contain the true value: for the four parameters, for Young's modulus and Poisson's ratio, and for all
+nuisance parameters together. A coverage outside 91–98 % is marked with a star. The noise is white,
+or autoregressive with a coefficient of 0.85 and the same standard deviation, for which intervals of
+independent errors must fail. The second table has mean ± standard deviation of the errors of the
+logarithms, divided by their standard errors: 0 ± 1 if the standard errors are correct.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ ACCEPTED = (0.91, 0.98)
 
 @dataclass(frozen=True)
 class Case:
-    """What the twins differ by, and what is estimated of them."""
+    """Kind of twins: correlation of the noise, and the nuisance parameters that are estimated."""
 
     name: str
     phi: float

@@ -1,8 +1,8 @@
-"""What the wrong damping law does to an answer: a bar swung ever faster, fitted with both laws.
+"""Effect of a wrong damping law on the estimates: bars swung at increasing speed, fitted with two laws.
 
-The tracks are those of Kelvin and Voigt's law, by the midpoint rule, with noise; the same
-recording is fitted with that law and with Rayleigh's, which also brakes the rotation of a stretched
-body. Errors are in standard errors of the fit; the verdict is what the user sees.
+The tracks are simulated with the Kelvin–Voigt law and the midpoint rule, with noise. The same
+recording is fitted with this law and with Rayleigh's, which also damps the rotation of a stretched
+body. Errors are in standard errors of the fit; the verdict is that of the run.
 
     python scripts/study_damping.py
 """
@@ -101,7 +101,7 @@ def bar(law: str) -> Body:
 
 
 def fitted(measured: Experiment, law: str) -> str:
-    """What comes out, in a line and the verdict's."""
+    """Fit a recording with a damping law, and return its errors in one line, then the verdict."""
     body = bar(law)
     markers = replace(measured.markers, placement=None)
     found = run(

@@ -1,4 +1,4 @@
-"""How often intervals from one depth image hold the truth, and how well it tells E, by twins.
+"""Accuracy of E from one depth image, and coverage of its intervals, for twins.
 
 A bar of 120 x 30 x 20 mm hangs from one end. An image of it has noise of 0.15 mm that is alike over
 three pixels. Where the camera is said to be, bias and scale of its depth are off by what is drawn
@@ -54,7 +54,7 @@ UNKNOWN = cs.Nuisance.none(
 
 
 def camera(distance_m: float) -> cs.DepthCamera:
-    """One that looks at the middle of the bar from so far."""
+    """Return a camera that looks at the middle of the bar from a distance [m]."""
     pose = np.eye(4)
     ahead = -WAY / np.linalg.norm(WAY)
     right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(
@@ -80,7 +80,7 @@ BODY = cs.box_mesh((0.12, 0.03, 0.02), (4, 1, 1))
 
 
 def image_m(seen_by: cs.DepthCamera) -> np.ndarray:
-    """Without noise."""
+    """Return the depth image without noise [m]."""
     depth = cs.Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
     experiment = bar(depth)
     x, skin = (
@@ -97,7 +97,7 @@ def image_m(seen_by: cs.DepthCamera) -> np.ndarray:
 def off(
     camera: cs.DepthCamera, turn_rad: np.ndarray, shift_m: np.ndarray
 ) -> cs.DepthCamera:
-    """It, said to be turned about the middle of the bar and shifted."""
+    """Return the camera with a wrong pose: rotated about the middle of the bar, and shifted."""
     pose, turn = camera.pose.copy(), Rotation.from_rotvec(turn_rad).as_matrix()
     pose[:3, :3] = turn @ pose[:3, :3]
     pose[:3, 3] = turn @ (pose[:3, 3] - MIDDLE_M) + MIDDLE_M + shift_m
@@ -110,9 +110,9 @@ def fitted(
     noise_m: float = NOISE_M,
     pose: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:
-    """E over the truth, the ends of its interval over that, and the RMS of the points [mm].
+    """Return E and the ends of its interval, each divided by the true E, and the RMS of the points [mm].
 
-    What the camera is off by is drawn from its priors, but for a turn and a shift given.
+    The errors of the camera are drawn from its priors; `pose` states rotation and shift instead.
     """
     seen_by = camera(distance_m)
     noise = gaussian_filter(rng.normal(size=SHAPE), 1.2)
@@ -336,7 +336,7 @@ def holds(seed: int) -> bool:
 
 
 def started(seed: int) -> np.ndarray:
-    """The same from a camera that is said to be 20 mm and 10 degrees off, whichever way."""
+    """Return the result of `fitted` for a camera pose that is wrong by 20 mm and 10° at random."""
     rng = np.random.default_rng(seed)
     ways = rng.normal(size=(2, 3))
     axis, way = ways / np.linalg.norm(ways, axis=1)[:, None]

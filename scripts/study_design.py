@@ -147,9 +147,9 @@ def table(found: Design) -> str:
 
 
 def features(found: Design) -> str:
-    """How much of each coordinate's acceleration there is, and at which frequency.
+    """Return a table of the RMS acceleration along each coordinate, and its mean frequency.
 
-    Turns and pushes are told in the body's own axes at the start: along the cylinder, and across.
+    Rotations and shifts are in the axes of the body at the start: along the cylinder, and across.
     """
     motion, (rotation, _) = found.motion, found.recording.start_pose
     place, rate, growth = motion.derivatives(motion.grid_s)

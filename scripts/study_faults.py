@@ -1,12 +1,13 @@
-"""How often the 95 % intervals hold the truth in a real laboratory: twins with one fault each.
+"""Coverage of the 95 % intervals with the errors of a real laboratory, for twins with one error each.
 
-A cylinder hangs from a swung hand, as in study_coverage.py; its tracks come from the scheme that
-also fits them and have white noise. Every twin has one fault, drawn at its size, and is identified
-as a user does who states nothing: with the default nuisance parameters, noise and errors. It is
-solved from the truth. Counted is how often an interval holds the truth; beside it stand the median
-standard errors, and for faultless twins by how much those without nuisance parameters are smaller.
-Where something that is assumed is wrong, drawn from its deviation, counted is also how often the
-whole interval holds it, of a budget that has this assumption, or all of them.
+A cylinder hangs from a swung hand, as in study_coverage.py. The tracks are simulated with the scheme
+of the fit and have white noise. Each twin has one error of the recording, a random number of the
+stated size, and is identified with every option at its default: nuisance parameters, noise and
+covariance. The solve starts from the true values. The table has the coverage of the intervals and the
+median standard errors; for twins without errors also the ratio of standard errors with and without
+nuisance parameters. In the rows "assumed", the body deviates from an assumption of the budget by a
+random number with the standard deviation of this assumption; these rows have the coverage of the
+combined interval too, of a budget with this assumption or with all of them.
 """
 
 from __future__ import annotations
@@ -328,7 +329,7 @@ def at_places(experiment: Experiment, places_m: Array) -> Experiment:
 
 
 def drawn(names: Sequence[str]) -> Callable[..., Pair]:
-    """What is assumed is off, each drawn from its deviation."""
+    """Return a fault that draws deviations from the named assumptions, each at its standard deviation."""
 
     def fault(experiment: Experiment, rng: Generator) -> Pair:
         off = {}
@@ -432,7 +433,7 @@ def _share(held: Array) -> str:
 
 
 def loss_of_precision(outcomes: Sequence[Outcome]) -> str:
-    """What the default nuisance parameters cost where nothing is wrong."""
+    """Return the ratios of standard errors with and without nuisance parameters, without errors."""
     ratios = np.nanmedian(
         [outcome.relative / outcome.without for outcome in outcomes], axis=0
     )

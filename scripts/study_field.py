@@ -1,12 +1,12 @@
-"""What of a stiffness that differs from place to place is found: twins whose stiffness is known.
+"""Accuracy of spatially varying stiffness, for twins whose stiffness is known.
 
-A block hangs from a swung hand; markers are glued to its surface. Its stiff half, or a stiff ball
-inside, is in no description: one field of Young's modulus over the whole body is estimated, and
-counted is in how many elements the 95 % interval holds the truth: of all, and of those that the
-data tell, where the interval is less than half as wide as the prior's. The tracks are made with the
-scheme that fits them, each with noise of its own, on a mesh whose elements meet where the materials
-do. For two phases the ball has another centre in each twin, and the intervals of the contrast are
-listed.
+A block with markers on its surface hangs from a swung hand. The problem does not state its stiff
+half, or a stiff ball inside: one field of Young's modulus over the whole body is estimated. The
+table has the share of elements whose 95 % interval contains the true value: of all elements, and of
+those that the data determine, whose interval is less than half as wide as that of the prior. The
+tracks are simulated with the scheme of the fit, each with its own noise, on a mesh that follows the
+boundary between the materials. For two phases the ball has another centre in each twin, and the
+intervals of the contrast are listed.
 
     nice -n 15 python scripts/study_field.py --twins 10
     nice -n 15 python scripts/study_field.py --cost
@@ -53,7 +53,7 @@ CENTRES_M = (
 
 @dataclass(frozen=True)
 class Twin:
-    """What is hidden, and how it is sought."""
+    """True stiffness of a block, and the prior of the estimated field."""
 
     name: str
     kind: str
@@ -75,7 +75,7 @@ class Twin:
 def stiff_cells(
     kind: str, mesh: cs.TetMesh, centre_m: Array = BALL_M
 ) -> NDArray[np.bool_]:
-    """Which cells are stiffer."""
+    """Return the mask of the stiffer cells."""
     centres = mesh.points_m[mesh.tetrahedra].mean(axis=1)
     if kind == "half":
         return centres[:, 2] < SIZE_M[2] / 2
@@ -106,7 +106,7 @@ def hung(body: Body, count: int, steps: int) -> cs.Experiment:
 
 
 def problem_of(twin: Twin, seed: int) -> tuple[cs.Problem, Array]:
-    """Its problem, and the truth: the logarithm of E in every cell."""
+    """Return the problem of a twin, and the logarithm of the true E in every cell (cells,)."""
     mesh = cs.box_mesh(SIZE_M, tuple(round(size / EDGE_M) for size in SIZE_M))
     stiff = stiff_cells(twin.kind, mesh, twin.centre_m(seed))
     regions = [cs.Region("stiff", stiff)] if stiff.any() else []
@@ -254,7 +254,7 @@ def step_of(z_m: Array, log: Array) -> float:
 
 
 def cost() -> None:
-    """What a mode costs: processor time of a solve an iteration, over that without a field."""
+    """Print the processor time of an iteration by number of modes, and its ratio to that without."""
     print(
         "| modes | nodes | s an iteration | over that without |\n|---|---|---|---|"
     )
@@ -287,7 +287,7 @@ def cost() -> None:
 
 
 def main() -> None:
-    """Print the tables."""
+    """Run the study with the options of the command line, and print its tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=10)
     parser.add_argument("--cost", action="store_true")

@@ -1,9 +1,8 @@
-"""How often the 95 % intervals of materials with memory hold the truth: noisy twins.
+"""Coverage of the 95 % intervals of viscoelastic materials, for twins with different noise.
 
-A block sticks out of a hand that swings it and then holds it still; its tracks come from the scheme
-that also fits them, with white noise. Counted is how often an interval holds the truth: of each
-parameter, and of the instantaneous modulus. Without noise the truth is found to rounding, which is
-said first.
+A block projects from a hand that swings it and then holds it still. The tracks are simulated with the
+scheme of the fit and have white noise. The table has the coverage for each parameter and for the
+instantaneous modulus. Before it, the error of the estimates without noise is printed.
 
     python scripts/study_memory.py --twins 200 --branches 1 2
 """

@@ -39,7 +39,7 @@ NAMES = ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")
 
 
 def drawn(name: str, rng: np.random.Generator) -> dict[str, float]:
-    """True parameters."""
+    """Return true parameters of a body, drawn at random around its typical values."""
     young_pa = YOUNG_PA[name] * float(np.exp(rng.uniform(-0.5, 0.5)))
     damping = {
         "gamma_r_s": 0.004 * np.exp(rng.uniform(-0.5, 0.5)),

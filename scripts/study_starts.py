@@ -1,14 +1,14 @@
-"""From how far away a problem is solved: many starts on three bodies, or none at all.
+"""Convergence from distant initial guesses, and without any, for three bodies.
 
-Every parameter is guessed log-uniformly within a factor of the truth, or none is. The bodies:
-the paper's cylinder, which hangs; a soft bar, which sags as far as it is long; a block of silicone,
-stiff enough to move as the hand does. A start succeeds when every parameter is within 1 % of the
-best answer of all, or within three of its standard errors; or, as where the data do not tell some
-parameter, when it fits as well: the likelihood ratio of the two is within three deviations. How
-many succeed so only is told. Without a guess, where every run has noise of its own, an answer
-succeeds when it fits no worse than the truth does, whose misfit is the noise. The cost is counted
-in sweeps: one factorisation of every timestep's block, those of simulations and of the rest state
-included.
+The guess of every parameter is log-uniform within a factor of the true value, or there is no guess.
+The bodies are the paper's cylinder, which hangs; a soft bar, which sags by as much as its length; and
+a block of silicone, so stiff that it moves almost as the hand does. A start succeeds if every
+parameter is within 1 %, or within three standard errors, of the best answer of all starts. It also
+succeeds with an equal fit, as where the data do not determine a parameter: the likelihood ratio of
+both answers is within three standard deviations; the number of these successes is printed. Without a
+guess every run has its own noise, and an answer succeeds if its misfit is not larger than that of the
+true values. The cost is counted in sweeps, that is in factorisations of the blocks of all time steps,
+including those of simulations and of the initial equilibrium.
 """
 
 from __future__ import annotations
@@ -382,7 +382,7 @@ def loss_of_truth(noisy: Case, clean: Case) -> float:
 def attempt(
     case: Case, number: int, guess: NDArray[np.float64], method: str
 ) -> Outcome:
-    """Solve from one start."""
+    """Solve a case from one initial guess, and return its errors and its number of sweeps."""
     given, nothing = tuple(guess.tolist()), (np.nan,) * len(guess)
     with counted_factorisations() as count:
         try:

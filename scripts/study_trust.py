@@ -1,10 +1,10 @@
-"""How often the verdict on an answer is right: faultless twins, and twins with one hidden fault.
+"""Reliability of the verdict, for twins without errors and twins with one error in the description.
 
-Two small bodies, soft and stiffer, moved at random, with white noise and nuisance parameters as
-they are by default. Faultless twins are to be called good, at least 95 of 100; of those whose
-problem is described wrongly (`wrong_twins`) at most 2 of 100. What is refused before it is solved
-counts as recognised. A cause of the misfit, which takes refits to find, is looked for only where
-the answer would be called good without.
+A soft and a stiffer small body are moved at random, with white noise and the default nuisance
+parameters. Twins without errors should be rated "good", at least 95 of 100; twins whose problem is
+described wrongly (`wrong_twins`) should not, at most 2 of 100. Input that is refused before it is
+solved counts as recognised. Likely errors of the description, whose search needs refits, are sought
+only if the answer would be rated "good" without them.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ DAMPING = {"gamma_r_s": 0.01, "gamma_m_1_s": 2.0}
 
 @dataclass(frozen=True)
 class Outcome:
-    """One twin: what was said of it, and by how many standard errors its worst parameter is off."""
+    """Verdict on one twin, and the largest error of its parameters in standard errors."""
 
     fault: str
     seed: int
@@ -105,7 +105,7 @@ def main() -> None:
 
 
 def row(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
-    """Of the table: how many there are of each verdict."""
+    """Return a row of the table: the number of twins with each verdict."""
     verdicts = Counter(each.verdict for each in outcomes)
     counts = [
         str(verdicts[word]) for word in ("refused", "doubtful", "check", "good")
@@ -123,7 +123,7 @@ def row(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
 
 
 def subject(reason: str) -> str:
-    """What a reason is about, without its numbers."""
+    """Return the subject of a reason, without its numbers."""
     return re.split(
         r"[:;,(]| by | that | as if | is | are ",
         re.sub("likely: '.*?':", "", reason),
@@ -168,7 +168,7 @@ def judged(fault: str, seed: int) -> Outcome:
 
 
 def errors_of(found: Run, truth: Mapping[str, float]) -> dict[str, float]:
-    """Of every parameter, in its standard errors; those without one are told by none."""
+    """Return the error of every parameter in standard errors; parameters without one are left out."""
     bars = {name: found.std_error(name) for name in truth}
     return {
         name: abs(found.parameters[name] - value) / error

@@ -1,8 +1,8 @@
-"""How often the 95 % intervals of E, ρ and ν hold the truth with a force sensor: noisy twins.
+"""Coverage of the 95 % intervals of E, ρ and ν with a force sensor, for twins with different noise.
 
-A block sticks out of a hand that swings it. Its tracks and the wrench of the hand come from the
-scheme that also fits them, with white noise of 1 mm and 0.05 N. Without the sensor only the ratio
-of E and ρ is told.
+A block projects from a hand that swings it. The tracks and the wrench of the hand are simulated with
+the scheme of the fit and have white noise of 1 mm and 0.05 N. Without the sensor, the data determine
+only the ratio of E to ρ.
 
     nice -n 15 python scripts/study_wrench.py --twins 200
 """

@@ -1,4 +1,4 @@
-"""Faultless twins: two small bodies, moved at random, seen with noise."""
+"""Twins without errors: two small bodies, moved at random, with noisy marker tracks."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ WRENCH_N, WRENCH_NM = 5e-4, 5e-5
 def sensing_twin(
     name: str, truth: dict[str, float], seed: int, samples: int = SAMPLES
 ) -> Problem:
-    """The same with a sensor at the grasp, in its frame and about a point above the body."""
+    """Return a twin with a force sensor at the grasp, in its frame and about a point above the body."""
     given = twin(name, truth, seed, samples)
     (experiment,) = given.experiments
     (grasp,) = experiment.grasps

@@ -1,7 +1,7 @@
-"""Twins of a problem whose description is wrong in one known way.
+"""Problems whose description is wrong in one known way.
 
-Each fault takes a `Problem` with good data and a random generator, and returns the problem as
-somebody would describe it who makes that mistake. `FAULTS` tells which causes name it.
+Each fault is a function of a correct `Problem` and a random generator, which returns the problem with
+this error in its description. `FAULTS` states the hypotheses that name each error correctly.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ JUMP_M, SLIP_M = (0.01, 0.03), (0.005, 0.02)
 
 @dataclass(frozen=True)
 class Fault:
-    """A mistake, and the causes that name it rightly."""
+    """Error in a description, and the codes of the hypotheses that name it correctly."""
 
     change: Change
     causes: tuple[str, ...]
@@ -85,7 +85,7 @@ def poses_times(factor: float) -> Change:
 
 
 def markers_times(factor: float) -> Change:
-    """Tracks in another unit."""
+    """Return a change that multiplies all marker positions by a factor."""
     return lambda e, rng: with_markers(e, factor * e.markers.positions_m)
 
 
@@ -299,7 +299,7 @@ def with_track_axes(
 
 
 def constant(poses: PoseSequence) -> PoseSequence:
-    """The first pose throughout."""
+    """Return poses that are all equal to the first one."""
     first = slice(0, 1)
     return replace(
         poses,
@@ -374,7 +374,7 @@ TRACK_FAULTS = {
 
 
 def wrenches(change: Callable[[Wrench], Wrench]) -> Change:
-    """Every measured wrench changed."""
+    """Return a change that applies a function to every measured wrench."""
 
     def changed(experiment: Experiment, rng: Rng) -> Experiment:
         grasps = [
@@ -389,7 +389,7 @@ def wrenches(change: Callable[[Wrench], Wrench]) -> Change:
 
 
 def wrench_times(force: float, torque: float) -> Change:
-    """Forces and torques multiplied."""
+    """Return a change that multiplies the measured forces and torques by factors."""
     factors = np.repeat([force, torque], 3)
     return wrenches(lambda w: replace(w, values=factors * w.values))
 
@@ -443,7 +443,7 @@ WRENCH_FAULTS = {
 
 
 def obstacles(change: Callable[[Obstacle], Obstacle]) -> Change:
-    """Every obstacle changed."""
+    """Return a change that applies a function to every obstacle."""
     return lambda e, rng: e.with_obstacles(
         [change(each) for each in e.obstacles]
     )
