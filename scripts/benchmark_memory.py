@@ -58,10 +58,8 @@ def main() -> None:
         seconds = np.array(
             [[timed(run) for run, _ in sweeps] for _ in range(repeats)]
         )
-        best, relative = (
-            seconds.min(axis=0),
-            np.median(seconds / seconds[:, :1], axis=0),
-        )
+        best = seconds.min(axis=0)
+        relative = np.median(seconds / seconds[:, :1], axis=0)
         for branches, (_, columns) in enumerate(sweeps):
             print(
                 f"  {branches} branches, {columns} columns: {1e3 * best[branches]:6.1f} ms at best,"
@@ -74,7 +72,8 @@ def sweep(
     experiment: Experiment, branches: int, estimated: bool
 ) -> tuple[Callable[[], object], int]:
     """A sweep of the experiment with so many branches, and how many columns it has."""
-    plain, names = experiment.body, [f"prony_{k + 1}" for k in range(branches)]
+    plain = experiment.body
+    names = [f"prony_{k + 1}" for k in range(branches)]
     body = Body(
         plain.mesh,
         density_kg_m3=plain.parts[0].density_kg_m3,

@@ -100,7 +100,8 @@ def measured(
     )
     before_mb = peak_mb()
     clock = time.perf_counter if threads > 1 else time.process_time
-    began, spent = clock(), Stopwatch(clock)
+    began = clock()
+    spent = Stopwatch(clock)
     x, failure = continue_simulation(
         segment.experiment,
         setting.dynamics,

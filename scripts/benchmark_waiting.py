@@ -77,7 +77,8 @@ def waited(words: list[str], cache: str) -> Waited:
     """Run a command of the command line on a terminal of its own."""
     ours, theirs = pty.openpty()
     environment = {**os.environ, "XDG_CACHE_HOME": cache, "TERM": "xterm"}
-    before, began = os.times(), time.perf_counter()
+    before = os.times()
+    began = time.perf_counter()
     with subprocess.Popen(
         [sys.executable, "-c", MAIN, *words],
         stdout=theirs,

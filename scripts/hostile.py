@@ -72,7 +72,8 @@ WAITING = 10
 # An ordinary user, where the script is started by root.
 NOBODY = 65534
 PROGRAM = "from collocation_sysid.cli import main; main()"
-MARKERS, POSES = "swing_markers.csv", "swing_motion.csv"
+MARKERS = "swing_markers.csv"
+POSES = "swing_motion.csv"
 REDUCED = ("--set", "solver.method=reduced-space")
 COUNTS = (b"-1", b"0", b"4294967295", b"1e308", b"nan", b"99999999999999999999")
 
@@ -300,12 +301,14 @@ def _repeated(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
 
 
 def _zeros(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
-    at, length = _place(rng, content), int(rng.integers(1, 64))
+    at = _place(rng, content)
+    length = int(rng.integers(1, 64))
     return content[:at] + bytes(length) + content[at + length :]
 
 
 def _largest(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
-    at, length = _place(rng, content), int(rng.choice([2, 4, 8]))
+    at = _place(rng, content)
+    length = int(rng.choice([2, 4, 8]))
     return (
         content[:at] + b"\xff" * (length - 1) + b"\x7f" + content[at + length :]
     )
@@ -371,10 +374,8 @@ class FileKind:
 
     def run(self, cases: Cases) -> Counter[str]:
         """Count the outcomes; none where the package that reads the format is missing."""
-        base, counts = (
-            cases.folder / f"base_{self.name.replace(' ', '_')}",
-            Counter[str](),
-        )
+        base = cases.folder / f"base_{self.name.replace(' ', '_')}"
+        counts = Counter[str]()
         shutil.copytree(cases.problem, base)
         in_fork(lambda: self.make(base))
         for words in self.commands:
@@ -437,10 +438,8 @@ def _with_bag(kind: str) -> Callable[[Path], object]:
     """State poses and tracks by topics of a log, called trial with the ending of its kind."""
 
     def make(folder: Path) -> None:
-        poses, table = (
-            read_poses(folder / POSES),
-            read_markers(folder / MARKERS),
-        )
+        poses = read_poses(folder / POSES)
+        table = read_markers(folder / MARKERS)
         log = logs.bag(folder / "log", logs.recorded(poses, table, kind), kind)
         if log.is_dir():
             log = next(log.glob("*.db3"))
@@ -839,10 +838,8 @@ NAMES += (
 def _named(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
     """Write reports and exports of a run whose names could be taken for other things."""
     name = "".join(rng.choice(NAMES, rng.integers(1, 8)))
-    problem, result = (
-        folder / "run" / "problem.toml",
-        folder / "run" / "result.json",
-    )
+    problem = folder / "run" / "problem.toml"
+    result = folder / "run" / "result.json"
     problem.write_text(
         problem.read_text().replace('"A tiny foam bar"', _quoted(name))
     )
@@ -901,7 +898,8 @@ def _without_privileges() -> None:
     class Header(ctypes.Structure):
         _fields_ = [("version", ctypes.c_uint32), ("process", ctypes.c_int)]
 
-    header, none = Header(0x20080522, 0), (ctypes.c_uint32 * 6)()
+    header = Header(0x20080522, 0)
+    none = (ctypes.c_uint32 * 6)()
     if ctypes.CDLL(None).capset(ctypes.byref(header), none):
         raise OSError("the privileges cannot be given up")
 
@@ -950,7 +948,8 @@ def _full(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
         prepared = 'cp -r run out && cd out && cp ../*.csv ../*.toml ../*.vtu . 2>/dev/null; exec "$@"'
         size += sum(f.stat().st_size + 4096 for f in folder.glob("*.*"))
     else:
-        size, prepared = int(rng.integers(4, 400)) * 1024, 'exec "$@"'
+        size = int(rng.integers(4, 400)) * 1024
+        prepared = 'exec "$@"'
     mounted = f"mount -t tmpfs -o size={size} tmpfs out && {prepared}"
     program = [sys.executable, "-c", PROGRAM, *words]
     ended = _ended(
@@ -986,10 +985,8 @@ def _ended(words: Sequence[str], folder: Path, limit_s: float) -> Ended:
 
 def _kernels(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
     """Solve with compiled kernels that were damaged, exchanged, linked or made by another user."""
-    cache, words = (
-        folder / "cache",
-        ("solve", "problem.toml", *REDUCED, "-q", "--out", "out"),
-    )
+    cache = folder / "cache"
+    words = ("solve", "problem.toml", *REDUCED, "-q", "--out", "out")
 
     def with_cache() -> None:
         os.environ["COLLOCATION_SYSID_CACHE"] = str(cache)
@@ -998,7 +995,8 @@ def _kernels(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
         _without_privileges()
 
     first = run(words, folder, limit_s, with_cache)
-    files, kind = sorted(cache.glob("*.o")), rng.integers(4)
+    files = sorted(cache.glob("*.o"))
+    kind = rng.integers(4)
     if first.code not in (0, 1) or not files:
         return "unclear", first
     file, other = (files[k] for k in rng.integers(len(files), size=2))
@@ -1213,7 +1211,8 @@ def table(
     os.environ["COLLOCATION_SYSID_THREADS"] = "1"  # a fork keeps no threads
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        problem, solved = folder / "problem", folder / "solved"
+        problem = folder / "problem"
+        solved = folder / "solved"
         problem.mkdir()
         in_fork(lambda: problem_files.write_problem(problem, {"swing": 8}))
         shutil.copytree(problem, solved)

@@ -21,8 +21,10 @@ from collocation_sysid.recording import Experiment, PoseSequence, Wrench
 
 FOLDER = Path(__file__).parents[1] / "problems" / "poked_block"
 TRUTH = {"young_pa": 2e4, "poisson": 0.4, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
-PLACES, QUARTERS = 12, 4
-NOISE_N, ONSET_M = 1e-3, 1e-4
+PLACES = 12
+QUARTERS = 4
+NOISE_N = 1e-3
+ONSET_M = 1e-4
 DEPTHS_M = 4e-4 * np.arange(6)
 # Where there are nodes, across and down: fine below the ball.
 ACROSS_M = np.array([0.0, 1.5, 3.0, 10.0]) / 1e3

@@ -196,7 +196,8 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
     threading.settrace(trace)
     sys.settrace(trace)
-    start, failed = time.perf_counter(), item.session.testsfailed
+    start = time.perf_counter()
+    failed = item.session.testsfailed
     yield
     sys.settrace(None)
     threading.settrace(None)  # type: ignore[arg-type]

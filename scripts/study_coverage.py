@@ -44,8 +44,12 @@ from collocation_sysid.statistics.uncertainty import (
 
 Array = NDArray[np.float64]
 
-SCHEME, LAYERS, STEPS = "midpoint", 5, 60
-OFFSET_M, SHIFT_S, PHI = 0.002, 0.003, 0.85
+SCHEME = "midpoint"
+LAYERS = 5
+STEPS = 60
+OFFSET_M = 0.002
+SHIFT_S = 0.003
+PHI = 0.85
 QUANTITIES = (*TRUTH, "young_pa", "poisson")
 COLUMNS = ("λ", "μ", "γ_r", "γ_m", "E", "ν", "own")
 KINDS = (
@@ -196,7 +200,8 @@ def twin(
     followed, p = collocation.follow_estimates(
         np.append(collocation.parameters.guess_q, drawn)
     )
-    (segment,), phi = followed.transcriptions, p[collocation.nq :]
+    (segment,) = followed.transcriptions
+    phi = p[collocation.nq :]
     tracks = segment.markers.predict_positions(x, phi)
     noise = sigma_m * noise_of(rng, tracks.shape, case.phi)
     return collocation_of(with_markers(experiment, tracks + noise)), phi
@@ -226,7 +231,8 @@ def truth() -> dict[str, float]:
 
 def held(uncertainty: Uncertainty) -> list[float]:
     """One where an interval holds the truth, zero where not, NaN where there is none."""
-    estimates, found = {**uncertainty.estimates, **uncertainty.derived}, []
+    estimates = {**uncertainty.estimates, **uncertainty.derived}
+    found = []
     for name, value in truth().items():
         interval = estimates[name].statistical95
         found.append(
@@ -322,7 +328,8 @@ def score_table(by_case: list[list[Outcome]]) -> str:
     for k, kind in enumerate(KINDS):
         for case, outcomes in zip(CASES, by_case, strict=True):
             rows = np.array([outcome.scores[k] for outcome in outcomes])
-            mean, deviation = np.nanmean(rows, axis=0), np.nanstd(rows, axis=0)
+            mean = np.nanmean(rows, axis=0)
+            deviation = np.nanstd(rows, axis=0)
             cells = [
                 f"{m:+.2f} ± {d:.2f}"
                 for m, d in zip(mean, deviation, strict=True)

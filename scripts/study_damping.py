@@ -29,7 +29,9 @@ from collocation_sysid.recording import (
     PoseSequence,
 )
 
-SIZE_M, DIVISIONS, DENSITY_KG_M3 = (0.03, 0.03, 0.15), (1, 1, 5), 100.0
+SIZE_M = (0.03, 0.03, 0.15)
+DIVISIONS = (1, 1, 5)
+DENSITY_KG_M3 = 100.0
 TRUTH = {
     "lambda_pa": 16e3,
     "mu_pa": 12e3,
@@ -37,7 +39,10 @@ TRUTH = {
     "gamma_m_1_s": 0.5,
 }
 GUESS = {name: Unknown(guess=1.5 * value) for name, value in TRUTH.items()}
-STEP_S, TIME_S, NOISE_M, TURN_HZ = 0.005, 1.5, 3e-4, 1.5
+STEP_S = 0.005
+TIME_S = 1.5
+NOISE_M = 3e-4
+TURN_HZ = 1.5
 LAWS = ("kelvin-voigt", "rayleigh")
 
 

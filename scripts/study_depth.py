@@ -36,15 +36,17 @@ TRUTH = {
     "gamma_r_s": 1e-3,
     "gamma_m_1_s": 0.1,
 }
-MATRIX, SHAPE = [[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]], (120, 160)
-MIDDLE_M, WAY, NOISE_M = (
-    np.array([0.06, 0.015, -0.01]),
-    np.array([0, -0.9, 0.44]),
-    1.5e-4,
-)
+MATRIX = [[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]]
+SHAPE = (120, 160)
+MIDDLE_M = np.array([0.06, 0.015, -0.01])
+WAY = np.array([0, -0.9, 0.44])
+NOISE_M = 1.5e-4
 # Noise is along the rays; along the normals of what is seen it is so much of that.
 ALONG_NORMALS = 0.65
-TURN_RAD, SHIFT_M, BIAS_M, SCALE = 0.09, 0.02, 0.005, 0.005
+TURN_RAD = 0.09
+SHIFT_M = 0.02
+BIAS_M = 0.005
+SCALE = 0.005
 UNKNOWN = cs.Nuisance.none(
     depth_turn_rad=TURN_RAD,
     depth_shift_m=SHIFT_M,
@@ -83,10 +85,8 @@ def image_m(seen_by: cs.DepthCamera) -> np.ndarray:
     """Return the depth image without noise [m]."""
     depth = cs.Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
     experiment = bar(depth)
-    x, skin = (
-        cs.simulate(experiment, TRUTH).positions_m[0],
-        VisibleSurface.from_body(experiment.body, depth),
-    )
+    x = cs.simulate(experiment, TRUTH).positions_m[0]
+    skin = VisibleSurface.from_body(experiment.body, depth)
     rotations, translations = seen_by.pose_at([0.0])
     triangles = (
         skin.subdivided_triangles(x[skin.nodes]) - translations[0]
@@ -98,7 +98,8 @@ def off(
     camera: cs.DepthCamera, turn_rad: np.ndarray, shift_m: np.ndarray
 ) -> cs.DepthCamera:
     """Return the camera with a wrong pose: rotated about the middle of the bar, and shifted."""
-    pose, turn = camera.pose.copy(), Rotation.from_rotvec(turn_rad).as_matrix()
+    pose = camera.pose.copy()
+    turn = Rotation.from_rotvec(turn_rad).as_matrix()
     pose[:3, :3] = turn @ pose[:3, :3]
     pose[:3, 3] = turn @ (pose[:3, 3] - MIDDLE_M) + MIDDLE_M + shift_m
     return cs.DepthCamera(MATRIX, pose=pose)
@@ -192,18 +193,17 @@ class SoftTwin:
 
 
 SOFT_TRUTH = {**TRUTH, "young_pa": 2.5e4}
-SOFT_MATRIX, SOFT_SHAPE = (
-    [[420.0, 0, 160], [0, 420.0, 120], [0, 0, 1]],
-    (240, 320),
-)
-SOFT_MIDDLE_M, SOFT_WAY = (
-    np.array([0.045, 0.015, -0.04]),
-    np.array([0, -0.9, 0.35]),
-)
-SOFT_DISTANCE_M, SOFT_NOISE_M = 0.4, 4e-4
-SOFT_TURN_RAD, SOFT_SHIFT_M = np.radians(2.7), 0.008
+SOFT_MATRIX = [[420.0, 0, 160], [0, 420.0, 120], [0, 0, 1]]
+SOFT_SHAPE = (240, 320)
+SOFT_MIDDLE_M = np.array([0.045, 0.015, -0.04])
+SOFT_WAY = np.array([0, -0.9, 0.35])
+SOFT_DISTANCE_M = 0.4
+SOFT_NOISE_M = 4e-4
+SOFT_TURN_RAD = np.radians(2.7)
+SOFT_SHIFT_M = 0.008
 # Standard deviations of the true pose of the camera, from image to image.
-TRUE_TURN_RAD, TRUE_SHIFT_M = np.radians(1.0), 0.003
+TRUE_TURN_RAD = np.radians(1.0)
+TRUE_SHIFT_M = 0.003
 # Parts of each side of a face that images are made of: with 4, chords in place of arcs make E 1.5 %
 # too large.
 SOFT_DIVISIONS = 12

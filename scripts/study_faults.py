@@ -109,7 +109,8 @@ def main() -> None:
         "OPENBLAS_NUM_THREADS": "1",
         "COLLOCATION_SYSID_THREADS": "1",
     }
-    start, notes = multiprocessing.get_context("spawn"), []
+    start = multiprocessing.get_context("spawn")
+    notes = []
     began = time.perf_counter()
     print(header(arguments.twins), table_head(), sep="\n\n", flush=True)
     with ProcessPoolExecutor(arguments.workers, mp_context=start) as pool:
@@ -174,7 +175,8 @@ def identified(
     experiment: Experiment, assumed: Sequence[Assumption] = ()
 ) -> tuple[Uncertainty, Array, bool]:
     """With every option left to its default, from the truth."""
-    fit, true = fitted(experiment, assumed), truth()
+    fit = fitted(experiment, assumed)
+    true = truth()
     lines = fit.lines
     whole = [
         float(lines[n].combined95[0] <= true[n] <= lines[n].combined95[1])
@@ -189,7 +191,8 @@ def fitted(experiment: Experiment, assumed: Sequence[Assumption]) -> Fit:
     """Return the fit of an experiment from the truth, with a budget of some assumptions."""
     problem = Problem([experiment], parameters(np.array(list(TRUTH.values()))))
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
-    collocation, z = solution.collocation, solution.z
+    collocation = solution.collocation
+    z = solution.z
     found = uncertainty_at(collocation, z)
     deviations = [(row, row.sigma) for row in assumed if row.sigma is not None]
     changes = changed_residuals(collocation, z, deviations)
@@ -202,7 +205,8 @@ def fitted(experiment: Experiment, assumed: Sequence[Assumption]) -> Fit:
 
 
 def relative_errors(found: Uncertainty) -> Array:
-    estimates, true = {**found.estimates, **found.derived}, truth()
+    estimates = {**found.estimates, **found.derived}
+    true = truth()
     errors = [estimates[name].statistical_std_error for name in QUANTITIES]
     return np.array([np.nan if e is None else e for e in errors]) / [
         true[n] for n in QUANTITIES

@@ -34,10 +34,14 @@ from collocation_sysid.statistics.field_estimates import (
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 Array = NDArray[np.float64]
-SIZE_M, EDGE_M, STEP_S, SIGMA_M = (0.04, 0.04, 0.12), 0.01, 1 / 60, 1e-4
+SIZE_M = (0.04, 0.04, 0.12)
+EDGE_M = 0.01
+STEP_S = 1 / 60
+SIGMA_M = 1e-4
 YOUNG_PA = 3e4
 BESIDE = {"poisson": 0.45, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
-BALL_M, RADIUS_M = np.array([0.022, 0.02, 0.06]), 0.015
+BALL_M = np.array([0.022, 0.02, 0.06])
+RADIUS_M = 0.015
 # Centres of the ball in twins with two phases, in turn [m].
 CENTRES_M = (
     (0.022, 0.02, 0.06),
@@ -86,11 +90,13 @@ def stiff_cells(
 
 def hung(body: Body, count: int, steps: int) -> cs.Experiment:
     """The block in the hand, with markers on its surface that nobody has seen yet."""
-    t_s, upright = STEP_S * np.arange(steps), Rotation.identity()
+    t_s = STEP_S * np.arange(steps)
+    upright = Rotation.identity()
     poses = swing(
         t_s, (0.02, 0.02, 0.01), (0.3, 0.3, 0.5), (1.7, 2.3, 1.3), 0.2, upright
     )
-    x, high = body.nodes_m, np.array(SIZE_M)
+    x = body.nodes_m
+    high = np.array(SIZE_M)
     surface = np.flatnonzero(
         ((x < 1e-9) | (x > high - 1e-9)).any(axis=1)
         & (x[:, 2] < high[2] - 0.01)
@@ -178,7 +184,8 @@ def found_of(twin: Twin, seed: int) -> Found:
     began = time.process_time()
     solution = cs.solve(problem)
     assert solution.status.converged, solution.message
-    collocation, took_s = solution.collocation, time.process_time() - began
+    collocation = solution.collocation
+    took_s = time.process_time() - began
     known = uncertainty_at(collocation, solution.z)
     body = collocation.transcriptions[0].body
     (field,) = field_estimates(body, collocation.parameters, solution.q, known)
@@ -190,15 +197,14 @@ def found_of(twin: Twin, seed: int) -> Found:
 
 def told(twin: Twin, seeds: range) -> str:
     """A row of the table: means over twins."""
-    rows, said = [], set[str]()
+    rows = []
+    said = set[str]()
     for seed in seeds:
         found = found_of(twin, seed)
-        field, truth, mesh, took_s = (
-            found.field,
-            found.truth,
-            found.mesh,
-            found.took_s,
-        )
+        field = found.field
+        truth = found.truth
+        mesh = found.mesh
+        took_s = found.took_s
         low, high = np.log(field.statistical95)
         held = (low < truth) & (truth < high)
         stiff = stiff_cells(twin.kind, mesh, twin.centre_m(seed))
@@ -210,7 +216,8 @@ def told(twin: Twin, seeds: range) -> str:
         )
         z_m = mesh.points_m[mesh.tetrahedra].mean(axis=1)[:, 2]
         step_mm = 1e3 * step_of(z_m, log) if twin.kind == "half" else np.nan
-        share, width = field.is_informed.mean(), np.median(field.deviation)
+        share = field.is_informed.mean()
+        width = np.median(field.deviation)
         error = np.sqrt(np.mean((log - truth) ** 2))
         inside = (
             held[field.is_informed].mean()

@@ -28,7 +28,8 @@ from collocation_sysid.statistics.uncertainty import uncertainty_at
 SAMPLES = 101
 # Frames come from 0 s on; the motion rises from there.
 LOOKED_AT_S = (0.25, 0.5, 1.0)
-EARLY_S, NEAR = 0.3, 0.1
+EARLY_S = 0.3
+NEAR = 0.1
 SHOWN_EVERY = 10
 
 

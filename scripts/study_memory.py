@@ -34,8 +34,12 @@ from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
-SIZE_M, DIVISIONS = (0.1, 0.03, 0.03), (4, 1, 1)
-NOISE_M, STEPS, STEP_S, MOVED_S = 2e-4, 120, 0.01, 0.4
+SIZE_M = (0.1, 0.03, 0.03)
+DIVISIONS = (4, 1, 1)
+NOISE_M = 2e-4
+STEPS = 120
+STEP_S = 0.01
+MOVED_S = 0.4
 TRUTH = {
     "young_pa": 2e4,
     "poisson": 0.3,
@@ -64,7 +68,8 @@ def main() -> None:
 
 def report(branches: int, twins: int, seed: int) -> None:
     """Find the truth without noise, then count."""
-    exact, parameters = recording(branches), unknowns(branches)
+    exact = recording(branches)
+    parameters = unknowns(branches)
     solution = ReducedSpace()(Collocation([exact], parameters))
     true = truth(branches)
     worst = max(

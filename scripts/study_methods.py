@@ -36,7 +36,8 @@ from collocation_sysid.recording import write_poses_csv
 from collocation_sysid.result.synthesis import Recipe, write_data
 
 WITHIN = 0.01
-RADIUS_M, HEIGHT_M = 0.04, 0.16
+RADIUS_M = 0.04
+HEIGHT_M = 0.16
 
 LM = {"inner": "levenberg-marquardt"}
 # Not from a coarse solution by reduced space.

@@ -129,10 +129,12 @@ def _line(
             for e in estimates
         ]
     )
-    mean, count = logs.mean(), len(logs)
+    mean = logs.mean()
+    count = len(logs)
     scatter = 100 * float(logs.std(ddof=1)) if count > 1 else np.nan
     told = [(e.statistical95, e.combined95) for e in estimates]
-    halves, held = [], []
+    halves = []
+    held = []
     for intervals in zip(*told, strict=True):
         ends = [
             np.log(np.maximum(interval, 1e-12))

@@ -134,7 +134,8 @@ def fit(problem: Problem, solution: Solution | None = None) -> Fit:
 def joint(beam: Beam) -> None:
     """One material for the three trials, and everything the report has to say of it."""
     found = fit(beam.load(), shipped(beam))
-    solution, uncertainty = found.solution, found.uncertainty
+    solution = found.solution
+    uncertainty = found.uncertainty
     print(
         f"{solution.message} {solution.iterations} sweeps, {solution.timing.total:.0f} s"
     )

@@ -57,8 +57,12 @@ BOUNDS = {
     "gamma_r_s": (1e-5, 1.0),
     "gamma_m_1_s": (1e-3, 100.0),
 }
-RADIUS_M, HEIGHT_M, STEP_S, SIGMA_M = 0.04, 0.16, 0.01, 1e-3
-TOLERANCE, ERRORS = 0.01, 3.0
+RADIUS_M = 0.04
+HEIGHT_M = 0.16
+STEP_S = 0.01
+SIGMA_M = 1e-3
+TOLERANCE = 0.01
+ERRORS = 3.0
 ENDED = ("converged", "acceptable")
 
 
@@ -237,7 +241,8 @@ def measured(
     markers = Markers(
         poses.t_s, nowhere, noise_m, places_m=body.nodes_m[marked]
     )
-    grasp, ideal = Grasp(held, poses), Nuisance.none()
+    grasp = Grasp(held, poses)
+    ideal = Nuisance.none()
     experiment = Experiment(
         body, poses.t_s, [grasp], markers, name="swing", nuisance=ideal
     )
@@ -348,7 +353,8 @@ def study(
     ]
     ended = [True, *(each.status in ENDED for each in outcomes)]
     first = min(np.flatnonzero(ended), key=lambda k: losses[k])
-    least, reference = losses[first], np.array(answers[first])
+    least = losses[first]
+    reference = np.array(answers[first])
     return [
         judged(each, reference, least, np.array(std_errors))
         for each in outcomes
@@ -373,7 +379,8 @@ def unguessed(case: Case, noise_m: float, seed: int, method: str) -> Outcome:
 
 def loss_of_truth(noisy: Case, clean: Case) -> float:
     """The noise's sum of squares, in its deviations."""
-    seen, true = noisy.experiment.markers, clean.experiment.markers.positions_m
+    seen = noisy.experiment.markers
+    true = clean.experiment.markers.positions_m
     return float(
         (((seen.positions_m - true) / seen.sigma_m[:, None]) ** 2).sum()
     )
@@ -383,7 +390,8 @@ def attempt(
     case: Case, number: int, guess: NDArray[np.float64], method: str
 ) -> Outcome:
     """Solve a case from one initial guess, and return its errors and its number of sweeps."""
-    given, nothing = tuple(guess.tolist()), (np.nan,) * len(guess)
+    given = tuple(guess.tolist())
+    nothing = (np.nan,) * len(guess)
     with counted_factorisations() as count:
         try:
             solution = solve(problem_of(case, guess), method)
@@ -429,7 +437,8 @@ def judged(
     std_errors: NDArray[np.float64],
 ) -> Outcome:
     """The outcome compared with the best answer."""
-    found, excess = np.array(outcome.found), outcome.loss - least
+    found = np.array(outcome.found)
+    excess = outcome.loss - least
     ratios = np.abs(np.log(found / best))
     errors = np.abs(found - best) / std_errors
     close = bool(((ratios < TOLERANCE) | (errors < ERRORS)).all())
@@ -466,7 +475,8 @@ def parameters(values: NDArray[np.float64]) -> Parameters:
 @contextmanager
 def counted_factorisations() -> Iterator[list[int]]:
     """Count the matrices factorised meanwhile."""
-    count, original = [0], Factoriser.factorise
+    count = [0]
+    original = Factoriser.factorise
 
     def counting(self: Factoriser, *matrix: Any, **room: Any) -> Factor:
         count[0] += 1

@@ -41,7 +41,10 @@ from collocation_sysid.statistics.misspecification.plausibility import (
 )
 
 # With fewer steps the scheme, not a mistake, would be what is recognised.
-SAMPLES, STEP_S, SUBSTEPS, SIGMA_M = 60, 0.01, 3, 1e-3
+SAMPLES = 60
+STEP_S = 0.01
+SUBSTEPS = 3
+SIGMA_M = 1e-3
 # An answer is right whose parameters are all within so many standard errors.
 RIGHT = 3.0
 DAMPING = {"gamma_r_s": 0.01, "gamma_m_1_s": 2.0}
@@ -79,7 +82,9 @@ def main() -> None:
         "--json", type=Path, help="a file for every twin, a line each"
     )
     arguments = parser.parse_args()
-    rows, faulty, began = [], [], time.perf_counter()
+    rows = []
+    faulty = []
+    began = time.perf_counter()
     for name in arguments.only:
         count = arguments.twins if name == "none" else arguments.faulty
         outcomes = []
@@ -180,10 +185,8 @@ def errors_of(found: Run, truth: Mapping[str, float]) -> dict[str, float]:
 @cache
 def bodies() -> tuple[tuple[Body, float], ...]:
     """Each with its Young's modulus [Pa] where it is soft."""
-    cylinder, box = (
-        cylinder_mesh(0.04, 0.16, 1, 5),
-        box_mesh((0.04, 0.05, 0.15), (2, 2, 5)),
-    )
+    cylinder = cylinder_mesh(0.04, 0.16, 1, 5)
+    box = box_mesh((0.04, 0.05, 0.15), (2, 2, 5))
     return (
         (Body(cylinder, density_kg_m3=20.0, damping="rayleigh"), 700.0),
         (Body(box, density_kg_m3=100.0, damping="rayleigh"), 5e3),
@@ -200,7 +203,8 @@ def swung(seed: int) -> tuple[Problem, dict[str, float]]:
         "poisson": 0.3,
     } | DAMPING
     t_s = STEP_S * np.arange(SAMPLES)
-    nodes, length_m = body.nodes_m, np.ptp(body.nodes_m[:, 2])
+    nodes = body.nodes_m
+    length_m = np.ptp(body.nodes_m[:, 2])
     held = np.flatnonzero(nodes[:, 2] < 1e-9)
     outside = np.setdiff1d(
         np.unique(body.mesh.surface),

@@ -27,7 +27,8 @@ from collocation_sysid.recording import (
 
 Rng = np.random.Generator
 Change = Callable[[Experiment, Rng], Experiment]
-JUMP_M, SLIP_M = (0.01, 0.03), (0.005, 0.02)
+JUMP_M = (0.01, 0.03)
+SLIP_M = (0.005, 0.02)
 
 
 @dataclass(frozen=True)
@@ -218,7 +219,8 @@ def exchanged(experiment: Experiment, rng: Rng) -> Experiment:
 
 def slipping(experiment: Experiment, rng: Rng) -> Experiment:
     """A marker that slips on the body."""
-    t_s, markers = experiment.t_s, experiment.markers
+    t_s = experiment.t_s
+    markers = experiment.markers
     k = int(rng.integers(len(t_s) // 4, 3 * len(t_s) // 4))
     rotations, _ = experiment.grasps[0].poses.at(t_s)
     tracks = np.array(markers.positions_m)
@@ -325,7 +327,8 @@ def restarting(experiment: Experiment, rng: Rng) -> Experiment:
 
 def torn(experiment: Experiment, rng: Rng) -> Experiment:
     """A mesh whose lower elements share no nodes with the others."""
-    body, cells = experiment.body, np.array(experiment.body.mesh.tetrahedra)
+    body = experiment.body
+    cells = np.array(experiment.body.mesh.tetrahedra)
     points_m = np.array(body.mesh.points_m)
     heights_m = points_m[cells].mean(axis=1)[:, 2]
     low = heights_m < np.median(heights_m)
