@@ -26,6 +26,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
+from collocation_sysid.program.depth.depth_comparison import camera_residuals
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
 from collocation_sysid.statistics.uncertainty import uncertainty_at
@@ -137,7 +138,7 @@ def fitted(
     ]
     low, high = bars.statistical95 or (0.0, np.inf)
     (part,) = solution.collocation.iterates(solution.z)
-    (reading,) = part.segment.depths
+    (reading,) = camera_residuals(part.segment)
     rms_mm = 1e3 * np.sqrt(
         np.nanmean(
             reading.signed_distances_m(part.observables[-1], part.phi) ** 2
