@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ...errors import listed
-from ...model.contact import contact_terms
+from ...model.contact.contact_force import contact_terms
 from ...recording import (
     Capsule,
     Cuboid,
