@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 import collocation_sysid as cs
-from collocation_sysid.model.contact import contact_terms
+from collocation_sysid.model.contact.contact_force import contact_terms
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.sweep import Sweep

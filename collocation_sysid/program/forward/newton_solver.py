@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from ...common.array_types import Array
 from ...errors import SimulationError
 from ...recording.experiment import Experiment
-from ..contact.condensed_contact import (
+from ..linear_algebra.factorisation import Factor, Factoriser
+from ..stopwatch import Stopwatch
+from .condensed_steps import (
     Compliance,
     CondensationError,
     CondensedSteps,
     StepEquations,
 )
-from ..linear_algebra.factorisation import Factor, Factoriser
-from ..stopwatch import Stopwatch
 from .newton_linearisation import NewtonLinearisation
 from .retraction import Retraction, add_increment
 
@@ -146,7 +146,7 @@ class NewtonSolver:
     last_factor : Factor or None
         Factor of the last solution of complete equations, with which the next one begins.
     compliance : Compliance or None
-        Inverse of the matrix of the body without contact, of the last step with contact.
+        Inverse of the matrix of the body without local forces, of the last step with such forces.
     definite_factor : Factor or None
         Last positive definite factor on the way to an equilibrium, with which the next search for
         one begins.
@@ -173,7 +173,7 @@ class NewtonSolver:
         self.stopwatch = stopwatch or Stopwatch()
         self.body = experiment.body
         # A retraction moves surfaces off the obstacles that hold them.
-        self._is_free_of_contact = not experiment.obstacles
+        self._has_no_obstacle = not experiment.obstacles
         self.options = options or NewtonOptions()
         at_start = experiment.is_prescribed(experiment.t_s[:1])[0]
         holding = at_start if prescribed is None else prescribed
@@ -258,11 +258,11 @@ class NewtonSolver:
         raise self._iteration_failure(iterate)
 
     def solve_step(self, x: Array, equations: StepEquations) -> Array:
-        """Solve one implicit time step, with contact or without, for the free dofs.
+        """Solve one implicit time step for the free dofs.
 
-        Contact is condensed to the dofs that touch, with the factor of the body without contact of
-        earlier steps. Where that does not converge, the complete equations are solved, first with
-        the factor of the previous solution as long as steps shrink fast.
+        Local forces are condensed to the dofs on which they act, with the factor of the body
+        without them of earlier steps. Where that does not converge, the complete equations are
+        solved, first with the factor of the previous solution as long as steps shrink fast.
 
         Parameters
         ----------
@@ -281,7 +281,7 @@ class NewtonSolver:
         NewtonFailure
             If no method converges, or an element is inverted at the start.
         """
-        if equations.contact.acts and self.has_no_inverted_element(x):
+        if equations.local.has_forces and self.has_no_inverted_element(x):
             improved, done = self._simplified_newton(
                 x, _CondensedIteration(self, equations)
             )
@@ -518,7 +518,7 @@ class NewtonSolver:
         share = 1.0
         update = (
             self._retraction
-            if keep_definite and self._is_free_of_contact
+            if keep_definite and self._has_no_obstacle
             else add_increment
         )
         for _ in range(self.options.max_backtracks):
@@ -677,7 +677,7 @@ class _CompleteIteration:
 
 
 class _CondensedIteration:
-    """Steps with the factor of the body without contact, and contact condensed.
+    """Steps with the factor of the body without local forces, which are condensed.
 
     Parameters
     ----------
@@ -699,7 +699,7 @@ class _CondensedIteration:
     def factorise_at(self, x: Array) -> None:
         solver = self._solver
         with solver.stopwatch.evaluating():
-            at = self._equations.linearise(x, with_contact=False)
+            at = self._equations.linearise_without_local(x)
         symmetric = at._replace(skew=NO_SKEW_PART)
         factor = solver.factorise(symmetric, x, keep_definite=False)
         solver.compliance = Compliance(factor, len(solver.free))
