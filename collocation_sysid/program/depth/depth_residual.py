@@ -97,6 +97,7 @@ class DepthResidual(MeasurementResidual):
     group_size = 1
     has_offsets = True
     sigma_key = "sigma_m of depth"
+    is_compiled = True
 
     @classmethod
     def from_correspondences(

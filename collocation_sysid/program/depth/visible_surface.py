@@ -359,9 +359,8 @@ class VisibleSurface:
             rays, distance_upper_bound=bound
         )
         is_within = np.isfinite(apart)
-        near[is_within] = (
-            apart[is_within] * away_m[nearest[is_within]] <= reach_m
-        )
+        away_m = np.take(away_m, nearest, mode="clip")
+        near[is_within] = (apart * away_m)[is_within] <= reach_m
         return near
 
     def nearest_points(
