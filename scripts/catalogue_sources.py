@@ -50,7 +50,7 @@ class CatalogueSource:
 
     @property
     def problem_file(self) -> Path:
-        """The problem file."""
+        """Absolute path of the problem file."""
         return ROOT / self.problem
 
 
