@@ -16,6 +16,7 @@ from ..program.collocation import ExperimentIterate
 from ..program.depth.depth_comparison import (
     DepthError,
     SurfaceComparison,
+    camera_residuals,
     depth_residuals,
     outline_distances_px,
     surface_residuals,
@@ -86,7 +87,7 @@ def predict(
                 positions_m=trajectory.positions_m,
                 phi=phi,
             )
-            for reading in segment.depths
+            for reading in camera_residuals(segment)
         }
     }
 

@@ -19,6 +19,7 @@ from ..methods.solution import Solution, Status
 from ..methods.solve_recorder import Recorder
 from ..problem import Problem
 from ..program.collocation import Collocation
+from ..program.unlabelled_points import declared_points
 from ..recording.depth_camera import Depth
 from ..recording.experiment import Experiment
 from .coarse_start import undetermined_names
@@ -116,13 +117,9 @@ def collocation_with_all_points(
         segment = iterate.segment
         name = segment.experiment.name
         correspondences = tuple(
-            reading.correspondences.with_depth(
-                depth,
-                reading.surface_shapes(iterate.x, iterate.phi),
-                phi=iterate.phi,
-            )
-            for reading, depth in zip(
-                segment.depths, given[name].depths, strict=True
+            residual.correspondences_of(measured, iterate.x, phi=iterate.phi)
+            for residual, measured in zip(
+                segment.reassociable, declared_points(given[name]), strict=True
             )
         )
         associations[name] = replace(

@@ -18,10 +18,9 @@ from scipy.spatial import KDTree
 
 from ...common.array_types import Array, Index
 from ...fem.body import Body
-from ...model.nuisance_map import NuisanceMap
 from ...recording.depth_camera import Depth
-from ...recording.experiment import Experiment
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
+from ..correspondences import Correspondences
 from .camera_alignment import align_camera, thinned
 from .depth_camera_model import DepthCameraModel
 from .depth_outline import Outline
@@ -64,7 +63,7 @@ def initial_gate_m(shape_m: Array) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceCorrespondences:
+class SurfaceCorrespondences(Correspondences):
     """Points of a camera and corresponding points of the surface, in S images of at most E points.
 
     Only points within the gate are contained; arrays of images with fewer points are padded with
@@ -125,6 +124,18 @@ class SurfaceCorrespondences:
     has_converged: bool
     outline: Outline
     is_aligned: bool = False
+
+    @property
+    def measured(self) -> Depth:
+        """Measured points of the camera."""
+        return self.camera.depth
+
+    def with_start_values(self, phi: Array) -> Array:
+        """Return a copy of φ (k,) with the camera's nuisance parameters `start_values`."""
+        own = self.camera.parameter_indices
+        updated = phi.copy()
+        updated[own] = self.camera.parameters_from(self.start_values)[own]
+        return updated
 
     @classmethod
     def from_shapes(
@@ -572,28 +583,3 @@ def _nearest_facing(
         x, world[in_box], candidates=facing
     )
     return _NearestPoints(in_box, faces, barycentric=barycentric)
-
-
-def initial_correspondences(
-    experiment: Experiment,
-) -> tuple[SurfaceCorrespondences, ...]:
-    """Return the correspondences of each depth camera of an experiment with the undeformed body in
-    its grasps, after an alignment of the camera; an empty tuple without cameras.
-    """
-    if not experiment.depths:
-        return ()
-    nuisance = NuisanceMap.from_experiment(experiment)
-    sightings = []
-    for number, depth in enumerate(experiment.depths):
-        view = DepthCameraModel.from_experiment(
-            experiment, number, nuisance=nuisance
-        )
-        nodes = VisibleSurface.from_body(experiment.body, depth).nodes
-        shapes_m = experiment.rigid_positions(depth.sample_times_s)[:, nodes]
-        nothing = np.zeros(nuisance.size)
-        sightings.append(
-            SurfaceCorrespondences.from_alignment(
-                view, experiment.body, shapes_m=shapes_m, phi=nothing
-            )
-        )
-    return tuple(sightings)

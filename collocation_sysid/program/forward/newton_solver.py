@@ -234,9 +234,28 @@ class NewtonSolver:
         x, done = self._with_known_factor(x, residual)
         if done and not self.options.checks_stability:
             return x
-        return self._solve_with_backtracking(
-            x, residual, linearise=linearise, keep_definite=True
-        )
+        iterate = self._iterate_at(x, linearise, keep_definite=True)
+        for _ in range(self.options.max_iterations):
+            if self._is_last(iterate.step):
+                self.last_factor = iterate.factor
+                iterate.x[self.free] += iterate.step
+                return iterate.x
+            self.definite_factor = iterate.factor
+            chords = self._static_chords(iterate, residual)
+            if chords is not None:
+                if chords.converged and not self.options.checks_stability:
+                    return chords.x
+                try:
+                    iterate = self._iterate_at(
+                        chords.x, linearise, keep_definite=True
+                    )
+                    continue
+                except NewtonFailure:
+                    pass
+            iterate = self._backtrack(
+                iterate, residual, linearise=linearise, keep_definite=True
+            )
+        raise self._iteration_failure(iterate)
 
     def solve_step(self, x: Array, equations: StepEquations) -> Array:
         """Solve one implicit time step for the free dofs.
@@ -275,69 +294,52 @@ class NewtonSolver:
         )
         if done:
             return improved
-        return self._solve_with_backtracking(
-            x.copy(),
-            equations.residual,
-            linearise=equations.linearise,
-            keep_definite=False,
+        iterate = self._iterate_at(
+            x.copy(), equations.linearise, keep_definite=False
         )
-
-    def _solve_with_backtracking(
-        self,
-        x: Array,
-        residual: Residual,
-        linearise: Linearise,
-        keep_definite: bool,
-    ) -> Array:
-        """Return the solution (3n,) [m] of residual(x) = 0 by Newton's method with backtracking.
-
-        A step is accepted when the next one, computed with the same factor, is shorter (Deuflhard's
-        natural monotonicity test), and no element is inverted.
-
-        Parameters
-        ----------
-        x : (3n,) array
-            First guess [m]; modified.
-        residual, linearise : callable
-            Functions of the state, see `solve_equilibrium`.
-        keep_definite : bool
-            Whether the matrix must be positive definite. Chord steps then replace those of Newton
-            where they shrink fast.
-
-        Raises
-        ------
-        NewtonFailure
-            If the method does not converge or a matrix is singular.
-        """
-        with self.stopwatch.evaluating():
-            at = linearise(x)
-        factor = self.factorise(at, x, keep_definite=keep_definite)
-        iterate = _Iterate(x, factor, step=self.step(factor, at.residual))
         for _ in range(self.options.max_iterations):
             if self._is_last(iterate.step):
                 self.last_factor = iterate.factor
                 iterate.x[self.free] += iterate.step
                 return iterate.x
-            if keep_definite:
-                self.definite_factor = iterate.factor
-                chords = self._static_chords(iterate, residual)
-                if chords is not None:
-                    if chords.converged and not self.options.checks_stability:
-                        return chords.x
-                    following = self._definite_iterate(chords.x, linearise)
-                    if following is not None:
-                        iterate = following
-                        continue
             iterate = self._backtrack(
                 iterate,
-                residual,
-                linearise=linearise,
-                keep_definite=keep_definite,
+                equations.residual,
+                linearise=equations.linearise,
+                keep_definite=False,
             )
-        raise NewtonFailure(
+        raise self._iteration_failure(iterate)
+
+    def _iteration_failure(self, iterate: _Iterate) -> NewtonFailure:
+        """Return the failure of a search that has taken the largest number of iterations."""
+        return NewtonFailure(
             iterate.x,
             f"Newton's method took more than {self.options.max_iterations} iterations",
         )
+
+    def _iterate_at(
+        self, x: Array, linearise: Linearise, keep_definite: bool
+    ) -> _Iterate:
+        """Return the iterate at x (3n,) [m], with its own factor and the step of Newton's method.
+
+        Parameters
+        ----------
+        x : (3n,) array
+            State; stored, not copied.
+        linearise : callable
+            `NewtonLinearisation` at a state.
+        keep_definite : bool
+            Whether a matrix that is not positive definite is a failure.
+
+        Raises
+        ------
+        NewtonFailure
+            If the matrix is singular or, with `keep_definite`, not positive definite.
+        """
+        with self.stopwatch.evaluating():
+            at = linearise(x)
+        factor = self.factorise(at, x, keep_definite=keep_definite)
+        return _Iterate(x, factor, step=self.step(factor, at.residual))
 
     def _with_known_factor(
         self, x: Array, residual: Residual
@@ -397,20 +399,6 @@ class NewtonSolver:
                 x[self.free] += step
                 return _Chords(x, converged=True)
         return _Chords(x, converged=False) if has_moved else None
-
-    def _definite_iterate(
-        self, x: Array, linearise: Linearise
-    ) -> _Iterate | None:
-        """Return the iterate at x (3n,) [m] with a factor of its own, or None if the matrix is
-        singular or not positive definite there.
-        """
-        with self.stopwatch.evaluating():
-            at = linearise(x)
-        try:
-            factor = self.factorise(at, x, keep_definite=True)
-        except NewtonFailure:
-            return None
-        return _Iterate(x, factor, step=self.step(factor, at.residual))
 
     def _simplified_newton(
         self, x: Array, iteration: ChordIteration
@@ -506,6 +494,9 @@ class NewtonSolver:
         keep_definite: bool,
     ) -> _Iterate:
         """Return the next iterate, with the first of the halved steps that is acceptable.
+
+        A step is acceptable when the next one, computed with the same factor, is shorter
+        (Deuflhard's natural monotonicity test), and no element is inverted.
 
         Parameters
         ----------
