@@ -13,14 +13,14 @@ from ..common.array_types import Array
 from ..common.display import short
 from ..methods.complementarity import with_contact_energy
 from ..methods.solution import Solution
-from ..model.contact import contact_terms
-from ..program.collocation import ExperimentIterate
-from ..program.contact.contact_summary import (
+from ..model.contact.contact_force import contact_terms
+from ..model.contact.contact_summary import (
     ContactSummary,
-    contact_summaries_of_parts,
+    contact_summaries,
     friction_summaries,
     surface_gaps_and_pressures,
 )
+from ..program.collocation import ExperimentIterate
 from ..recording.experiment import Experiment
 from ..statistics.concerns import Concern, concern_if
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
@@ -60,7 +60,7 @@ def guess_concerns(
     `is_complete` is false if only the first samples were simulated: then there are only concerns
     about penetration at the start.
     """
-    concerns = contact_concerns(contact_summaries_of_parts(parts), AT_THE_GUESS)
+    concerns = contact_concerns(summaries_of_parts(parts), AT_THE_GUESS)
     return [
         each
         for each in concerns
@@ -70,7 +70,18 @@ def guess_concerns(
 
 def concerns(parts: Sequence[ExperimentIterate]) -> list[Concern]:
     """Return concerns about contact in the fit, see `contact_concerns`."""
-    return contact_concerns(contact_summaries_of_parts(parts))
+    return contact_concerns(summaries_of_parts(parts))
+
+
+def summaries_of_parts(
+    parts: Iterable[ExperimentIterate],
+) -> Iterator[ContactSummary]:
+    """Yield the contact summaries of each obstacle of each experiment, experiment by experiment, at
+    the positions of its iterate.
+    """
+    for part in parts:
+        t_s = part.equations.dynamics.t_s[: len(part.x)]
+        yield from contact_summaries(part.segment.experiment, part.x, t_s=t_s)
 
 
 def contact_concerns(

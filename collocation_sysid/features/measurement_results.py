@@ -13,7 +13,7 @@ import numpy as np
 
 from ..common.array_types import Array, root_mean
 from ..common.serialisation import optional
-from ..program.contact.contact_summary import FrictionSummary
+from ..model.contact.contact_summary import FrictionSummary
 from ..program.depth.depth_comparison import DepthError, SurfaceComparison
 
 

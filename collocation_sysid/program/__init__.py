@@ -26,7 +26,7 @@ Streaming
 Simulation
     `simulation` simulates an experiment with the package `forward`.
 Analyses of a motion
-    The packages `contact` and `modes`.
+    The package `modes`.
 
 Methods use `Collocation`; statistics use `Transcription`, `ExperimentIterate` and `Sweep`;
 predictions use `simulate`; live estimation uses `streaming`.

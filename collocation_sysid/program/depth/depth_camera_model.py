@@ -201,11 +201,19 @@ class DepthCameraModel:
         image : int
             Index of the image.
         """
-        corrected = self._correction.evaluate(
-            phi[self.parameter_indices], np.vstack([points.T, rays.T])
+        # The correction is affine: its values at seven points determine it for all.
+        basis = np.eye(6, 7, k=1)
+        origin, *axes = self._correction.evaluate(
+            phi[self.parameter_indices], basis
         ).T
         rotations, translations = self.poses
-        return corrected @ rotations[image].T + translations[image]
+        turn = rotations[image].T
+        slopes = (np.stack(axes) - origin) @ turn
+        world = points @ slopes[:3]
+        if rays.any():
+            world += rays @ slopes[3:]
+        world += origin @ turn + translations[image]
+        return world
 
     def body_middle_m(self, sample: int) -> Array:
         """Return the middle (3,) of the undeformed body, carried by the first pose, in the camera's

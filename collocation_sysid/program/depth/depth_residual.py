@@ -98,6 +98,7 @@ class DepthResidual(CorrespondenceResidual):
     group_size = 1
     has_offsets = True
     sigma_key = "sigma_m of depth"
+    is_compiled = True
 
     @classmethod
     def from_correspondences(

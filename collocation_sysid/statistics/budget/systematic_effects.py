@@ -28,12 +28,12 @@ from ...fem.laws.constants import GAMMA_R, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
 from ...fem.rest_shape import RestShape
-from ...model.contact import Contact, contact_terms
+from ...model.contact.contact_force import Contact, contact_terms
+from ...model.contact.contact_summary import surface_gaps_and_pressures
 from ...model.dynamics import Dynamics
 from ...model.force_term import States
 from ...model.parameters import Parameters
 from ...program.collocation import ExperimentIterate
-from ...program.contact.contact_summary import surface_gaps_and_pressures
 from ...program.reactions.reaction_forces import forces_on_dofs, reaction_forces
 from ...recording.grasp import free_rigid_motions
 from ...recording.homogeneous_deformation import (
