@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..common.array_types import Array, root_mean
+from ..methods.solution import Solution
 from ..program.collocation import ExperimentIterate
 from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
@@ -17,6 +18,7 @@ from .measurement_results import (
     InstrumentMisfit,
     InstrumentPrediction,
     PredictionErrors,
+    PredictionResiduals,
     misfit,
 )
 
@@ -109,6 +111,26 @@ def step_differences(
     yield np.nan_to_num(way_m / segment.experiment.markers.sigma_m[:, None])
 
 
+def prediction_residuals(
+    experiment: Experiment, trajectory: Trajectory, _: InstrumentPrediction
+) -> PredictionResiduals | None:
+    """Return the differences of the markers [m]; None without a sample of any."""
+    markers = experiment.markers
+    if not markers.sample_count:
+        return None
+    return PredictionResiduals(
+        experiment.t_s,
+        trajectory.markers_m - markers.positions_m,
+        is_counted=markers.is_present,
+        unit="m",
+    )
+
+
+def fit_rms(solution: Solution) -> dict[str, float | None]:
+    """Return the RMS distance of the markers [m]; 0 without samples."""
+    return {"m": solution.rms_m}
+
+
 def error_texts(error: PredictionErrors, _: Units) -> Iterator[str]:
     """Yield RMS and largest distance in words; nothing without markers."""
     if error.rms_m:
@@ -127,5 +149,7 @@ MARKERS = Feature(
     errors=errors,
     misfits=misfits,
     step_differences=step_differences,
+    prediction_residuals=prediction_residuals,
+    fit_rms=fit_rms,
     error_texts=error_texts,
 )

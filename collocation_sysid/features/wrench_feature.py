@@ -13,6 +13,7 @@ from ..methods.solution import Solution, pooled_wrench_rms, wrench_rms
 from ..program.collocation import ExperimentIterate
 from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
+from ..program.wrench_residual import predict_wrenches
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import COMPONENTS, UNITS
 from ..statistics.assessment import forward_simulation_concerns
@@ -28,13 +29,15 @@ from .measurement_results import (
     InstrumentMisfit,
     InstrumentPrediction,
     PredictionErrors,
+    PredictionResiduals,
     SensorSeries,
     comparison_columns,
     misfit,
 )
-from .wrench_at_guess import wrench_deviations
+from .wrench_at_guess import MESSAGE_OF_OFFSET, wrench_deviations
 from .wrench_causes import (
     CHECKED_SAMPLES,
+    MESSAGES,
     wrench_causes,
     wrench_mistakes,
 )
@@ -108,7 +111,9 @@ def step_differences(
     predicted.
     """
     sensors = part.segment.sensors
-    fitted = part.predict_wrenches() if sensors else []
+    fitted = (
+        predict_wrenches(sensors, part.reactions, part.phi) if sensors else []
+    )
     rows = zip(sensors, fitted, predicted.wrenches, strict=True)
     for sensor, of_fit, of_simulation in rows:
         way = share * np.nan_to_num(
@@ -206,6 +211,31 @@ def simulated_series(
         yield SensorSeries("wrench", k, columns, COMPONENTS, units=UNITS)
 
 
+def prediction_residuals(
+    experiment: Experiment, _: Trajectory, predicted: InstrumentPrediction
+) -> PredictionResiduals | None:
+    """Return the differences of the forces [N] on the complete specimen; None without sensors."""
+    sensors = experiment.wrenches
+    if not sensors:
+        return None
+    pairs = zip(predicted.wrenches, sensors, strict=True)
+    return PredictionResiduals.in_order_of_time(
+        np.concatenate([sensor.t_s for sensor in sensors]),
+        np.concatenate(
+            [
+                sensor.symmetry * (read - sensor.values)[:, :3]
+                for read, sensor in pairs
+            ]
+        ),
+        unit="N",
+    )
+
+
+def fit_rms(solution: Solution) -> dict[str, float | None]:
+    """Return the RMS residual of the forces [N]; None if none is measured."""
+    return {"N": pooled_wrench_rms(solution)[0]}
+
+
 def validation_concerns(
     name: str, error: PredictionErrors, solution: Solution
 ) -> list[Concern]:
@@ -278,6 +308,7 @@ def _forces_text(*sizes: float | None) -> str:
 
 WRENCH = Feature(
     "wrench",
+    messages={**MESSAGES, **MESSAGE_OF_OFFSET},
     instruments=instruments,
     predict=predict,
     copied=copied,
@@ -291,6 +322,8 @@ WRENCH = Feature(
     validation_concerns=validation_concerns,
     recorded=recorded,
     simulated_series=simulated_series,
+    prediction_residuals=prediction_residuals,
+    fit_rms=fit_rms,
     fit_fields=fit_fields,
     pooled_fields=pooled_fields,
     fit_lines=fit_lines,

@@ -407,6 +407,9 @@ class Assumption:
         a problem states its deviation.
     description : str
         Description.
+    remedy : str
+        What to measure or state in order to reduce the effect, as an imperative phrase without a
+        full stop.
     effect : callable
         Returns the effect of one unit, from an experiment at the answer and the index of the
         component, from 0; None if there is no effect in this experiment.
@@ -420,6 +423,7 @@ class Assumption:
     unit: str
     sigma: float | None
     description: str
+    remedy: str
     effect: Callable[[ExperimentAtAnswer, int], Effect | None]
     component_names: str = ""
     of_specimens: bool = False
@@ -869,6 +873,7 @@ ASSUMPTIONS = (
         "1",
         sigma=0.01,
         description="size of the mesh",
+        remedy="measure two lengths of the real body and scale the mesh to them",
         effect=_size,
     ),
     Assumption(
@@ -877,6 +882,8 @@ ASSUMPTIONS = (
         sigma=0.58,
         description="weight under which the mesh was deformed when it was made, along each axis, if "
         "object.rest_shape is not stated",
+        remedy="state object.rest_shape: whether the mesh is free of stress, or the shape in "
+        "which the body hung or stood during its scan",
         effect=_rest_shape,
         component_names="x y z",
     ),
@@ -885,6 +892,7 @@ ASSUMPTIONS = (
         "1",
         sigma=0.005,
         description="displacement of the surface along its normal, relative to the thickness",
+        remedy="measure the thickness of the real body at several places",
         effect=_surface,
         component_names=_MODES,
     ),
@@ -893,6 +901,7 @@ ASSUMPTIONS = (
         "1",
         sigma=0.01,
         description="mass of the body, if it is not estimated",
+        remedy="weigh the body",
         effect=_mass,
     ),
     Assumption(
@@ -900,6 +909,7 @@ ASSUMPTIONS = (
         "1",
         sigma=0.05,
         description="density at one end of the body relative to that in its middle",
+        remedy="weigh two halves of a specimen",
         effect=_density_gradient,
         component_names="x y z",
     ),
@@ -908,6 +918,8 @@ ASSUMPTIONS = (
         "1",
         sigma=0.05,
         description="stiffness along one axis relative to that across it",
+        remedy="record a second motion with the body held the other way round, or press a cube "
+        "along each of its axes",
         effect=_anisotropy,
         component_names="x y z",
         of_specimens=True,
@@ -917,6 +929,7 @@ ASSUMPTIONS = (
         "1",
         sigma=0.02,
         description="stiffness at the end of a recording relative to that at its beginning",
+        remedy="repeat the first recording at the end",
         effect=_drift,
         of_specimens=True,
     ),
@@ -925,6 +938,7 @@ ASSUMPTIONS = (
         "1",
         sigma=1e-4,
         description="rate of all clocks",
+        remedy="compare all clocks with a reference clock",
         effect=_time_scale,
     ),
     Assumption(
@@ -932,6 +946,9 @@ ASSUMPTIONS = (
         "",
         sigma=0.02,
         description="Poisson's ratio, if it is stated",
+        remedy="measure Poisson's ratio in a tension test, or estimate it; solid rubber is nearly "
+        "incompressible: state poisson = 0.499 in [parameters], and the deviation of this value, "
+        "poisson = 0.0005, in [uncertainty.assumptions]",
         effect=_poisson,
         of_specimens=True,
     ),
@@ -941,6 +958,8 @@ ASSUMPTIONS = (
         sigma=1.0,
         description="damping force of another objective law, as a fraction of its difference from the "
         "stated law",
+        remedy="compare the laws with compare-models --damping on faster and slower motions, "
+        'or state damping_law = "none" where the law is known',
         effect=_objective_damping,
         component_names=" ".join(OBJECTIVE_DAMPINGS),
     ),
@@ -950,6 +969,8 @@ ASSUMPTIONS = (
         sigma=None,
         description="damping force of the Rayleigh law, as a fraction of its difference from the stated "
         "law",
+        remedy="compare the laws with compare-models --damping on motions that rotate "
+        "the body",
         effect=_rayleigh_damping,
     ),
     Assumption(
@@ -957,6 +978,7 @@ ASSUMPTIONS = (
         "m",
         sigma=2e-4,
         description="compliance of grip and skin, as the thickness of a layer of the body's material",
+        remedy="glue the body to a stiff plate, or attach markers to the body beside the grip",
         effect=_grip,
     ),
     Assumption(
@@ -964,6 +986,9 @@ ASSUMPTIONS = (
         "m/N",
         sigma=1e-6,
         description="compliance of the test bench",
+        remedy="press the platens against each other without a specimen and state "
+        "the slope of displacement over force as machine_compliance_m_n = { mean = …, deviation = … } "
+        "in [uncertainty.assumptions]",
         effect=_machine,
         of_specimens=True,
     ),
@@ -972,6 +997,7 @@ ASSUMPTIONS = (
         "",
         sigma=0.1,
         description="coefficient of friction of platens between which nodes slide",
+        remedy="lubricate the platens, or glue the specimen to them",
         effect=_platen_friction,
     ),
     Assumption(
@@ -980,6 +1006,9 @@ ASSUMPTIONS = (
         sigma=1.0,
         description="slip of faces that are pressed by platens and held along all axes, as a fraction of "
         "that without friction, if only loads are measured",
+        remedy="measure the bulge, by markers on the side or depth images; or state "
+        'platen_slip = "none" in [uncertainty.assumptions] if the faces are glued, or axes = "z" if '
+        "they slide",
         effect=_platen_slip,
     ),
     Assumption(
@@ -987,6 +1016,8 @@ ASSUMPTIONS = (
         "1",
         sigma=1.0,
         description="compliance of the contact with obstacles, as a fraction of that of the pressure law",
+        remedy="refine the mesh at the contact, or state a larger stiffness_pa_m and a "
+        "smaller width_m of the obstacle",
         effect=_contact_stiffness,
     ),
     Assumption(
@@ -994,6 +1025,7 @@ ASSUMPTIONS = (
         "1",
         sigma=AIR_DENSITY_DEVIATION,
         description="buoyancy relative to that of the model, because of the density of the air",
+        remedy="state the density of the air",
         effect=_buoyancy,
     ),
     Assumption(
@@ -1001,6 +1033,7 @@ ASSUMPTIONS = (
         "1",
         sigma=AIR_COEFFICIENT_DEVIATION,
         description="added mass of the air relative to that of the model",
+        remedy="repeat the motion more slowly, or with a heavier specimen",
         effect=_added_mass,
     ),
     Assumption(
@@ -1008,6 +1041,7 @@ ASSUMPTIONS = (
         "1",
         sigma=AIR_COEFFICIENT_DEVIATION,
         description="drag of the air relative to that of the model",
+        remedy="repeat the motion more slowly, or with a heavier specimen",
         effect=_air_drag,
     ),
 )
