@@ -34,7 +34,8 @@ from collocation_sysid.statistics.budget.systematic_effects import (
 )
 
 Array = NDArray[np.float64]
-SCHEME, AXES = "midpoint", "xyz"
+SCHEME = "midpoint"
+AXES = "xyz"
 # Steps between changes of what drifts.
 PIECE = 2
 
@@ -87,9 +88,12 @@ def _tracks(
     values = _lame(truth, values)
     if not drift:
         return simulate(truth, values, SCHEME, substeps=1).markers_m
-    t_s, markers = truth.t_s, truth.markers
+    t_s = truth.t_s
+    markers = truth.markers
     moduli = [name for name in values if name.endswith("_pa")]
-    tracks, start, velocity = [markers.positions_m[:0]], {}, 0.0
+    tracks = [markers.positions_m[:0]]
+    start = {}
+    velocity = 0.0
     steps = len(t_s) - 1
     for first in range(0, steps - 1, PIECE):  # the last piece has what is left
         here = slice(
@@ -125,7 +129,8 @@ def _lame(truth: Experiment, values: Mapping[str, float]) -> dict[str, float]:
     """The values by λ and μ, where the body has a law of its own."""
     if truth.body.parts[0].material.name == "neo-hookean":
         return dict(values)
-    young, poisson = values["young_pa"], values["poisson"]
+    young = values["young_pa"]
+    poisson = values["poisson"]
     kept = {n: v for n, v in values.items() if n not in ("young_pa", "poisson")}
     mu = young / 2 / (1 + poisson)
     return kept | {
@@ -139,7 +144,8 @@ def _body(
     values: Mapping[str, float],
     off: Mapping[str, float],
 ) -> Body:
-    old, (grasp,) = experiment.body, experiment.grasps
+    old = experiment.body
+    (grasp,) = experiment.grasps
     pivot_m = old.nodes_m[grasp.nodes].mean(axis=0)
     larger = 1 + off.get("body_scale", 0.0)
     mesh = TetMesh(
@@ -173,10 +179,8 @@ def _body(
 
 def _stiffer_along(shares: Sequence[float]) -> Material:
     def energy(f, lambda_pa, mu_pa):
-        j, young_pa = (
-            ca.det(f),
-            mu_pa * (3 * lambda_pa + 2 * mu_pa) / (lambda_pa + mu_pa),
-        )
+        j = ca.det(f)
+        young_pa = mu_pa * (3 * lambda_pa + 2 * mu_pa) / (lambda_pa + mu_pa)
         green = 0.5 * (f.T @ f - ca.SX.eye(3))
         isotropic = 0.5 * mu_pa * (2 * ca.trace(green) - 2 * ca.log(j))
         isotropic += 0.5 * lambda_pa * ca.log(j) ** 2

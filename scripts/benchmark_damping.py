@@ -103,7 +103,8 @@ def sweep_of(
     (part,) = collocation.iterates_at(collocation.guess_p, [x])
 
     def sweep() -> tuple[float, ...]:
-        watch, began = Stopwatch(), time.perf_counter()
+        watch = Stopwatch()
+        began = time.perf_counter()
         Sweep(segment, stopwatch=watch).forward(part.x, part.equations)
         return (
             time.perf_counter() - began,

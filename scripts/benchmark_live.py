@@ -115,7 +115,8 @@ def _noisy(name: str) -> Problem:
 def _compared(
     name: str, problem: Problem, live: LiveEstimator, frames: list[Frame]
 ) -> None:
-    took, again = [], []
+    took = []
+    again = []
     with without_garbage_of_startup():
         for frame in frames:
             update = live.process_frame(frame)
@@ -123,7 +124,8 @@ def _compared(
             again.append(update.relinearised)
             if abs(frame.t_s - EARLY_S) < 1e-6:
                 early = update
-    settled, row_s = live.finish() or update, _row_s(problem)
+    settled = live.finish() or update
+    row_s = _row_s(problem)
     median, late = 1e3 * np.percentile(took, [50, 99])
     print(
         f"{name}: {len(frames)} frames of {live.model.substeps} rows, {np.mean(again):.1f} again"
@@ -137,7 +139,8 @@ def _compared(
     solution = solve(problem, ReducedSpace())
     batch = uncertainty_at(solution.collocation, solution.z).estimates
     for key, true in TRUTH[name].items():
-        found, known = update.estimates[key], batch[key]
+        found = update.estimates[key]
+        known = batch[key]
         apart, at_last = (
             abs(each.value - known.value)
             / (known.statistical_std_error or np.nan)
@@ -160,7 +163,8 @@ def _row_s(problem: Problem) -> float:
     """Processor time of a row in a sweep of the whole recording, the least of some."""
     collocation = problem.collocation()
     rows = collocation.transcriptions[0].grid_times
-    horizon, found = Horizon(collocation, [rows]), []
+    horizon = Horizon(collocation, [rows])
+    found = []
     x, _ = horizon.simulate(collocation.guess_p)
     for _ in range(SWEEPS):
         began = time.thread_time()

@@ -1,8 +1,8 @@
-"""What branches of memory cost a sweep of the paper's size: 171 nodes, 100 timesteps.
+"""Cost of viscoelastic branches in a sweep of the paper's size: 171 nodes, 100 time steps.
 
-Sweeps with none, one and two branches take turns in one run, on one thread, by processor time, so
-that other work on the machine moves the ratio little. A branch has two parameters, and with them
-two more columns to solve for; the second table has them fixed.
+Sweeps with no, one and two branches alternate in one run on one thread and are timed by processor
+time, so that other work on the machine changes the ratios little. A branch has two parameters, each
+of which adds a column of sensitivities; in the second table the parameters of the branches are fixed.
 
     python scripts/benchmark_memory.py
 """
@@ -58,10 +58,8 @@ def main() -> None:
         seconds = np.array(
             [[timed(run) for run, _ in sweeps] for _ in range(repeats)]
         )
-        best, relative = (
-            seconds.min(axis=0),
-            np.median(seconds / seconds[:, :1], axis=0),
-        )
+        best = seconds.min(axis=0)
+        relative = np.median(seconds / seconds[:, :1], axis=0)
         for branches, (_, columns) in enumerate(sweeps):
             print(
                 f"  {branches} branches, {columns} columns: {1e3 * best[branches]:6.1f} ms at best,"
@@ -74,7 +72,8 @@ def sweep(
     experiment: Experiment, branches: int, estimated: bool
 ) -> tuple[Callable[[], object], int]:
     """A sweep of the experiment with so many branches, and how many columns it has."""
-    plain, names = experiment.body, [f"prony_{k + 1}" for k in range(branches)]
+    plain = experiment.body
+    names = [f"prony_{k + 1}" for k in range(branches)]
     body = Body(
         plain.mesh,
         density_kg_m3=plain.parts[0].density_kg_m3,

@@ -74,7 +74,7 @@ STEPS = (50, 100, 200, 400, 800, 1600)
 
 @dataclass(frozen=True)
 class Row:
-    """One run."""
+    """Measurements of one run of one method: sizes, iterations, times [s] and peak memory [MB]."""
 
     method: str
     nodes: int
@@ -135,7 +135,8 @@ def swung(body: Body, steps: int) -> Experiment:
     placement = place_markers(places, body.nodes_m, body, "vertex")
     markers = Markers(t_s, np.zeros((steps, 8, 3)), 0.001, placement=placement)
     held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
-    grasp, ideal = Grasp(held, poses), Nuisance.none()
+    grasp = Grasp(held, poses)
+    ideal = Nuisance.none()
     return Experiment(body, t_s, [grasp], markers, name="swing", nuisance=ideal)
 
 
@@ -148,7 +149,8 @@ def measure(mesh: str, steps: int, method: str) -> Row:
     began = time.perf_counter()
     collocation = Collocation([experiment], PARAMETERS)
     build_s = time.perf_counter() - began
-    body, truth = experiment.body, experiment.body.theta_from_values(TRUTH)
+    body = experiment.body
+    truth = experiment.body.theta_from_values(TRUTH)
     body.linearise(body.nodes_m, 0 * body.nodes_m, truth)
     began = time.perf_counter()
     solution = METHODS[method]()(collocation)
@@ -203,10 +205,8 @@ def problem_of(mesh: str, steps: int, case: str, ideal: bool) -> Problem:
         sensor = Wrench(experiment.t_s, np.zeros((steps, 6)), *WRENCH_SIGMAS)
         grasps = [replace(grasp, wrench=sensor) for grasp in experiment.grasps]
         experiment = replace(experiment, grasps=grasps)
-    made, markers = (
-        simulate(experiment, TRUTH | memory, "midpoint", substeps=1),
-        experiment.markers,
-    )
+    made = simulate(experiment, TRUTH | memory, "midpoint", substeps=1)
+    markers = experiment.markers
     sigmas = np.repeat(WRENCH_SIGMAS, 3)
     felt = [
         wrench + sigmas * noise(size=wrench.shape) for wrench in made.wrenches
@@ -241,7 +241,7 @@ def identified(
 
 
 def show_unknown(mesh: str, steps: int) -> None:
-    """What interior point takes for what is not known, over what it takes without."""
+    """Print the time of interior point with nuisance parameters, divided by the time without."""
     for case in UNKNOWN:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             ideal, whole = (
@@ -283,12 +283,11 @@ def shared_out(
     ) -> tuple[float, float, float]:
         first.body.threads = threads
         busy_s = workers.client.run(time.process_time) if workers else {}
-        here_s, began = time.process_time(), time.perf_counter()
+        here_s = time.process_time()
+        began = time.perf_counter()
         solution = ReducedSpace()(collocation, workers=workers)
-        wall_s, here_s = (
-            time.perf_counter() - began,
-            time.process_time() - here_s,
-        )
+        wall_s = time.perf_counter() - began
+        here_s = time.process_time() - here_s
         busiest_s = 0.0
         if workers:
             after_s = workers.client.run(time.process_time)

@@ -1,9 +1,9 @@
-"""What it costs to know nothing: a run at the paper's size without guess and places of markers.
+"""Time of a run without an initial guess and without marker positions, at the paper's size.
 
-The same recording is identified with both (a guess a factor of two off, places known to 1 mm) and
-without either, in turn and with the default nuisance parameters; the ratio of the medians is
-printed. A run is the whole of it: start, solve, forward simulation, error bars and verdict.
-Compiling the element's code comes before.
+The same recording is identified in turn with both (a guess that is wrong by a factor of two,
+positions known to 1 mm) and without either, each time with the default nuisance parameters. The
+ratio of the median times is printed. A run is complete: initialisation, solve, forward simulation,
+intervals and verdict. Kernels are compiled before the first run.
 """
 
 from __future__ import annotations

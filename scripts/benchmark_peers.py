@@ -131,7 +131,7 @@ class Progress:
             raise LimitReachedError
 
     def append(self, values: Mapping[str, float], time_s: float) -> None:
-        """Append an entry."""
+        """Append the values of the parameters at a time, with the number of simulations so far."""
         self.times_s.append(time_s)
         self.values.append(dict(values))
         self.counts.append(self.simulations)

@@ -1,9 +1,10 @@
-"""Where time and memory go in larger bodies: simulation and a sweep at 500 to 20,000 nodes.
+"""Time and memory of a simulation and a sweep of bodies with 500 to 20,000 nodes.
 
-The swung cylinder of `benchmark_methods.py`, with the default damping or Rayleigh's. Each line is a
-process of its own: peak memory is its own. On one thread times are the processor's, which other
-work on the machine lengthens little; on more they are the wall's. A sweep is a feasibility step and
-the sensitivities by four parameters; a few timesteps tell what one costs.
+The body is the swung cylinder of `benchmark_methods.py`, with the default damping law or with
+Rayleigh's. Each line is measured in a process of its own, so that peak memory is that of the line.
+On one thread, times are processor times, which other work on the machine changes little; on more
+threads they are wall times. A sweep consists of a feasibility step and the sensitivities to four
+parameters; a few time steps are enough to measure the cost of one.
 
     python scripts/benchmark_sizes.py                              # all sizes, one and two threads
     python scripts/benchmark_sizes.py --size 5000 --steps 200      # peak memory of 200 steps
@@ -61,7 +62,7 @@ class Cost:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Run the benchmark with the options of the command line, and print its table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", nargs="+", choices=[*SIZES], default=[*SIZES])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
@@ -99,7 +100,8 @@ def measured(
     )
     before_mb = peak_mb()
     clock = time.perf_counter if threads > 1 else time.process_time
-    began, spent = clock(), Stopwatch(clock)
+    began = clock()
+    spent = Stopwatch(clock)
     x, failure = continue_simulation(
         segment.experiment,
         setting.dynamics,
@@ -125,7 +127,7 @@ def measured(
 
 
 def kind(solver: Sweep) -> str:
-    """What factorises."""
+    """Return the name of the factorisation that a sweep uses."""
     chosen = solver.factoriser
     if chosen.skyline:
         return "skyline"

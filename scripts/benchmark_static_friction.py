@@ -55,7 +55,7 @@ class Solve:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Run the benchmark with the options of the command line, and print its table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--baseline", default="bbaeea20", metavar="REVISION")
     parser.add_argument("--only", nargs="+", choices=("compression", "poked"))

@@ -1,8 +1,7 @@
-"""What a user waits for at the terminal: start-up, check, solve and report, as whole commands.
+"""Waiting times at the terminal: start-up, check, solve and report, as complete commands.
 
-Each is run with kernels that are compiled already, and `solve` also as on a fresh installation,
-with an empty cache. Times are wall and processor time; the first line is the first text on a
-terminal.
+Each command is run with compiled kernels, and `solve` also with an empty cache, as on a new
+installation. The table has wall time, processor time, and the time to the first text.
 
     python scripts/benchmark_waiting.py --problem problems/foam_cylinder/recording.toml
 """
@@ -38,7 +37,7 @@ class Waited:
 
 
 def main() -> None:
-    """Print a table."""
+    """Time the commands several times, and print a table of the medians."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--problem", type=Path, default=PROBLEM)
     parser.add_argument("--repeats", type=int, default=3)
@@ -78,7 +77,8 @@ def waited(words: list[str], cache: str) -> Waited:
     """Run a command of the command line on a terminal of its own."""
     ours, theirs = pty.openpty()
     environment = {**os.environ, "XDG_CACHE_HOME": cache, "TERM": "xterm"}
-    before, began = os.times(), time.perf_counter()
+    before = os.times()
+    began = time.perf_counter()
     with subprocess.Popen(
         [sys.executable, "-c", MAIN, *words],
         stdout=theirs,

@@ -29,7 +29,10 @@ IMAGES = ("h_e_c", "h_m_c", "h_em_c", "t_em_c")
 CLAMP_M = np.array([0.07, 0.0, 0.0])
 # Planes are fitted to so many pixels either way, every few of them; they are those of one face
 # where depth differs by less and leaves less beside the plane.
-HALF, EVERY, DEEP_M, ROUGH_M = 6, 2, 0.02, 0.002
+HALF = 6
+EVERY = 2
+DEEP_M = 0.02
+ROUGH_M = 0.002
 # Normals count that are within these angles [degrees] of an axis, in turn.
 WITHIN = (15, 12, 10, 8, 6, 5, 4, 3, 3, 3, 3, 3)
 
@@ -54,14 +57,10 @@ def main() -> None:
         stated = np.array(said["object_to_camera"]) @ np.array(
             said["mesh_to_object"]
         )
-        seen, matrix = (
-            np.load(source / f"{name}.npz"),
-            np.array(said["camera_matrix"]),
-        )
-        to_camera, depth_m = (
-            np.eye(4),
-            seen["depth_counts"] * float(seen["count_m"]),
-        )
+        seen = np.load(source / f"{name}.npz")
+        matrix = np.array(said["camera_matrix"])
+        to_camera = np.eye(4)
+        depth_m = seen["depth_counts"] * float(seen["count_m"])
         turned = upright(face_normals(depth_m, matrix), stated[:3, :3])
         to_camera[:3, :3] = turned
         to_camera[:3, 3] = (stated[:3, :3] - turned) @ CLAMP_M + stated[:3, 3]

@@ -30,9 +30,11 @@ GROUPS = {
     "m2_u025": (2, 1, 3, 0, 4),
 }
 BASE_TO_CENTRE_M = np.array([-0.030, -0.013, 0.0])
-LENGTH_M, LAYERS = 0.360, 14
+LENGTH_M = 0.360
+LAYERS = 14
 # Places along the axis, and radii there.
-PLACES_M, RADII_M = (0.0, 0.305, 0.360), (0.01541, 0.00642, 0.00480)
+PLACES_M = (0.0, 0.305, 0.360)
+RADII_M = (0.01541, 0.00642, 0.00480)
 # A hexagon through the circle has 31 % less bending stiffness: the same second moment of area.
 HEXAGON = (np.pi / 4 / (5 * np.sqrt(3) / 16)) ** 0.25
 

@@ -1,11 +1,12 @@
-"""How the command line ends on damaged and hostile input: counts by kind of input and outcome.
+"""Outcomes of the command line for damaged and hostile input, counted by kind of input.
 
     nice -n 19 python scripts/hostile.py [--count 100] [--seed 0] [--only toml urdf] [--keep FOLDER]
 
-A case is a small problem of the tests, a file of which is damaged in a way drawn from the seed, the
-kind and the case's number, and a command that reads it. Files are cut, some of their bytes are
-replaced, repeated or exchanged, and what the format gives a meaning is put in. A case is run in a
-process of its own, with limits of time and memory. It is
+A case is a small problem of the tests with one damaged file, and a command that reads this file. The
+damage is drawn at random from the seed, the kind and the number of the case: files are truncated,
+some of their bytes are replaced, repeated or exchanged, and values with a special meaning in the
+format are inserted. Each case is run in a separate process with limits of time and memory. Its
+outcome is
 
     refused     exit code 2, one message of one line, and nothing written
     accepted    exit code 0 or 1
@@ -71,14 +72,15 @@ WAITING = 10
 # An ordinary user, where the script is started by root.
 NOBODY = 65534
 PROGRAM = "from collocation_sysid.cli import main; main()"
-MARKERS, POSES = "swing_markers.csv", "swing_motion.csv"
+MARKERS = "swing_markers.csv"
+POSES = "swing_motion.csv"
 REDUCED = ("--set", "solver.method=reduced-space")
 COUNTS = (b"-1", b"0", b"4294967295", b"1e308", b"nan", b"99999999999999999999")
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How a process ended: code, negative number of a signal, or None after the limit."""
+    """End of a process: exit code, negative signal number, or None after the time limit; its output."""
 
     code: int | None
     out: str
@@ -129,7 +131,7 @@ class Running:
         return Ended(code, self.said(self.out), self.said(self.err))
 
     def said(self, stream: Any) -> str:
-        """What it has written so far; the fork shares the place in the file."""
+        """Return all text written to a stream so far, without moving the position that forks share."""
         size = os.fstat(stream.fileno()).st_size
         return os.pread(stream.fileno(), size, 0).decode("utf-8", "replace")
 
@@ -299,12 +301,14 @@ def _repeated(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
 
 
 def _zeros(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
-    at, length = _place(rng, content), int(rng.integers(1, 64))
+    at = _place(rng, content)
+    length = int(rng.integers(1, 64))
     return content[:at] + bytes(length) + content[at + length :]
 
 
 def _largest(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
-    at, length = _place(rng, content), int(rng.choice([2, 4, 8]))
+    at = _place(rng, content)
+    length = int(rng.choice([2, 4, 8]))
     return (
         content[:at] + b"\xff" * (length - 1) + b"\x7f" + content[at + length :]
     )
@@ -370,10 +374,8 @@ class FileKind:
 
     def run(self, cases: Cases) -> Counter[str]:
         """Count the outcomes; none where the package that reads the format is missing."""
-        base, counts = (
-            cases.folder / f"base_{self.name.replace(' ', '_')}",
-            Counter[str](),
-        )
+        base = cases.folder / f"base_{self.name.replace(' ', '_')}"
+        counts = Counter[str]()
         shutil.copytree(cases.problem, base)
         in_fork(lambda: self.make(base))
         for words in self.commands:
@@ -436,10 +438,8 @@ def _with_bag(kind: str) -> Callable[[Path], object]:
     """State poses and tracks by topics of a log, called trial with the ending of its kind."""
 
     def make(folder: Path) -> None:
-        poses, table = (
-            read_poses(folder / POSES),
-            read_markers(folder / MARKERS),
-        )
+        poses = read_poses(folder / POSES)
+        table = read_markers(folder / MARKERS)
         log = logs.bag(folder / "log", logs.recorded(poses, table, kind), kind)
         if log.is_dir():
             log = next(log.glob("*.db3"))
@@ -703,7 +703,7 @@ FILES = (
 
 @dataclass(frozen=True)
 class Cases:
-    """What all kinds share.
+    """Settings that all kinds of cases share.
 
     Attributes
     ----------
@@ -727,7 +727,7 @@ class Cases:
     kept: Path | None = None
 
     def rng(self, kind: str, number: int) -> Rng:
-        """Of a case; the same whichever others are run."""
+        """Return the random generator of a case, independent of the other cases that are run."""
         return np.random.default_rng([self.seed, number, *kind.encode()])
 
     def keep(
@@ -838,10 +838,8 @@ NAMES += (
 def _named(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
     """Write reports and exports of a run whose names could be taken for other things."""
     name = "".join(rng.choice(NAMES, rng.integers(1, 8)))
-    problem, result = (
-        folder / "run" / "problem.toml",
-        folder / "run" / "result.json",
-    )
+    problem = folder / "run" / "problem.toml"
+    result = folder / "run" / "result.json"
     problem.write_text(
         problem.read_text().replace('"A tiny foam bar"', _quoted(name))
     )
@@ -900,7 +898,8 @@ def _without_privileges() -> None:
     class Header(ctypes.Structure):
         _fields_ = [("version", ctypes.c_uint32), ("process", ctypes.c_int)]
 
-    header, none = Header(0x20080522, 0), (ctypes.c_uint32 * 6)()
+    header = Header(0x20080522, 0)
+    none = (ctypes.c_uint32 * 6)()
     if ctypes.CDLL(None).capset(ctypes.byref(header), none):
         raise OSError("the privileges cannot be given up")
 
@@ -949,7 +948,8 @@ def _full(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
         prepared = 'cp -r run out && cd out && cp ../*.csv ../*.toml ../*.vtu . 2>/dev/null; exec "$@"'
         size += sum(f.stat().st_size + 4096 for f in folder.glob("*.*"))
     else:
-        size, prepared = int(rng.integers(4, 400)) * 1024, 'exec "$@"'
+        size = int(rng.integers(4, 400)) * 1024
+        prepared = 'exec "$@"'
     mounted = f"mount -t tmpfs -o size={size} tmpfs out && {prepared}"
     program = [sys.executable, "-c", PROGRAM, *words]
     ended = _ended(
@@ -985,10 +985,8 @@ def _ended(words: Sequence[str], folder: Path, limit_s: float) -> Ended:
 
 def _kernels(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
     """Solve with compiled kernels that were damaged, exchanged, linked or made by another user."""
-    cache, words = (
-        folder / "cache",
-        ("solve", "problem.toml", *REDUCED, "-q", "--out", "out"),
-    )
+    cache = folder / "cache"
+    words = ("solve", "problem.toml", *REDUCED, "-q", "--out", "out")
 
     def with_cache() -> None:
         os.environ["COLLOCATION_SYSID_CACHE"] = str(cache)
@@ -997,7 +995,8 @@ def _kernels(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
         _without_privileges()
 
     first = run(words, folder, limit_s, with_cache)
-    files, kind = sorted(cache.glob("*.o")), rng.integers(4)
+    files = sorted(cache.glob("*.o"))
+    kind = rng.integers(4)
     if first.code not in (0, 1) or not files:
         return "unclear", first
     file, other = (files[k] for k in rng.integers(len(files), size=2))
@@ -1212,7 +1211,8 @@ def table(
     os.environ["COLLOCATION_SYSID_THREADS"] = "1"  # a fork keeps no threads
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        problem, solved = folder / "problem", folder / "solved"
+        problem = folder / "problem"
+        solved = folder / "solved"
         problem.mkdir()
         in_fork(lambda: problem_files.write_problem(problem, {"swing": 8}))
         shutil.copytree(problem, solved)

@@ -21,7 +21,11 @@ def lowest(requirements: list[str]) -> list[str]:
 
 
 def of_project() -> list[str]:
-    """Of the package and its extras, but for what they ask of each other and on some machines."""
+    """Return the lowest versions of the dependencies of the package and its extras.
+
+    Requirements of an extra on the package itself, and requirements for some platforms only, are
+    left out.
+    """
     project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
     extras = [
         each

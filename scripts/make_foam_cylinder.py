@@ -29,7 +29,9 @@ SWING = Swing(
     rise_s=0.1,
 )
 # Cameras at 100 Hz; the robot logs its poses at 200 Hz.
-STEP_S, POSE_STEP_S, FINE_S = 0.01, 0.005, 0.001
+STEP_S = 0.01
+POSE_STEP_S = 0.005
+FINE_S = 0.001
 
 
 def main() -> None:

@@ -29,10 +29,15 @@ TRUTH = {
     "gamma_m_1_s": 0.5,
     "density_kg_m3": 100.0,
 }
-NOISE_M, NOISE_N = 3e-4, 5e-3
-STEP_S, PLATE_S, FINE_S = 0.01, 0.01, 0.00025
+NOISE_M = 3e-4
+NOISE_N = 5e-3
+STEP_S = 0.01
+PLATE_S = 0.01
+FINE_S = 0.00025
 # The gripper comes down until the block is pressed by the last of it.
-DURATION_S, LOWERED_S, LOWERED_M = 0.8, 0.4, 0.0154
+DURATION_S = 0.8
+LOWERED_S = 0.4
+LOWERED_M = 0.0154
 
 
 def lowered(t_s: np.ndarray) -> PoseSequence:
@@ -44,7 +49,7 @@ def lowered(t_s: np.ndarray) -> PoseSequence:
 
 
 def grid(step_s: float) -> np.ndarray:
-    """Times of the recording."""
+    """Return the times of the recording at a distance of `step_s` [s]."""
     return step_s * np.arange(round(DURATION_S / step_s) + 1)
 
 

@@ -40,8 +40,11 @@ SWING = Swing(
     ),  # held level, the mesh's x pointing down
 )
 # Cameras at 100 Hz; the robot logs its poses at 200 Hz.
-STEP_S, POSE_STEP_S, FINE_S = 0.01, 0.005, 0.001
-MISPLACED, GLUED_M = "tip_2", (0.006, 0.02598, 0.155)
+STEP_S = 0.01
+POSE_STEP_S = 0.005
+FINE_S = 0.001
+MISPLACED = "tip_2"
+GLUED_M = (0.006, 0.02598, 0.155)
 SWAPS = (("low_1", "mid_1", slice(25, 33)), ("tip_1", "tip_3", slice(48, 60)))
 OCCLUSIONS = (
     ("mid_2", slice(10, 24)),
@@ -77,7 +80,8 @@ def main() -> None:
 
 def as_glued(experiment: Experiment) -> Experiment:
     """The experiment with the misplaced marker where it is."""
-    body, markers = experiment.body, experiment.markers
+    body = experiment.body
+    markers = experiment.markers
     places = markers.predict_positions(body.nodes_m)
     places[markers.names.index(MISPLACED)] = GLUED_M
     placement = place_markers(places, body.nodes_m, body)

@@ -53,14 +53,16 @@ def turned(
     radii_mm: tuple[float, ...], heights_mm: tuple[float, ...]
 ) -> TetMesh:
     """A quarter turn of a section, of the cylinder's volume."""
-    radii_m, heights_m = np.array(radii_mm) / 1e3, np.array(heights_mm) / 1e3
+    radii_m = np.array(radii_mm) / 1e3
+    heights_m = np.array(heights_mm) / 1e3
     angle = np.pi / 2 / SECTORS
     radii_m *= np.sqrt(angle / np.sin(angle))
     whole = len(radii_m) * len(heights_m)
     plane = np.stack(
         np.meshgrid(radii_m, heights_m, indexing="ij"), -1
     ).reshape(-1, 2)
-    points, tetrahedra = [], []
+    points = []
+    tetrahedra = []
     for k in range(SECTORS + 1):
         axis = np.round([np.cos(k * angle), np.sin(k * angle)], 15)
         points.append(

@@ -21,8 +21,10 @@ from collocation_sysid.recording import Experiment, PoseSequence, Wrench
 
 FOLDER = Path(__file__).parents[1] / "problems" / "poked_block"
 TRUTH = {"young_pa": 2e4, "poisson": 0.4, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
-PLACES, QUARTERS = 12, 4
-NOISE_N, ONSET_M = 1e-3, 1e-4
+PLACES = 12
+QUARTERS = 4
+NOISE_N = 1e-3
+ONSET_M = 1e-4
 DEPTHS_M = 4e-4 * np.arange(6)
 # Where there are nodes, across and down: fine below the ball.
 ACROSS_M = np.array([0.0, 1.5, 3.0, 10.0]) / 1e3
@@ -30,7 +32,7 @@ DOWN_M = np.array([0.0, 1.5, 4.5, 15.0]) / 1e3
 
 
 def graded(*edges_m: np.ndarray) -> TetMesh:
-    """Of a box, with planes of nodes at these places along x, y and z."""
+    """Return the mesh of a box with planes of nodes at the given coordinates along x, y and z [m]."""
     even = box_mesh((1.0,) * 3, [len(places) - 1 for places in edges_m])
     points = [
         np.interp(even.points_m[:, k], np.linspace(0, 1, len(places)), places)
@@ -40,12 +42,12 @@ def graded(*edges_m: np.ndarray) -> TetMesh:
 
 
 def quarter() -> TetMesh:
-    """Of the block about a place, which is the origin."""
+    """Return the mesh of a quarter of the block around a poked point, which is the origin."""
     return graded(ACROSS_M, ACROSS_M, -DOWN_M)
 
 
 def forces_n(experiment: Experiment, depths_m: np.ndarray) -> np.ndarray:
-    """What the whole ball is pushed back with, exactly, at depths that follow one another."""
+    """Return the exact force on the complete ball at successive depths [N]."""
     t_s = np.arange(len(depths_m), dtype=float)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
     down = PoseSequence(

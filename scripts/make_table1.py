@@ -28,7 +28,8 @@ SWING = Swing(
     frequency_hz=(0.9, 1.1, 1.3),
     rise_s=0.3,
 )
-STEP_S, FINE_S = 0.01, 0.001
+STEP_S = 0.01
+FINE_S = 0.001
 
 
 def main() -> None:

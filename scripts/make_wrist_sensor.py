@@ -31,7 +31,9 @@ TRUTH = {
     "gamma_m_1_s": 0.5,
     "density_kg_m3": 120.0,
 }
-NOISE_M, NOISE_N, NOISE_NM = 1e-3, 0.05, 2e-3
+NOISE_M = 1e-3
+NOISE_N = 0.05
+NOISE_NM = 2e-3
 SWING = Swing(
     duration_s=0.6,
     amplitude_m=(0.05, 0.04, 0.03),
@@ -40,7 +42,10 @@ SWING = Swing(
     rise_s=0.1,
 )
 # Cameras at 100 Hz, the sensor at 500 Hz; the robot logs its poses at 200 Hz.
-STEP_S, SENSOR_S, POSE_STEP_S, FINE_S = 0.01, 0.002, 0.005, 0.001
+STEP_S = 0.01
+SENSOR_S = 0.002
+POSE_STEP_S = 0.005
+FINE_S = 0.001
 
 
 def main() -> None:
@@ -60,13 +65,12 @@ def main() -> None:
     found = simulate(
         replace(experiment, grasps=[moved]), TRUTH, timestep_s=FINE_S
     )
-    rng, frames = (
-        np.random.default_rng(1),
-        slice(None, None, round(STEP_S / POSE_STEP_S)),
-    )
+    rng = np.random.default_rng(1)
+    frames = slice(None, None, round(STEP_S / POSE_STEP_S))
     tracks = found.markers_m[frames]
     tracks = tracks + NOISE_M * rng.normal(size=tracks.shape)
-    names, t_s = experiment.markers.names, experiment.t_s[frames]
+    names = experiment.markers.names
+    t_s = experiment.t_s[frames]
     write_markers_csv(FOLDER / "swing_markers.csv", t_s, names, tracks)
     sizes = np.repeat([NOISE_N, NOISE_NM], 3)
     wrench = found.wrenches[0] + sizes * rng.normal(size=(len(times), 6))

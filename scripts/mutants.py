@@ -96,7 +96,7 @@ class Mutant:
 
 
 def changed(node: ast.expr) -> ast.expr | None:
-    """What stands in an expression's place, or None where nothing is changed."""
+    """Return the faulty expression that replaces `node`; None if this kind is not changed."""
     match node:
         case ast.Compare(left, [operator, *more], right) if (
             type(operator) in COMPARED
@@ -186,7 +186,7 @@ def mutants_of(path: Path, root: Path) -> list[Mutant]:
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """As a plugin of pytest: note what of the package a passing test runs, and for how long."""
+    """Record the functions of the package that a passing test runs and its duration (pytest hook)."""
     seen: set[tuple[str, int]] = set()
 
     def trace(frame, event: str, argument: object) -> None:
@@ -196,7 +196,8 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
     threading.settrace(trace)
     sys.settrace(trace)
-    start, failed = time.perf_counter(), item.session.testsfailed
+    start = time.perf_counter()
+    failed = item.session.testsfailed
     yield
     sys.settrace(None)
     threading.settrace(None)  # type: ignore[arg-type]
@@ -273,7 +274,7 @@ def tests_against(
 
 
 def copy_tree(to: Path) -> None:
-    """What git knows of, as it stands in the working tree."""
+    """Copy all files that git does not ignore from the working tree to a folder."""
     listed = subprocess.run(
         ["git", "ls-files", "-co", "--exclude-standard"],
         cwd=ROOT,
@@ -291,7 +292,7 @@ def copy_tree(to: Path) -> None:
 def run_pytest(
     tree: Path, cache: Path, *arguments: str, timeout_s: float | None = None
 ) -> int | None:
-    """Its exit code, or None if it took too long."""
+    """Run pytest in a tree and return its exit code; None if it exceeds the time limit."""
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(tree), str(tree / "scripts")]),
         "COLLOCATION_SYSID_CACHE": str(cache),

@@ -191,7 +191,7 @@ def _isotropic(strain: Array, lame: tuple[float, float]) -> Array:
 
 
 def _symmetric(tensor: Array) -> Array:
-    """Return the symmetric part."""
+    """Return the symmetric part of a tensor field."""
     return 0.5 * (tensor + tensors.transpose(tensor))
 
 

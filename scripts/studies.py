@@ -94,10 +94,8 @@ def run_variants(
     time_s : float
         A run ends by itself after this, or is killed a little later.
     """
-    store, limits = (
-        RunStore(folder / "runs"),
-        RunOptions(workers=workers, time_limit_s=time_s + GRACE_S),
-    )
+    store = RunStore(folder / "runs")
+    limits = RunOptions(workers=workers, time_limit_s=time_s + GRACE_S)
     planned: dict[str, list[PlannedRun]] = {}
     for variant in variants:
         overrides = variant.limited(time_s).overrides

@@ -26,7 +26,7 @@ GAMMA_M = "gamma_m_1_s"
 
 @dataclass(frozen=True)
 class Twin:
-    """What the fit of one twin says of γ_m [1/s]."""
+    """Estimate of γ_m and its intervals for one twin [1/s]."""
 
     estimate: float
     statistical: tuple[float, float]

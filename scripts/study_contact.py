@@ -23,11 +23,12 @@ from scipy.stats import t as student
 
 import collocation_sysid as cs
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.model.contact import contact_terms
+from collocation_sysid.model.contact.contact_force import contact_terms
 from collocation_sysid.recording.obstacle_solids import Solid
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
-YOUNG_PA, POISSON = 1e4, 0.3
+YOUNG_PA = 1e4
+POISSON = 0.3
 LAW = {
     "lambda_pa": YOUNG_PA * POISSON / ((1 + POISSON) * (1 - 2 * POISSON)),
     "mu_pa": YOUNG_PA / (2 * (1 + POISSON)),
@@ -36,7 +37,8 @@ LAW = {
 }
 CONTACT_PA = YOUNG_PA / (1 - POISSON**2)
 # Lengths in half-widths of the contact: a fiftieth of the radius strains little.
-RADIUS_M, FINE_M = 50.0, 1.4
+RADIUS_M = 50.0
+FINE_M = 1.4
 UP = np.array([0.0, 0.0, 1.0])
 # Blocks from which the force on a half-space is extrapolated.
 SIZES_M = (30.0, 90.0)
@@ -45,8 +47,9 @@ SIZES_M = (30.0, 90.0)
 def ticks(
     cells: int, fine_m: float, size_m: float, growth: float
 ) -> np.ndarray:
-    """So many equal cells to `fine_m`, then ever larger ones to `size_m`."""
-    found, step = list(np.linspace(0, fine_m, cells + 1)), fine_m / cells
+    """Return coordinates of nodes: equal cells up to `fine_m`, then growing cells up to `size_m` [m]."""
+    found = list(np.linspace(0, fine_m, cells + 1))
+    step = fine_m / cells
     while found[-1] < size_m:
         step *= growth
         found.append(found[-1] + step)
@@ -118,7 +121,8 @@ def pressed(
         place[:, None], np.zeros((0, 1, place.shape[1]))
     )[0, 0]
     law = term.law_of_contact
-    near, within = np.maximum(law.widths_m - gap_m, 0), np.maximum(-gap_m, 0)
+    near = np.maximum(law.widths_m - gap_m, 0)
+    within = np.maximum(-gap_m, 0)
     push = (
         law.surface.area_m2 * law.data[3] * (near**2 - within**2) / law.widths_m
     )
@@ -181,7 +185,7 @@ def sphere_on_half_space(cells: int) -> float:
 def cylinder(
     cells: float, kappa: float = 100.0, delta: float = 0.002
 ) -> tuple[float, int]:
-    """The same of a long cylinder, of which half is there."""
+    """Return force ratio and number of nodes, as `sphere` does, for half of a long cylinder."""
     edge_m = 1 / cells
     wide = ticks(round(FINE_M * cells), FINE_M, 30.0, 2.0)
     deep = ticks(max(1, round(FINE_M * cells / 2)), FINE_M / 2, 30.0, 2.0)
@@ -197,7 +201,7 @@ def cylinder(
 
 @dataclass(frozen=True)
 class Twin:
-    """What was found of one: E with its interval, by the model and by Hertz' formula.
+    """Young's modulus of one twin with its interval, by finite elements and by Hertz's formula.
 
     Attributes
     ----------
@@ -213,8 +217,9 @@ class Twin:
 
 
 def hertz_pa(depths_m: np.ndarray, force_n: np.ndarray) -> float:
-    """E by F = 4/3 E/(1 − ν²) √R d^1.5, with d from where the fit is best."""
-    (radius_m, poisson) = 0.0032, gel.TRUTH["poisson"]
+    """Return E of F = 4/3 E/(1 − ν²) √R d^1.5, with the onset of the depth d fitted too [Pa]."""
+    radius_m = 0.0032
+    poisson = gel.TRUTH["poisson"]
 
     def missed(unknown: np.ndarray) -> np.ndarray:
         deep_m = np.maximum(depths_m - 1e-3 * unknown[1], 0)
@@ -225,14 +230,15 @@ def hertz_pa(depths_m: np.ndarray, force_n: np.ndarray) -> float:
 
 
 def twins(count: int) -> Iterator[Twin]:
-    """Of the problem as it ships, each solved from the answer to the one before."""
+    """Yield the results of twins of the shipped problem; each solve starts from the previous answer."""
     guess = f"parameters.young_pa.guess={gel.TRUTH['young_pa']}"
     problem = cs.Problem.read(gel.FOLDER / "problem.toml", [guess])
     reach_m = np.arange(-5e-4, 2.5e-3, 2e-5)
     exact_n = CubicSpline(
         reach_m, gel.forces_n(problem.experiments[0], reach_m)
     )
-    spread, z = student.ppf(0.975, gel.PLACES - 1), None
+    spread = student.ppf(0.975, gel.PLACES - 1)
+    z = None
     for seed in range(count):
         rng = np.random.default_rng(seed)
         onset_m = gel.ONSET_M * rng.normal(size=gel.PLACES)
@@ -248,7 +254,8 @@ def twins(count: int) -> Iterator[Twin]:
             measured.append(replace(experiment, grasps=[*held, read]))
         twin = replace(problem, experiments=measured).collocation()
         solution = ReducedSpace()(twin, start=z)
-        z, told = solution.z, uncertainty_at(solution.collocation, solution.z)
+        z = solution.z
+        told = uncertainty_at(solution.collocation, solution.z)
         places = [
             part.phi[0] for part in solution.collocation.iterates(solution.z)
         ]

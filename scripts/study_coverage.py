@@ -1,14 +1,14 @@
-"""How often the 95 % intervals of a whole identification hold the truth: many noisy twins.
+"""Coverage of the 95 % intervals of complete identifications, for twins with different noise.
 
-A cylinder hangs from a swung hand; its tracks come from the scheme that also fits them, so that
-nothing but noise is wrong. Every twin gets noise of its own, and where nuisance
-parameters are estimated (offsets of the markers, a shift of their clock) values drawn from the
-priors. It is solved from the truth in the reduced space, and counted is how often an interval
-holds the truth: of the four parameters, of Young's modulus and Poisson's ratio, and of the
-nuisance parameters pooled. A share beyond 91–98 % is marked with a star. Noise is white, or
-autoregressive with a coefficient of 0.85 and the same deviation; error bars for independent errors
-must fail then. The second table has the errors of the logarithms over their standard deviations,
-mean ± standard deviation: 0 ± 1 if all is well.
+A cylinder hangs from a swung hand. The tracks are simulated with the scheme of the fit, so that
+noise is the only error. Each twin has its own noise and, if nuisance parameters are estimated
+(offsets of the markers, a delay of their clock), values of these drawn from their priors. It is
+solved by reduced space, starting from the true values. The coverage is the share of intervals that
+contain the true value: for the four parameters, for Young's modulus and Poisson's ratio, and for all
+nuisance parameters together. A coverage outside 91–98 % is marked with a star. The noise is white,
+or autoregressive with a coefficient of 0.85 and the same standard deviation, for which intervals of
+independent errors must fail. The second table has mean ± standard deviation of the errors of the
+logarithms, divided by their standard errors: 0 ± 1 if the standard errors are correct.
 """
 
 from __future__ import annotations
@@ -44,8 +44,12 @@ from collocation_sysid.statistics.uncertainty import (
 
 Array = NDArray[np.float64]
 
-SCHEME, LAYERS, STEPS = "midpoint", 5, 60
-OFFSET_M, SHIFT_S, PHI = 0.002, 0.003, 0.85
+SCHEME = "midpoint"
+LAYERS = 5
+STEPS = 60
+OFFSET_M = 0.002
+SHIFT_S = 0.003
+PHI = 0.85
 QUANTITIES = (*TRUTH, "young_pa", "poisson")
 COLUMNS = ("λ", "μ", "γ_r", "γ_m", "E", "ν", "own")
 KINDS = (
@@ -60,7 +64,7 @@ ACCEPTED = (0.91, 0.98)
 
 @dataclass(frozen=True)
 class Case:
-    """What the twins differ by, and what is estimated of them."""
+    """Kind of twins: correlation of the noise, and the nuisance parameters that are estimated."""
 
     name: str
     phi: float
@@ -196,7 +200,8 @@ def twin(
     followed, p = collocation.follow_estimates(
         np.append(collocation.parameters.guess_q, drawn)
     )
-    (segment,), phi = followed.transcriptions, p[collocation.nq :]
+    (segment,) = followed.transcriptions
+    phi = p[collocation.nq :]
     tracks = segment.markers.predict_positions(x, phi)
     noise = sigma_m * noise_of(rng, tracks.shape, case.phi)
     return collocation_of(with_markers(experiment, tracks + noise)), phi
@@ -226,7 +231,8 @@ def truth() -> dict[str, float]:
 
 def held(uncertainty: Uncertainty) -> list[float]:
     """One where an interval holds the truth, zero where not, NaN where there is none."""
-    estimates, found = {**uncertainty.estimates, **uncertainty.derived}, []
+    estimates = {**uncertainty.estimates, **uncertainty.derived}
+    found = []
     for name, value in truth().items():
         interval = estimates[name].statistical95
         found.append(
@@ -322,7 +328,8 @@ def score_table(by_case: list[list[Outcome]]) -> str:
     for k, kind in enumerate(KINDS):
         for case, outcomes in zip(CASES, by_case, strict=True):
             rows = np.array([outcome.scores[k] for outcome in outcomes])
-            mean, deviation = np.nanmean(rows, axis=0), np.nanstd(rows, axis=0)
+            mean = np.nanmean(rows, axis=0)
+            deviation = np.nanstd(rows, axis=0)
             cells = [
                 f"{m:+.2f} ± {d:.2f}"
                 for m, d in zip(mean, deviation, strict=True)

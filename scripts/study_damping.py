@@ -1,8 +1,8 @@
-"""What the wrong damping law does to an answer: a bar swung ever faster, fitted with both laws.
+"""Effect of a wrong damping law on the estimates: bars swung at increasing speed, fitted with two laws.
 
-The tracks are those of Kelvin and Voigt's law, by the midpoint rule, with noise; the same
-recording is fitted with that law and with Rayleigh's, which also brakes the rotation of a stretched
-body. Errors are in standard errors of the fit; the verdict is what the user sees.
+The tracks are simulated with the Kelvin–Voigt law and the midpoint rule, with noise. The same
+recording is fitted with this law and with Rayleigh's, which also damps the rotation of a stretched
+body. Errors are in standard errors of the fit; the verdict is that of the run.
 
     python scripts/study_damping.py
 """
@@ -29,7 +29,9 @@ from collocation_sysid.recording import (
     PoseSequence,
 )
 
-SIZE_M, DIVISIONS, DENSITY_KG_M3 = (0.03, 0.03, 0.15), (1, 1, 5), 100.0
+SIZE_M = (0.03, 0.03, 0.15)
+DIVISIONS = (1, 1, 5)
+DENSITY_KG_M3 = 100.0
 TRUTH = {
     "lambda_pa": 16e3,
     "mu_pa": 12e3,
@@ -37,7 +39,10 @@ TRUTH = {
     "gamma_m_1_s": 0.5,
 }
 GUESS = {name: Unknown(guess=1.5 * value) for name, value in TRUTH.items()}
-STEP_S, TIME_S, NOISE_M, TURN_HZ = 0.005, 1.5, 3e-4, 1.5
+STEP_S = 0.005
+TIME_S = 1.5
+NOISE_M = 3e-4
+TURN_HZ = 1.5
 LAWS = ("kelvin-voigt", "rayleigh")
 
 
@@ -101,7 +106,7 @@ def bar(law: str) -> Body:
 
 
 def fitted(measured: Experiment, law: str) -> str:
-    """What comes out, in a line and the verdict's."""
+    """Fit a recording with a damping law, and return its errors in one line, then the verdict."""
     body = bar(law)
     markers = replace(measured.markers, placement=None)
     found = run(

@@ -80,7 +80,8 @@ def cylinder(duration_s: float, nuisance: str, substeps: int) -> Problem:
     overrides = [*guesses, f"transcription.substeps={substeps}"]
     shipped = Problem.read(FOLDER / "problem.toml", overrides)
     (experiment,) = shipped.experiments
-    (grasp,), step_s = experiment.grasps, experiment.timestep_s
+    (grasp,) = experiment.grasps
+    step_s = experiment.timestep_s
     t_s = np.arange(round(duration_s / step_s) + 1) * step_s
     swung = replace(SWING, duration_s=duration_s).poses(step_s / 4)
     unseen = np.zeros((len(t_s), len(experiment.markers.names), 3))
@@ -99,7 +100,8 @@ def cylinder(duration_s: float, nuisance: str, substeps: int) -> Problem:
 def own_limits() -> Limits:
     """Ranges, speeds and accelerations of the shipped swing. Its hand is the body's origin."""
     poses = SWING.poses(FINE_S)
-    place, turns = poses.positions_m, Rotation.from_quat(poses.quaternions_xyzw)
+    place = poses.positions_m
+    turns = Rotation.from_quat(poses.quaternions_xyzw)
     speed = np.gradient(place, FINE_S, axis=0)
     angular = (turns[1:] * turns[:-1].inv()).as_rotvec() / FINE_S
 
@@ -147,11 +149,12 @@ def table(found: Design) -> str:
 
 
 def features(found: Design) -> str:
-    """How much of each coordinate's acceleration there is, and at which frequency.
+    """Return a table of the RMS acceleration along each coordinate, and its mean frequency.
 
-    Turns and pushes are told in the body's own axes at the start: along the cylinder, and across.
+    Rotations and shifts are in the axes of the body at the start: along the cylinder, and across.
     """
-    motion, (rotation, _) = found.motion, found.recording.start_pose
+    motion = found.motion
+    (rotation, _) = found.recording.start_pose
     place, rate, growth = motion.derivatives(motion.grid_s)
     lines = [
         "|  | RMS | RMS acceleration | frequency Hz |",
@@ -201,7 +204,8 @@ def spread(found: Design, twins: int, seed: int) -> str:
 
 def twin(found: Design, rng: np.random.Generator) -> dict[str, float] | None:
     """The answer for one recording of the designed motion; None where there is none."""
-    problem, experiment = found.recording.problem, found.experiment
+    problem = found.recording.problem
+    experiment = found.experiment
     options = problem.parameters, problem.scheme, problem.first_substeps
     (segment,) = Collocation([experiment], *options).transcriptions
     phi = segment.guess_phi + rng.normal(size=segment.nuisance.size)

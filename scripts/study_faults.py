@@ -1,12 +1,13 @@
-"""How often the 95 % intervals hold the truth in a real laboratory: twins with one fault each.
+"""Coverage of the 95 % intervals with the errors of a real laboratory, for twins with one error each.
 
-A cylinder hangs from a swung hand, as in study_coverage.py; its tracks come from the scheme that
-also fits them and have white noise. Every twin has one fault, drawn at its size, and is identified
-as a user does who states nothing: with the default nuisance parameters, noise and errors. It is
-solved from the truth. Counted is how often an interval holds the truth; beside it stand the median
-standard errors, and for faultless twins by how much those without nuisance parameters are smaller.
-Where something that is assumed is wrong, drawn from its deviation, counted is also how often the
-whole interval holds it, of a budget that has this assumption, or all of them.
+A cylinder hangs from a swung hand, as in study_coverage.py. The tracks are simulated with the scheme
+of the fit and have white noise. Each twin has one error of the recording, a random number of the
+stated size, and is identified with every option at its default: nuisance parameters, noise and
+covariance. The solve starts from the true values. The table has the coverage of the intervals and the
+median standard errors; for twins without errors also the ratio of standard errors with and without
+nuisance parameters. In the rows "assumed", the body deviates from an assumption of the budget by a
+random number with the standard deviation of this assumption; these rows have the coverage of the
+combined interval too, of a budget with this assumption or with all of them.
 """
 
 from __future__ import annotations
@@ -108,7 +109,8 @@ def main() -> None:
         "OPENBLAS_NUM_THREADS": "1",
         "COLLOCATION_SYSID_THREADS": "1",
     }
-    start, notes = multiprocessing.get_context("spawn"), []
+    start = multiprocessing.get_context("spawn")
+    notes = []
     began = time.perf_counter()
     print(header(arguments.twins), table_head(), sep="\n\n", flush=True)
     with ProcessPoolExecutor(arguments.workers, mp_context=start) as pool:
@@ -173,7 +175,8 @@ def identified(
     experiment: Experiment, assumed: Sequence[Assumption] = ()
 ) -> tuple[Uncertainty, Array, bool]:
     """With every option left to its default, from the truth."""
-    fit, true = fitted(experiment, assumed), truth()
+    fit = fitted(experiment, assumed)
+    true = truth()
     lines = fit.lines
     whole = [
         float(lines[n].combined95[0] <= true[n] <= lines[n].combined95[1])
@@ -188,7 +191,8 @@ def fitted(experiment: Experiment, assumed: Sequence[Assumption]) -> Fit:
     """Return the fit of an experiment from the truth, with a budget of some assumptions."""
     problem = Problem([experiment], parameters(np.array(list(TRUTH.values()))))
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
-    collocation, z = solution.collocation, solution.z
+    collocation = solution.collocation
+    z = solution.z
     found = uncertainty_at(collocation, z)
     deviations = [(row, row.sigma) for row in assumed if row.sigma is not None]
     changes = changed_residuals(collocation, z, deviations)
@@ -201,7 +205,8 @@ def fitted(experiment: Experiment, assumed: Sequence[Assumption]) -> Fit:
 
 
 def relative_errors(found: Uncertainty) -> Array:
-    estimates, true = {**found.estimates, **found.derived}, truth()
+    estimates = {**found.estimates, **found.derived}
+    true = truth()
     errors = [estimates[name].statistical_std_error for name in QUANTITIES]
     return np.array([np.nan if e is None else e for e in errors]) / [
         true[n] for n in QUANTITIES
@@ -328,7 +333,7 @@ def at_places(experiment: Experiment, places_m: Array) -> Experiment:
 
 
 def drawn(names: Sequence[str]) -> Callable[..., Pair]:
-    """What is assumed is off, each drawn from its deviation."""
+    """Return a fault that draws deviations from the named assumptions, each at its standard deviation."""
 
     def fault(experiment: Experiment, rng: Generator) -> Pair:
         off = {}
@@ -432,7 +437,7 @@ def _share(held: Array) -> str:
 
 
 def loss_of_precision(outcomes: Sequence[Outcome]) -> str:
-    """What the default nuisance parameters cost where nothing is wrong."""
+    """Return the ratios of standard errors with and without nuisance parameters, without errors."""
     ratios = np.nanmedian(
         [outcome.relative / outcome.without for outcome in outcomes], axis=0
     )

@@ -1,12 +1,12 @@
-"""What of a stiffness that differs from place to place is found: twins whose stiffness is known.
+"""Accuracy of spatially varying stiffness, for twins whose stiffness is known.
 
-A block hangs from a swung hand; markers are glued to its surface. Its stiff half, or a stiff ball
-inside, is in no description: one field of Young's modulus over the whole body is estimated, and
-counted is in how many elements the 95 % interval holds the truth: of all, and of those that the
-data tell, where the interval is less than half as wide as the prior's. The tracks are made with the
-scheme that fits them, each with noise of its own, on a mesh whose elements meet where the materials
-do. For two phases the ball has another centre in each twin, and the intervals of the contrast are
-listed.
+A block with markers on its surface hangs from a swung hand. The problem does not state its stiff
+half, or a stiff ball inside: one field of Young's modulus over the whole body is estimated. The
+table has the share of elements whose 95 % interval contains the true value: of all elements, and of
+those that the data determine, whose interval is less than half as wide as that of the prior. The
+tracks are simulated with the scheme of the fit, each with its own noise, on a mesh that follows the
+boundary between the materials. For two phases the ball has another centre in each twin, and the
+intervals of the contrast are listed.
 
     nice -n 15 python scripts/study_field.py --twins 10
     nice -n 15 python scripts/study_field.py --cost
@@ -34,10 +34,14 @@ from collocation_sysid.statistics.field_estimates import (
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 Array = NDArray[np.float64]
-SIZE_M, EDGE_M, STEP_S, SIGMA_M = (0.04, 0.04, 0.12), 0.01, 1 / 60, 1e-4
+SIZE_M = (0.04, 0.04, 0.12)
+EDGE_M = 0.01
+STEP_S = 1 / 60
+SIGMA_M = 1e-4
 YOUNG_PA = 3e4
 BESIDE = {"poisson": 0.45, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
-BALL_M, RADIUS_M = np.array([0.022, 0.02, 0.06]), 0.015
+BALL_M = np.array([0.022, 0.02, 0.06])
+RADIUS_M = 0.015
 # Centres of the ball in twins with two phases, in turn [m].
 CENTRES_M = (
     (0.022, 0.02, 0.06),
@@ -53,7 +57,7 @@ CENTRES_M = (
 
 @dataclass(frozen=True)
 class Twin:
-    """What is hidden, and how it is sought."""
+    """True stiffness of a block, and the prior of the estimated field."""
 
     name: str
     kind: str
@@ -75,7 +79,7 @@ class Twin:
 def stiff_cells(
     kind: str, mesh: cs.TetMesh, centre_m: Array = BALL_M
 ) -> NDArray[np.bool_]:
-    """Which cells are stiffer."""
+    """Return the mask of the stiffer cells."""
     centres = mesh.points_m[mesh.tetrahedra].mean(axis=1)
     if kind == "half":
         return centres[:, 2] < SIZE_M[2] / 2
@@ -86,11 +90,13 @@ def stiff_cells(
 
 def hung(body: Body, count: int, steps: int) -> cs.Experiment:
     """The block in the hand, with markers on its surface that nobody has seen yet."""
-    t_s, upright = STEP_S * np.arange(steps), Rotation.identity()
+    t_s = STEP_S * np.arange(steps)
+    upright = Rotation.identity()
     poses = swing(
         t_s, (0.02, 0.02, 0.01), (0.3, 0.3, 0.5), (1.7, 2.3, 1.3), 0.2, upright
     )
-    x, high = body.nodes_m, np.array(SIZE_M)
+    x = body.nodes_m
+    high = np.array(SIZE_M)
     surface = np.flatnonzero(
         ((x < 1e-9) | (x > high - 1e-9)).any(axis=1)
         & (x[:, 2] < high[2] - 0.01)
@@ -106,7 +112,7 @@ def hung(body: Body, count: int, steps: int) -> cs.Experiment:
 
 
 def problem_of(twin: Twin, seed: int) -> tuple[cs.Problem, Array]:
-    """Its problem, and the truth: the logarithm of E in every cell."""
+    """Return the problem of a twin, and the logarithm of the true E in every cell (cells,)."""
     mesh = cs.box_mesh(SIZE_M, tuple(round(size / EDGE_M) for size in SIZE_M))
     stiff = stiff_cells(twin.kind, mesh, twin.centre_m(seed))
     regions = [cs.Region("stiff", stiff)] if stiff.any() else []
@@ -178,7 +184,8 @@ def found_of(twin: Twin, seed: int) -> Found:
     began = time.process_time()
     solution = cs.solve(problem)
     assert solution.status.converged, solution.message
-    collocation, took_s = solution.collocation, time.process_time() - began
+    collocation = solution.collocation
+    took_s = time.process_time() - began
     known = uncertainty_at(collocation, solution.z)
     body = collocation.transcriptions[0].body
     (field,) = field_estimates(body, collocation.parameters, solution.q, known)
@@ -190,15 +197,14 @@ def found_of(twin: Twin, seed: int) -> Found:
 
 def told(twin: Twin, seeds: range) -> str:
     """A row of the table: means over twins."""
-    rows, said = [], set[str]()
+    rows = []
+    said = set[str]()
     for seed in seeds:
         found = found_of(twin, seed)
-        field, truth, mesh, took_s = (
-            found.field,
-            found.truth,
-            found.mesh,
-            found.took_s,
-        )
+        field = found.field
+        truth = found.truth
+        mesh = found.mesh
+        took_s = found.took_s
         low, high = np.log(field.statistical95)
         held = (low < truth) & (truth < high)
         stiff = stiff_cells(twin.kind, mesh, twin.centre_m(seed))
@@ -210,7 +216,8 @@ def told(twin: Twin, seeds: range) -> str:
         )
         z_m = mesh.points_m[mesh.tetrahedra].mean(axis=1)[:, 2]
         step_mm = 1e3 * step_of(z_m, log) if twin.kind == "half" else np.nan
-        share, width = field.is_informed.mean(), np.median(field.deviation)
+        share = field.is_informed.mean()
+        width = np.median(field.deviation)
         error = np.sqrt(np.mean((log - truth) ** 2))
         inside = (
             held[field.is_informed].mean()
@@ -254,7 +261,7 @@ def step_of(z_m: Array, log: Array) -> float:
 
 
 def cost() -> None:
-    """What a mode costs: processor time of a solve an iteration, over that without a field."""
+    """Print the processor time of an iteration by number of modes, and its ratio to that without."""
     print(
         "| modes | nodes | s an iteration | over that without |\n|---|---|---|---|"
     )
@@ -287,7 +294,7 @@ def cost() -> None:
 
 
 def main() -> None:
-    """Print the tables."""
+    """Run the study with the options of the command line, and print its tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=10)
     parser.add_argument("--cost", action="store_true")

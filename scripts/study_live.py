@@ -1,9 +1,9 @@
-"""How often the intervals of live estimates hold the truth while a recording is being made.
+"""Coverage of the intervals of live estimates while a recording is made.
 
-Twins of a small block are moved at random, simulated by the scheme itself so that nothing but noise
-is off, seen with noise of 0.5 mm, and streamed frame by frame
-from the guess; with each frame a number of rows is passed again, so that what the machine does
-besides changes nothing but the times.
+Twins of a small block are moved at random and simulated with the scheme of the estimator, so that
+the noise of 0.5 mm is the only error. They are streamed frame by frame, starting from the guess. With
+each frame a fixed number of rows is linearised again, so that the load of the machine changes the
+times only, not the estimates.
 
     python scripts/study_live.py                       # 200 twins
     python scripts/study_live.py --twins 20 --rows 6 --batch 5
@@ -28,12 +28,13 @@ from collocation_sysid.statistics.uncertainty import uncertainty_at
 SAMPLES = 101
 # Frames come from 0 s on; the motion rises from there.
 LOOKED_AT_S = (0.25, 0.5, 1.0)
-EARLY_S, NEAR = 0.3, 0.1
+EARLY_S = 0.3
+NEAR = 0.1
 SHOWN_EVERY = 10
 
 
 class Tally:
-    """What was found of all twins so far."""
+    """Counts of intervals that contain the true value, verdicts, errors and latencies of all twins."""
 
     def __init__(self) -> None:
         self.held: Counter[tuple[float, str]] = Counter()
@@ -44,7 +45,7 @@ class Tally:
         self.latency_s: list[float] = []
 
     def stream(self, problem: Problem, rows: int, batch: bool) -> None:
-        """Stream a twin."""
+        """Stream a twin to a new estimator, and add its results to the counts."""
         live = LiveEstimator(problem, LiveOptions(rows=rows), time.thread_time)
         for frame in frames_of_recording(problem.experiments[0], live.model):
             update = live.process_frame(frame)
@@ -75,7 +76,7 @@ class Tally:
                 self.held[at_s, name] += low <= SOFT[name] <= high
 
     def show(self) -> None:
-        """Print it."""
+        """Print the coverage at each time, errors and latencies."""
         print(f"{len(self.errors)} twins")
         for at_s in LOOKED_AT_S:
             shares = (

@@ -1,9 +1,8 @@
-"""How often the 95 % intervals of materials with memory hold the truth: noisy twins.
+"""Coverage of the 95 % intervals of viscoelastic materials, for twins with different noise.
 
-A block sticks out of a hand that swings it and then holds it still; its tracks come from the scheme
-that also fits them, with white noise. Counted is how often an interval holds the truth: of each
-parameter, and of the instantaneous modulus. Without noise the truth is found to rounding, which is
-said first.
+A block projects from a hand that swings it and then holds it still. The tracks are simulated with the
+scheme of the fit and have white noise. The table has the coverage for each parameter and for the
+instantaneous modulus. Before it, the error of the estimates without noise is printed.
 
     python scripts/study_memory.py --twins 200 --branches 1 2
 """
@@ -35,8 +34,12 @@ from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
-SIZE_M, DIVISIONS = (0.1, 0.03, 0.03), (4, 1, 1)
-NOISE_M, STEPS, STEP_S, MOVED_S = 2e-4, 120, 0.01, 0.4
+SIZE_M = (0.1, 0.03, 0.03)
+DIVISIONS = (4, 1, 1)
+NOISE_M = 2e-4
+STEPS = 120
+STEP_S = 0.01
+MOVED_S = 0.4
 TRUTH = {
     "young_pa": 2e4,
     "poisson": 0.3,
@@ -65,7 +68,8 @@ def main() -> None:
 
 def report(branches: int, twins: int, seed: int) -> None:
     """Find the truth without noise, then count."""
-    exact, parameters = recording(branches), unknowns(branches)
+    exact = recording(branches)
+    parameters = unknowns(branches)
     solution = ReducedSpace()(Collocation([exact], parameters))
     true = truth(branches)
     worst = max(

@@ -1,8 +1,9 @@
-"""Which method finds the parameters from which guesses: methods × starts on a small problem.
+"""Success of each method from distant initial guesses, on a small problem.
 
-A cylinder hangs from a swung hand and is seen without noise, by the scheme that also fits it.
-Every method gets the same guesses, log-uniform within a factor of 10 of the truth in all four
-parameters. A run succeeds when all four come out within 1 %, whatever its status says.
+A cylinder hangs from a swung hand. Its tracks are simulated with the scheme of the fit, without
+noise. Every method starts from the same guesses, log-uniform within a factor of 10 of the true values
+in all four parameters. A run succeeds if all four estimates are within 1 % of the true values,
+whatever its status.
 
     python scripts/study_methods.py                     # all methods, 40 starts
     python scripts/study_methods.py --methods shooting reduced-space --starts 100
@@ -35,7 +36,8 @@ from collocation_sysid.recording import write_poses_csv
 from collocation_sysid.result.synthesis import Recipe, write_data
 
 WITHIN = 0.01
-RADIUS_M, HEIGHT_M = 0.04, 0.16
+RADIUS_M = 0.04
+HEIGHT_M = 0.16
 
 LM = {"inner": "levenberg-marquardt"}
 # Not from a coarse solution by reduced space.
@@ -99,12 +101,13 @@ integrator = "scheme"
 
 @dataclass(frozen=True)
 class Score:
-    """How a method did.
+    """Successes and times of a method.
 
     Attributes
     ----------
     runs, hits, converged, misled : int
-        Misled are those that converged elsewhere.
+        Numbers of runs, of successes, of runs that report convergence, and of runs that report
+        convergence at other parameters.
     time_s : float, median over all runs, those that were stopped included
     """
 
@@ -207,7 +210,7 @@ def write_problem(folder: Path, layers: int, steps: int, step_s: float) -> Path:
 
 
 def score(name: str, rows: Sequence[Row]) -> Score:
-    """Count a variant's runs."""
+    """Return the counts and the median time of the runs of one variant of a method."""
     near = [worst_error(row) <= WITHIN for row in rows]
     converged = [bool(row["converged"]) for row in rows]
     times = [
@@ -226,7 +229,7 @@ def score(name: str, rows: Sequence[Row]) -> Score:
 
 
 def table(scores: Sequence[Score]) -> str:
-    """Success rates as Markdown."""
+    """Return a Markdown table of the success rates."""
     heads = (
         "method",
         "found",

@@ -1,9 +1,9 @@
-"""What 1 mm of marker noise does to the parameters, by method: bias and spread over many seeds.
+"""Effect of 1 mm of marker noise on the estimates of each method: bias and spread over many seeds.
 
-The swung cylinder of study_coverage.py, seen by the scheme that also fits it, so that nothing but
-noise is wrong; every method gets the same noise and the same guess. Bias and spread are those of
-the logarithms in percent, the bias with its standard error; predicted is the standard error at
-the truth.
+The body is the swung cylinder of study_coverage.py, simulated with the scheme of the fit, so that
+noise is the only error. Every method has the same noise and the same guess. Bias and standard
+deviation are those of the logarithms in per cent, the bias with its standard error; the column
+"predicted" has the standard error at the true values.
 
     python scripts/study_noise.py
 """

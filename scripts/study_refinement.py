@@ -28,7 +28,8 @@ from collocation_sysid.runs.warm_start import WarmStart
 from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
 
 NOISE_M = 5e-5
-SAMPLES, STEP_S = 20, 0.01
+SAMPLES = 20
+STEP_S = 0.01
 BODIES = {
     "block": ((0.06, 0.06, 0.09), (2, 2, 2)),
     "bar": ((0.04, 0.04, 0.06), (1, 1, 1)),
@@ -39,7 +40,7 @@ NAMES = ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")
 
 
 def drawn(name: str, rng: np.random.Generator) -> dict[str, float]:
-    """True parameters."""
+    """Return true parameters of a body, drawn at random around its typical values."""
     young_pa = YOUNG_PA[name] * float(np.exp(rng.uniform(-0.5, 0.5)))
     damping = {
         "gamma_r_s": 0.004 * np.exp(rng.uniform(-0.5, 0.5)),
@@ -108,7 +109,8 @@ def main(twins: int = 20, first: int = 0) -> None:
                 problem, WarmStart.of(solution), found.estimates
             )
             for key in held:
-                estimate, error = found.estimates[key], refined.errors.get(key)
+                estimate = found.estimates[key]
+                error = refined.errors.get(key)
                 if (
                     estimate.statistical95 is None
                     or error is None

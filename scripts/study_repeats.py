@@ -32,7 +32,7 @@ NAMES = ("young_pa", "gamma_r_s", "gamma_m_1_s", "density_kg_m3")
 
 @dataclass(frozen=True)
 class Repeats:
-    """What was measured again and again, each with the recordings that tell it."""
+    """Repeated measurement of one body: the problem, and the names of the recordings of each repeat."""
 
     name: str
     problem: Problem
@@ -101,7 +101,7 @@ def _cylinders(silicone: str) -> Problem:
 def _alone(
     problem: Problem, names: Sequence[str]
 ) -> dict[str, ReportedEstimate]:
-    """What some recordings tell by themselves."""
+    """Return the estimates from the named recordings alone; empty if they cannot be solved."""
     own = [
         replace(e, validation=False)
         for e in problem.experiments
@@ -129,10 +129,12 @@ def _line(
             for e in estimates
         ]
     )
-    mean, count = logs.mean(), len(logs)
+    mean = logs.mean()
+    count = len(logs)
     scatter = 100 * float(logs.std(ddof=1)) if count > 1 else np.nan
     told = [(e.statistical95, e.combined95) for e in estimates]
-    halves, held = [], []
+    halves = []
+    held = []
     for intervals in zip(*told, strict=True):
         ends = [
             np.log(np.maximum(interval, 1e-12))

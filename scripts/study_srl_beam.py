@@ -1,7 +1,7 @@
-"""What the measured beam says: the joint fit, refinement, cross-validation, and Poisson's ratio.
+"""Results for the measured beam: joint fit, refinement, cross-validation, and Poisson's ratio.
 
-The problem is one of problems/srl_beam; every part changes a few of its keys and solves it again in
-the reduced space.
+The problem is one of problems/srl_beam. Every part changes a few of its keys and solves it again by
+reduced space.
 
     python scripts/study_srl_beam.py --from FOLDER              # all: a quarter of an hour
     python scripts/study_srl_beam.py --from FOLDER --problem memory.toml --parts joint validation
@@ -134,7 +134,8 @@ def fit(problem: Problem, solution: Solution | None = None) -> Fit:
 def joint(beam: Beam) -> None:
     """One material for the three trials, and everything the report has to say of it."""
     found = fit(beam.load(), shipped(beam))
-    solution, uncertainty = found.solution, found.uncertainty
+    solution = found.solution
+    uncertainty = found.uncertainty
     print(
         f"{solution.message} {solution.iterations} sweeps, {solution.timing.total:.0f} s"
     )
@@ -171,7 +172,7 @@ def joint(beam: Beam) -> None:
 
 
 def refinement(beam: Beam) -> None:
-    """The same fit on other meshes, other steps, and with other schemes."""
+    """Print the joint fit on other meshes, with other time steps, and with other schemes."""
     print(
         f"{'':34}{'E [kPa]':>8}  95 % interval    γ_r [ms]  γ_m [1/s]  RMS [mm]"
     )

@@ -1,14 +1,14 @@
-"""From how far away a problem is solved: many starts on three bodies, or none at all.
+"""Convergence from distant initial guesses, and without any, for three bodies.
 
-Every parameter is guessed log-uniformly within a factor of the truth, or none is. The bodies:
-the paper's cylinder, which hangs; a soft bar, which sags as far as it is long; a block of silicone,
-stiff enough to move as the hand does. A start succeeds when every parameter is within 1 % of the
-best answer of all, or within three of its standard errors; or, as where the data do not tell some
-parameter, when it fits as well: the likelihood ratio of the two is within three deviations. How
-many succeed so only is told. Without a guess, where every run has noise of its own, an answer
-succeeds when it fits no worse than the truth does, whose misfit is the noise. The cost is counted
-in sweeps: one factorisation of every timestep's block, those of simulations and of the rest state
-included.
+The guess of every parameter is log-uniform within a factor of the true value, or there is no guess.
+The bodies are the paper's cylinder, which hangs; a soft bar, which sags by as much as its length; and
+a block of silicone, so stiff that it moves almost as the hand does. A start succeeds if every
+parameter is within 1 %, or within three standard errors, of the best answer of all starts. It also
+succeeds with an equal fit, as where the data do not determine a parameter: the likelihood ratio of
+both answers is within three standard deviations; the number of these successes is printed. Without a
+guess every run has its own noise, and an answer succeeds if its misfit is not larger than that of the
+true values. The cost is counted in sweeps, that is in factorisations of the blocks of all time steps,
+including those of simulations and of the initial equilibrium.
 """
 
 from __future__ import annotations
@@ -57,8 +57,12 @@ BOUNDS = {
     "gamma_r_s": (1e-5, 1.0),
     "gamma_m_1_s": (1e-3, 100.0),
 }
-RADIUS_M, HEIGHT_M, STEP_S, SIGMA_M = 0.04, 0.16, 0.01, 1e-3
-TOLERANCE, ERRORS = 0.01, 3.0
+RADIUS_M = 0.04
+HEIGHT_M = 0.16
+STEP_S = 0.01
+SIGMA_M = 1e-3
+TOLERANCE = 0.01
+ERRORS = 3.0
 ENDED = ("converged", "acceptable")
 
 
@@ -237,7 +241,8 @@ def measured(
     markers = Markers(
         poses.t_s, nowhere, noise_m, places_m=body.nodes_m[marked]
     )
-    grasp, ideal = Grasp(held, poses), Nuisance.none()
+    grasp = Grasp(held, poses)
+    ideal = Nuisance.none()
     experiment = Experiment(
         body, poses.t_s, [grasp], markers, name="swing", nuisance=ideal
     )
@@ -348,7 +353,8 @@ def study(
     ]
     ended = [True, *(each.status in ENDED for each in outcomes)]
     first = min(np.flatnonzero(ended), key=lambda k: losses[k])
-    least, reference = losses[first], np.array(answers[first])
+    least = losses[first]
+    reference = np.array(answers[first])
     return [
         judged(each, reference, least, np.array(std_errors))
         for each in outcomes
@@ -373,7 +379,8 @@ def unguessed(case: Case, noise_m: float, seed: int, method: str) -> Outcome:
 
 def loss_of_truth(noisy: Case, clean: Case) -> float:
     """The noise's sum of squares, in its deviations."""
-    seen, true = noisy.experiment.markers, clean.experiment.markers.positions_m
+    seen = noisy.experiment.markers
+    true = clean.experiment.markers.positions_m
     return float(
         (((seen.positions_m - true) / seen.sigma_m[:, None]) ** 2).sum()
     )
@@ -382,8 +389,9 @@ def loss_of_truth(noisy: Case, clean: Case) -> float:
 def attempt(
     case: Case, number: int, guess: NDArray[np.float64], method: str
 ) -> Outcome:
-    """Solve from one start."""
-    given, nothing = tuple(guess.tolist()), (np.nan,) * len(guess)
+    """Solve a case from one initial guess, and return its errors and its number of sweeps."""
+    given = tuple(guess.tolist())
+    nothing = (np.nan,) * len(guess)
     with counted_factorisations() as count:
         try:
             solution = solve(problem_of(case, guess), method)
@@ -429,7 +437,8 @@ def judged(
     std_errors: NDArray[np.float64],
 ) -> Outcome:
     """The outcome compared with the best answer."""
-    found, excess = np.array(outcome.found), outcome.loss - least
+    found = np.array(outcome.found)
+    excess = outcome.loss - least
     ratios = np.abs(np.log(found / best))
     errors = np.abs(found - best) / std_errors
     close = bool(((ratios < TOLERANCE) | (errors < ERRORS)).all())
@@ -466,7 +475,8 @@ def parameters(values: NDArray[np.float64]) -> Parameters:
 @contextmanager
 def counted_factorisations() -> Iterator[list[int]]:
     """Count the matrices factorised meanwhile."""
-    count, original = [0], Factoriser.factorise
+    count = [0]
+    original = Factoriser.factorise
 
     def counting(self: Factoriser, *matrix: Any, **room: Any) -> Factor:
         count[0] += 1

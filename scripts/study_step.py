@@ -42,7 +42,9 @@ def twin(
 def main(twins: int = 20, first: int = 0) -> None:
     """Print how many intervals hold the truth."""
     for noise_m in NOISES_M:
-        held, steps, all_of_them = Counter(), Counter(), 0
+        held = Counter()
+        steps = Counter()
+        all_of_them = 0
         for name in BODIES:
             for seed in range(first, first + twins):
                 problem, truth = twin(name, noise_m, seed)

@@ -1,10 +1,10 @@
-"""How often the verdict on an answer is right: faultless twins, and twins with one hidden fault.
+"""Reliability of the verdict, for twins without errors and twins with one error in the description.
 
-Two small bodies, soft and stiffer, moved at random, with white noise and nuisance parameters as
-they are by default. Faultless twins are to be called good, at least 95 of 100; of those whose
-problem is described wrongly (`wrong_twins`) at most 2 of 100. What is refused before it is solved
-counts as recognised. A cause of the misfit, which takes refits to find, is looked for only where
-the answer would be called good without.
+A soft and a stiffer small body are moved at random, with white noise and the default nuisance
+parameters. Twins without errors should be rated "good", at least 95 of 100; twins whose problem is
+described wrongly (`wrong_twins`) should not, at most 2 of 100. Input that is refused before it is
+solved counts as recognised. Likely errors of the description, whose search needs refits, are sought
+only if the answer would be rated "good" without them.
 """
 
 from __future__ import annotations
@@ -41,7 +41,10 @@ from collocation_sysid.statistics.misspecification.plausibility import (
 )
 
 # With fewer steps the scheme, not a mistake, would be what is recognised.
-SAMPLES, STEP_S, SUBSTEPS, SIGMA_M = 60, 0.01, 3, 1e-3
+SAMPLES = 60
+STEP_S = 0.01
+SUBSTEPS = 3
+SIGMA_M = 1e-3
 # An answer is right whose parameters are all within so many standard errors.
 RIGHT = 3.0
 DAMPING = {"gamma_r_s": 0.01, "gamma_m_1_s": 2.0}
@@ -49,7 +52,7 @@ DAMPING = {"gamma_r_s": 0.01, "gamma_m_1_s": 2.0}
 
 @dataclass(frozen=True)
 class Outcome:
-    """One twin: what was said of it, and by how many standard errors its worst parameter is off."""
+    """Verdict on one twin, and the largest error of its parameters in standard errors."""
 
     fault: str
     seed: int
@@ -79,7 +82,9 @@ def main() -> None:
         "--json", type=Path, help="a file for every twin, a line each"
     )
     arguments = parser.parse_args()
-    rows, faulty, began = [], [], time.perf_counter()
+    rows = []
+    faulty = []
+    began = time.perf_counter()
     for name in arguments.only:
         count = arguments.twins if name == "none" else arguments.faulty
         outcomes = []
@@ -105,7 +110,7 @@ def main() -> None:
 
 
 def row(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
-    """Of the table: how many there are of each verdict."""
+    """Return a row of the table: the number of twins with each verdict."""
     verdicts = Counter(each.verdict for each in outcomes)
     counts = [
         str(verdicts[word]) for word in ("refused", "doubtful", "check", "good")
@@ -123,7 +128,7 @@ def row(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
 
 
 def subject(reason: str) -> str:
-    """What a reason is about, without its numbers."""
+    """Return the subject of a reason, without its numbers."""
     return re.split(
         r"[:;,(]| by | that | as if | is | are ",
         re.sub("likely: '.*?':", "", reason),
@@ -168,7 +173,7 @@ def judged(fault: str, seed: int) -> Outcome:
 
 
 def errors_of(found: Run, truth: Mapping[str, float]) -> dict[str, float]:
-    """Of every parameter, in its standard errors; those without one are told by none."""
+    """Return the error of every parameter in standard errors; parameters without one are left out."""
     bars = {name: found.std_error(name) for name in truth}
     return {
         name: abs(found.parameters[name] - value) / error
@@ -180,10 +185,8 @@ def errors_of(found: Run, truth: Mapping[str, float]) -> dict[str, float]:
 @cache
 def bodies() -> tuple[tuple[Body, float], ...]:
     """Each with its Young's modulus [Pa] where it is soft."""
-    cylinder, box = (
-        cylinder_mesh(0.04, 0.16, 1, 5),
-        box_mesh((0.04, 0.05, 0.15), (2, 2, 5)),
-    )
+    cylinder = cylinder_mesh(0.04, 0.16, 1, 5)
+    box = box_mesh((0.04, 0.05, 0.15), (2, 2, 5))
     return (
         (Body(cylinder, density_kg_m3=20.0, damping="rayleigh"), 700.0),
         (Body(box, density_kg_m3=100.0, damping="rayleigh"), 5e3),
@@ -200,7 +203,8 @@ def swung(seed: int) -> tuple[Problem, dict[str, float]]:
         "poisson": 0.3,
     } | DAMPING
     t_s = STEP_S * np.arange(SAMPLES)
-    nodes, length_m = body.nodes_m, np.ptp(body.nodes_m[:, 2])
+    nodes = body.nodes_m
+    length_m = np.ptp(body.nodes_m[:, 2])
     held = np.flatnonzero(nodes[:, 2] < 1e-9)
     outside = np.setdiff1d(
         np.unique(body.mesh.surface),

@@ -1,8 +1,8 @@
-"""How often the 95 % intervals of E, ρ and ν hold the truth with a force sensor: noisy twins.
+"""Coverage of the 95 % intervals of E, ρ and ν with a force sensor, for twins with different noise.
 
-A block sticks out of a hand that swings it. Its tracks and the wrench of the hand come from the
-scheme that also fits them, with white noise of 1 mm and 0.05 N. Without the sensor only the ratio
-of E and ρ is told.
+A block projects from a hand that swings it. The tracks and the wrench of the hand are simulated with
+the scheme of the fit and have white noise of 1 mm and 0.05 N. Without the sensor, the data determine
+only the ratio of E to ρ.
 
     nice -n 15 python scripts/study_wrench.py --twins 200
 """
@@ -34,9 +34,13 @@ from collocation_sysid.program.simulation import with_wrenches
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
-SIZE_M, DIVISIONS = (0.2, 0.06, 0.06), (4, 1, 1)
-NOISE_M, NOISE_N, NOISE_NM = 1e-3, 0.05, 0.005
-STEPS, STEP_S = 60, 0.01
+SIZE_M = (0.2, 0.06, 0.06)
+DIVISIONS = (4, 1, 1)
+NOISE_M = 1e-3
+NOISE_N = 0.05
+NOISE_NM = 0.005
+STEPS = 60
+STEP_S = 0.01
 DENSITY = "density_kg_m3"
 TRUTH = {
     "young_pa": 6e4,
@@ -55,7 +59,8 @@ def main() -> None:
     parser.add_argument("--twins", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    exact, rng = recording(), np.random.default_rng(arguments.seed)
+    exact = recording()
+    rng = np.random.default_rng(arguments.seed)
     held: dict[str, int] = {name: 0 for name in COUNTED}
     errors: dict[str, list[float]] = {name: [] for name in COUNTED}
     for twin in range(1, arguments.twins + 1):
@@ -103,7 +108,8 @@ def fitted(experiment: Experiment):
 
 def noisy(exact: Experiment, rng: np.random.Generator) -> Experiment:
     """The recording with noise on tracks and wrench."""
-    tracks, (grasp,) = exact.markers.positions_m, exact.grasps
+    tracks = exact.markers.positions_m
+    (grasp,) = exact.grasps
     assert grasp.wrench is not None
     sizes = np.repeat([NOISE_N, NOISE_NM], 3)
     wrench = grasp.wrench.values + sizes * rng.normal(

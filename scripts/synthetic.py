@@ -35,7 +35,7 @@ class Swing:
     start: Rotation = HANGING
 
     def poses(self, step_s: float) -> PoseSequence:
-        """Poses every `step_s`."""
+        """Return the poses at a distance of `step_s` in time [s]."""
         return swing(
             np.arange(round(self.duration_s / step_s) + 1) * step_s,
             self.amplitude_m,

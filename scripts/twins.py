@@ -1,4 +1,4 @@
-"""Faultless twins: two small bodies, moved at random, seen with noise."""
+"""Twins without errors: two small bodies, moved at random, with noisy marker tracks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from collocation_sysid.recording import (
 )
 
 NOISE_M = 5e-4
-SAMPLES, STEP_S = 60, 0.01
+SAMPLES = 60
+STEP_S = 0.01
 # Body, and where its grasp begins along its longest axis; both hang or stick out of the hand.
 BODIES = {
     "block": ((0.06, 0.06, 0.09), (2, 2, 3)),
@@ -59,10 +60,8 @@ def random_poses(t_s: np.ndarray, rng: np.random.Generator) -> PoseSequence:
     rise = (t_s - t_s[0]) ** 2 / ((t_s - t_s[0]) ** 2 + 0.1**2)
 
     def swing(size: float) -> np.ndarray:
-        frequency, phase = (
-            rng.uniform(1.0, 3.0, 3),
-            rng.uniform(0, 2 * np.pi, 3),
-        )
+        frequency = rng.uniform(1.0, 3.0, 3)
+        phase = rng.uniform(0, 2 * np.pi, 3)
         wave = np.sin(2 * np.pi * np.outer(t_s, frequency) + phase)
         return size * rise[:, None] * rng.uniform(0.5, 1.0, 3) * wave
 
@@ -83,7 +82,8 @@ def twin(
     """
     rng = np.random.default_rng(seed)
     size_m, divisions = BODIES[name]
-    body, t_s = block(size_m, divisions), STEP_S * np.arange(samples)
+    body = block(size_m, divisions)
+    t_s = STEP_S * np.arange(samples)
     held = np.flatnonzero(body.nodes_m[:, 2] > size_m[2] - 1e-6)
     free = np.setdiff1d(np.arange(len(body.nodes_m)), held)
     places = body.nodes_m[rng.choice(free, 6, replace=False)]
@@ -98,13 +98,14 @@ def twin(
     return Problem([with_markers(experiment, tracks + noise)], GUESS)
 
 
-WRENCH_N, WRENCH_NM = 5e-4, 5e-5
+WRENCH_N = 5e-4
+WRENCH_NM = 5e-5
 
 
 def sensing_twin(
     name: str, truth: dict[str, float], seed: int, samples: int = SAMPLES
 ) -> Problem:
-    """The same with a sensor at the grasp, in its frame and about a point above the body."""
+    """Return a twin with a force sensor at the grasp, in its frame and about a point above the body."""
     given = twin(name, truth, seed, samples)
     (experiment,) = given.experiments
     (grasp,) = experiment.grasps

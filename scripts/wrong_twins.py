@@ -1,7 +1,7 @@
-"""Twins of a problem whose description is wrong in one known way.
+"""Problems whose description is wrong in one known way.
 
-Each fault takes a `Problem` with good data and a random generator, and returns the problem as
-somebody would describe it who makes that mistake. `FAULTS` tells which causes name it.
+Each fault is a function of a correct `Problem` and a random generator, which returns the problem with
+this error in its description. `FAULTS` states the hypotheses that name each error correctly.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ from collocation_sysid.recording import (
 
 Rng = np.random.Generator
 Change = Callable[[Experiment, Rng], Experiment]
-JUMP_M, SLIP_M = (0.01, 0.03), (0.005, 0.02)
+JUMP_M = (0.01, 0.03)
+SLIP_M = (0.005, 0.02)
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A mistake, and the causes that name it rightly."""
+    """Error in a description, and the codes of the hypotheses that name it correctly."""
 
     change: Change
     causes: tuple[str, ...]
@@ -85,7 +86,7 @@ def poses_times(factor: float) -> Change:
 
 
 def markers_times(factor: float) -> Change:
-    """Tracks in another unit."""
+    """Return a change that multiplies all marker positions by a factor."""
     return lambda e, rng: with_markers(e, factor * e.markers.positions_m)
 
 
@@ -218,7 +219,8 @@ def exchanged(experiment: Experiment, rng: Rng) -> Experiment:
 
 def slipping(experiment: Experiment, rng: Rng) -> Experiment:
     """A marker that slips on the body."""
-    t_s, markers = experiment.t_s, experiment.markers
+    t_s = experiment.t_s
+    markers = experiment.markers
     k = int(rng.integers(len(t_s) // 4, 3 * len(t_s) // 4))
     rotations, _ = experiment.grasps[0].poses.at(t_s)
     tracks = np.array(markers.positions_m)
@@ -299,7 +301,7 @@ def with_track_axes(
 
 
 def constant(poses: PoseSequence) -> PoseSequence:
-    """The first pose throughout."""
+    """Return poses that are all equal to the first one."""
     first = slice(0, 1)
     return replace(
         poses,
@@ -325,7 +327,8 @@ def restarting(experiment: Experiment, rng: Rng) -> Experiment:
 
 def torn(experiment: Experiment, rng: Rng) -> Experiment:
     """A mesh whose lower elements share no nodes with the others."""
-    body, cells = experiment.body, np.array(experiment.body.mesh.tetrahedra)
+    body = experiment.body
+    cells = np.array(experiment.body.mesh.tetrahedra)
     points_m = np.array(body.mesh.points_m)
     heights_m = points_m[cells].mean(axis=1)[:, 2]
     low = heights_m < np.median(heights_m)
@@ -374,7 +377,7 @@ TRACK_FAULTS = {
 
 
 def wrenches(change: Callable[[Wrench], Wrench]) -> Change:
-    """Every measured wrench changed."""
+    """Return a change that applies a function to every measured wrench."""
 
     def changed(experiment: Experiment, rng: Rng) -> Experiment:
         grasps = [
@@ -389,7 +392,7 @@ def wrenches(change: Callable[[Wrench], Wrench]) -> Change:
 
 
 def wrench_times(force: float, torque: float) -> Change:
-    """Forces and torques multiplied."""
+    """Return a change that multiplies the measured forces and torques by factors."""
     factors = np.repeat([force, torque], 3)
     return wrenches(lambda w: replace(w, values=factors * w.values))
 
@@ -443,7 +446,7 @@ WRENCH_FAULTS = {
 
 
 def obstacles(change: Callable[[Obstacle], Obstacle]) -> Change:
-    """Every obstacle changed."""
+    """Return a change that applies a function to every obstacle."""
     return lambda e, rng: e.with_obstacles(
         [change(each) for each in e.obstacles]
     )

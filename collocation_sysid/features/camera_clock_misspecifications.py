@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 from ..common.array_types import Array
 from ..program.collocation import ExperimentIterate
 from ..program.depth.camera_alignment import thinned
+from ..program.depth.depth_comparison import camera_residuals
 from ..program.depth.depth_residual import DepthResidual
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ..statistics.misspecification.misspecification_hypothesis import (
@@ -70,7 +71,7 @@ def camera_clock_hypotheses(part: ExperimentIterate) -> Iterator[Hypothesis]:
     simulated or fitted motion; none for cameras with few images.
     """
     name = part.segment.experiment.name
-    for reading in part.segment.depths:
+    for reading in camera_residuals(part.segment):
         times_s = reading.correspondences.camera.depth.sample_times_s
         within = times_s <= reading.observable_s[-1] + 1e-9
         if np.count_nonzero(within) < FEWEST_IMAGES:

@@ -16,6 +16,7 @@ from ..program.collocation import ExperimentIterate
 from ..program.depth.depth_comparison import (
     DepthError,
     SurfaceComparison,
+    camera_residuals,
     depth_residuals,
     outline_distances_px,
     surface_residuals,
@@ -45,6 +46,7 @@ from .measurement_results import (
     FittedExperiment,
     InstrumentMisfit,
     InstrumentPrediction,
+    PictureKind,
     PredictionErrors,
 )
 
@@ -95,7 +97,7 @@ def predict(
                 positions_m=trajectory.positions_m,
                 phi=phi,
             )
-            for reading in segment.depths
+            for reading in camera_residuals(segment)
         }
     }
 
@@ -482,6 +484,16 @@ def _distance_text(error: DepthError) -> str:
 
 DEPTH = Feature(
     "depth",
+    picture_kinds=[
+        PictureKind(
+            "depth",
+            "Points of a depth camera with the outline of the fitted surface, at up to four "
+            "samples, and the distance of each point behind the surface; grey points are not "
+            "compared.",
+            before="shapes",
+            is_leading=True,
+        )
+    ],
     instruments=instruments,
     require_valid=require_depth_units,
     predict=predict,

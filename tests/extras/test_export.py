@@ -1447,7 +1447,7 @@ def test_sofa_gets_planes_and_balls_and_says_what_else_there_is(tmp_path):
         "not_expressed"
     ]
     for said in (
-        "it 0: contact is without friction",
+        "it 0: friction is not exported",
         "it 2: an obstacle of the kind",
         "it 4: an obstacle of the kind",
     ):

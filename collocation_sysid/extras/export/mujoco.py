@@ -55,7 +55,7 @@ CAPABILITIES = TargetCapabilities(
     damping_law="material",
     has_moving_grasps=True,
     has_rounded_edges=False,
-    has_contact_faces=False,
+    has_face_selection=False,
 )
 
 

@@ -1,4 +1,4 @@
-"""What a user waits for."""
+"""Waiting times of commands at the terminal."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ class Commands:
             }
 
     def track_first_solve_s(self, times: dict[str, Waited]) -> float:
-        """Of a fresh installation."""
+        """Wall time of the first solve of an installation, kernels included [s]."""
         return times["first solve"].wall_s
 
     def track_solve_s(self, times: dict[str, Waited]) -> float:
-        """Warm."""
+        """Wall time of a solve with compiled kernels [s]."""
         return times["solve"].wall_s
 
     def track_first_text_of_solve_s(self, times: dict[str, Waited]) -> float:
-        """Warm."""
+        """Time to the first text of a solve with compiled kernels [s]."""
         return times["solve"].first_s
 
     def track_help_processor_s(self, times: dict[str, Waited]) -> float:
-        """Processor time."""
+        """Processor time of the help text [s]."""
         return times["help"].processor_s
