@@ -195,7 +195,7 @@ class _MotionComparison:
                 data={
                     "by_ms": 1e3 * abs(lag_s),
                     "when": "late" if lag_s > 0 else "early",
-                    "do": "subtract" if lag_s > 0 else "add",
+                    "do": "subtract this from" if lag_s > 0 else "add this to",
                 },
                 corrected=ImageTimes(stated.images[covered], times_s[covered]),
             )

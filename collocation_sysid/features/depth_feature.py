@@ -61,6 +61,15 @@ OUTLINE_SHARE = 0.1
 # RMS distance of depth points in standard deviations up to which there is nothing to explain: noise
 # along the normal is rarely known better.
 LARGEST_NOISE = 1.5
+# Excluded points in notes, by the reason for which they are not compared.
+EXCLUSION_WORDS = {
+    "far": "farther from the body than gate_m",
+    "grazing": "on faces seen at a grazing angle",
+    "turned away": "on faces turned away from the camera",
+    "not chosen": "on faces that are not selected",
+    "hidden": "on hidden faces",
+    "crease": "near a crease",
+}
 # Most nodes of a body whose equilibria for many stiffnesses take seconds.
 NODES = 2000
 
@@ -415,11 +424,11 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
         distance_m = reading.signed_distances_m(observation, part.phi)
         correspondences = reading.correspondences
         excluded = ", ".join(
-            f"{count} {why}"
+            f"{count} {EXCLUSION_WORDS[why]}"
             for why, count in correspondences.excluded_counts.items()
             if count
         )
-        distances = "are compared, because none is near enough to the body"
+        distances = "are compared, because no point is near enough to the body"
         if correspondences.is_compared.any():
             distances = (
                 f"deviate from the surface by {1e3 * np.sqrt(np.nanmean(distance_m**2)):.3g} "
@@ -464,7 +473,7 @@ def _distance_text(error: DepthError) -> str:
     if error.rms_m is None:
         return "no point near the body"
     sentence = f"{1e3 * error.rms_m:.3g} mm RMS of {error.points} points"
-    gate = f"the gate of {1e3 * error.gate_m:.3g} mm"
+    gate = f"the limit of {1e3 * error.gate_m:.3g} mm (gate_m)"
     if not error.share_beyond_gate:
         return f"{sentence}, all within {gate}"
     beyond = f"{sentence}, {error.share_beyond_gate:.0%} beyond {gate}"

@@ -221,6 +221,6 @@ class DepthSection(MeasurementSection):
             else np.array(t_s, dtype=float).ravel()
         )
         if len(times) != count:
-            message = f"found {len(times)} times for {count} images or clouds; expected as many"
+            message = f"found {len(times)} times for {count} images or clouds; expected one time for each"
             raise InputError(message, where=f"{where}.t_s")
         return content, times

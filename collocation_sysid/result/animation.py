@@ -219,7 +219,8 @@ def experiment_named(
     available = {replay.name: replay for replay in replays if replay.has_shapes}
     if not available:
         raise InputError(
-            "no experiment of this run has a stored motion of a body; expected one with a mesh",
+            "no experiment of this run has a stored motion of a body with a mesh; expected a run "
+            "with such an experiment",
             run,
         )
     if experiment is None:

@@ -146,7 +146,8 @@ def test_a_law_that_leaves_something_else_is_refused_in_words():
     ):
         cs.NodeForce.from_law(pull, carries=3)
     with pytest.raises(
-        InputError, match="returns three forces and the new internal variables"
+        InputError,
+        match="returns the three components of a force, and of the new internal",
     ):
         cs.NodeForce.from_law(
             lambda x, v, before, at, pull_n: -pull_n * x, carries=2, name="pull"
@@ -219,11 +220,13 @@ def test_a_strut_from_a_file_is_the_one_from_python(strutted):
             ("carries = 6", "carries = 4"),
             "force 'maxwell' returns 6 internal variables; expected 4",
         ),
-        (("carries = 6\n", ""), "force 'maxwell' has an argument before `at`"),
+        (
+            ("carries = 6\n", ""),
+            "force 'maxwell': the function has an argument between v and `at`",
+        ),
         (
             ('"maxwell"', '"made"'),
-            "object.force.0.carries: found 6, but the number of internal "
-            "variables of the force 'made' is",
+            "object.force.0.carries: found 6, but the force 'made' has ",
         ),
     ],
 )
