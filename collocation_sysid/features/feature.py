@@ -106,6 +106,9 @@ class Feature:
         Topics of concerns that only this feature has, with their messages, by key.
     messages : mapping of str to str
         Messages of its concerns of general topics, by code.
+    captions : mapping of str to str
+        Captions of pictures that show its measurements beside the fit and lead a report, by the
+        beginning of their file names.
     instruments : callable
         ``instruments(experiment)``: texts of what the feature measures in a recording.
     require_valid : callable
@@ -189,6 +192,7 @@ class Feature:
     name: str
     topics: Mapping[str, Topic] = field(default_factory=dict)
     messages: Mapping[str, str] = field(default_factory=dict)
+    captions: Mapping[str, str] = field(default_factory=dict)
     instruments: Callable[[Experiment], Iterable[str]] = _nothing
     require_valid: Callable[[Experiment], object] = _nothing
     predict: Callable[[Transcription, Trajectory, Array], Fields] = _no_fields

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..common.display import Picture, own_pictures
+from ..features.registry import FEATURES, merged_fields
 
+# Captions of pictures that features declare.
+FEATURE_CAPTIONS = merged_fields(each.captions for each in FEATURES)
 # Captions of the pictures in the order of a report, by the beginning of their file names.
 PICTURE_CAPTIONS = {
-    "depth": "Points of a depth camera with the outline of the fitted surface, at up to four "
-    "samples, and the distance of each point behind the surface; grey points are not compared.",
+    **FEATURE_CAPTIONS,
     "shapes": "The fitted body at several times of the recording; orange: measured markers.",
     "field": "Spatially varying constant between the ends of its 95 % interval; below, a cut "
     "through the body. Pale colours: the data add little to the prior.",
@@ -32,7 +34,7 @@ PICTURE_CAPTIONS = {
     "jacobian": "Structure of the constraints' Jacobian.",
 }
 # Pictures that show measurement and fit, one of which leads the page.
-LEADING_PICTURES = ("tracks", "wrench", "reading", "depth")
+LEADING_PICTURES = ("tracks", "wrench", "reading", *FEATURE_CAPTIONS)
 
 
 def captioned_pictures(run: Path) -> list[Picture]:
