@@ -30,7 +30,11 @@ from ..statistics.misspecification.obstacle_misspecifications import (
 )
 from ..statistics.misspecification.placement_causes import placement_mistakes
 from .feature import Feature
-from .measurement_results import FittedExperiment, InstrumentPrediction
+from .measurement_results import (
+    FittedExperiment,
+    InstrumentPrediction,
+    PictureKind,
+)
 
 # Number of faces below which the mesh determines the width of a contact.
 FEWEST_FACES = 4.0
@@ -230,6 +234,16 @@ def fit_lines(
 
 CONTACT = Feature(
     "contact",
+    picture_kinds=[
+        PictureKind(
+            "pressure", "Pressure of obstacles on the body.", before="tracks"
+        ),
+        PictureKind(
+            "gap",
+            "Gap between the body's surface and obstacles.",
+            before="tracks",
+        ),
+    ],
     topics=TOPICS,
     messages=MESSAGES,
     hypotheses=hypotheses,

@@ -23,6 +23,7 @@ from .measurement_results import (
     FittedExperiment,
     InstrumentMisfit,
     InstrumentPrediction,
+    PictureKind,
     PredictionErrors,
     PredictionResiduals,
     SensorSeries,
@@ -306,6 +307,14 @@ def _unit_text(units: Units, reading: str) -> str:
 
 CUSTOM_SENSORS = Feature(
     "custom sensors",
+    picture_kinds=[
+        PictureKind(
+            "reading",
+            "Custom sensor: measured, fitted and simulated.",
+            before="error",
+            is_leading=True,
+        )
+    ],
     instruments=instruments,
     predict=predict,
     copied=copied,

@@ -49,6 +49,7 @@ from .measurement_results import (
     FittedExperiment,
     InstrumentMisfit,
     InstrumentPrediction,
+    PictureKind,
     PredictionErrors,
 )
 
@@ -495,10 +496,16 @@ DEPTH = Feature(
         **MESSAGES_OF_IMAGES,
         **MESSAGES_OF_TIMES,
     },
-    captions={
-        "depth": "Points of a depth camera with the outline of the fitted surface, at up to four "
-        "samples, and the distance of each point behind the surface; grey points are not compared.",
-    },
+    picture_kinds=[
+        PictureKind(
+            "depth",
+            "Points of a depth camera with the outline of the fitted surface, at up to four "
+            "samples, and the distance of each point behind the surface; grey points are not "
+            "compared.",
+            before="shapes",
+            is_leading=True,
+        )
+    ],
     instruments=instruments,
     require_valid=require_depth_units,
     predict=predict,

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
+from pathlib import Path
 from typing import Any
 
 from ..common.array_types import Array
@@ -26,9 +27,11 @@ from .measurement_results import (
     FittedExperiment,
     InstrumentMisfit,
     InstrumentPrediction,
+    PictureKind,
     PredictionErrors,
     PredictionResiduals,
     SensorSeries,
+    SeriesKind,
 )
 
 Fields = Mapping[str, Any]
@@ -106,9 +109,11 @@ class Feature:
         Topics of concerns that only this feature has, with their messages, by key.
     messages : mapping of str to str
         Messages of its concerns of general topics, by code.
-    captions : mapping of str to str
-        Captions of pictures that show its measurements beside the fit and lead a report, by the
-        beginning of their file names.
+    picture_kinds : sequence of PictureKind
+        Captions of its pictures; a kind stands before a general one or one of an earlier feature.
+    series_kind : SeriesKind, optional
+        Numbers of its sensors over time, if all of them measure the same; `recorded` then has them
+        as "sensor_columns" by the name of the kind.
     instruments : callable
         ``instruments(experiment)``: texts of what the feature measures in a recording.
     require_valid : callable
@@ -165,6 +170,13 @@ class Feature:
         ``live_limitations(experiment)``: parts of an experiment that live estimation does not
         support, each as its description, a value that is true if the experiment has it, and the
         supported alternative.
+    write_predicted : callable
+        ``write_predicted(experiment, trajectory, folder)`` writes predicted measurements of an
+        experiment as files of a problem.
+    read_predicted : callable
+        ``read_predicted(table)`` modifies the table of an experiment in a problem file, in place,
+        so that it reads these files beside the problem file; the table is unchanged without such
+        measurements.
     prediction_residuals : callable
         ``prediction_residuals(experiment, trajectory, predicted)``: differences by which a
         prediction is judged in a comparison of models; None without such measurements. Of several
@@ -192,7 +204,8 @@ class Feature:
     name: str
     topics: Mapping[str, Topic] = field(default_factory=dict)
     messages: Mapping[str, str] = field(default_factory=dict)
-    captions: Mapping[str, str] = field(default_factory=dict)
+    picture_kinds: Sequence[PictureKind] = ()
+    series_kind: SeriesKind | None = None
     instruments: Callable[[Experiment], Iterable[str]] = _nothing
     require_valid: Callable[[Experiment], object] = _nothing
     predict: Callable[[Transcription, Trajectory, Array], Fields] = _no_fields
@@ -238,6 +251,8 @@ class Feature:
     live_limitations: Callable[
         [Experiment], Iterable[tuple[str, object, str]]
     ] = _nothing
+    write_predicted: Callable[[Experiment, Trajectory, Path], object] = _nothing
+    read_predicted: Callable[[dict[str, Any]], object] = _nothing
     prediction_residuals: Callable[
         [Experiment, Trajectory, InstrumentPrediction],
         PredictionResiduals | None,

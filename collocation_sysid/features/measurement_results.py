@@ -279,6 +279,53 @@ class SensorSeries:
     units: Sequence[str] = ()
 
 
+@dataclass(frozen=True)
+class SeriesKind:
+    """Numbers that all sensors of one kind measure over time.
+
+    Attributes
+    ----------
+    name : str
+        Name of the kind, with which names of pictures and stored arrays begin.
+    number_names : sequence of m str
+        Names of the numbers.
+    units : sequence of m str
+        Their units.
+    """
+
+    name: str
+    number_names: Sequence[str]
+    units: Sequence[str]
+
+    def series(self, number: int, columns: Array) -> SensorSeries:
+        """Return the series of one sensor; number and columns are those of `SensorSeries`."""
+        return SensorSeries(
+            self.name, number, columns, self.number_names, units=self.units
+        )
+
+
+@dataclass(frozen=True)
+class PictureKind:
+    """Pictures of one kind in the report of a run.
+
+    Attributes
+    ----------
+    name : str
+        Beginning of the names of their files.
+    caption : str
+        Caption.
+    before : str
+        Name of the kind before which they stand in a report.
+    is_leading : bool
+        Whether they show measurement and fit, so that one of them may lead the report.
+    """
+
+    name: str
+    caption: str
+    before: str
+    is_leading: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class PredictionResiduals:
     """Differences by which a prediction of held-out measurements is judged, predicted less measured.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from ..program.collocation import ExperimentIterate
 from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
 from ..program.wrench_residual import predict_wrenches
+from ..recording import write_wrench_csv
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import COMPONENTS, UNITS
 from ..statistics.assessment import forward_simulation_concerns
@@ -28,9 +30,11 @@ from .measurement_results import (
     FittedExperiment,
     InstrumentMisfit,
     InstrumentPrediction,
+    PictureKind,
     PredictionErrors,
     PredictionResiduals,
     SensorSeries,
+    SeriesKind,
     comparison_columns,
     misfit,
 )
@@ -44,6 +48,11 @@ from .wrench_causes import (
 
 # Longest fit of the first samples to the markers that needs no request [s].
 LONGEST_FIT_S = 10.0
+# File of a predicted wrench.
+PREDICTED_FILE = "predicted_wrench.csv"
+# Keys of a wrench that describe its file.
+KEYS_OF_FILE = ("columns", "axis", "sign", "area_m2", "symmetry")
+SERIES_KIND = SeriesKind("wrench", COMPONENTS, units=UNITS)
 
 
 def instruments(experiment: Experiment) -> list[str]:
@@ -183,7 +192,8 @@ def recorded(
     predicted: InstrumentPrediction | None,
     _: Array,
 ) -> dict[str, Any]:
-    """Return an array (S, 19) for each sensor: time, and the wrench measured, fitted and simulated.
+    """Return an array (S, 19) for each sensor: time [s], and the wrench measured, fitted and
+    simulated.
 
     The wrenches are those of the whole specimen also where symmetry reduces the model to a part of
     it. NaN where the experiment was not fitted or not simulated.
@@ -197,7 +207,7 @@ def recorded(
         columns = comparison_columns(sensor.t_s, sensor.values, *models)
         columns[:, 1:] *= sensor.symmetry
         series.append(columns)
-    return {"wrenches": series}
+    return {"sensor_columns": {SERIES_KIND.name: series}}
 
 
 def simulated_series(
@@ -208,7 +218,41 @@ def simulated_series(
     for k, (sensor, simulated) in enumerate(pairs, 1):
         columns = comparison_columns(sensor.t_s, sensor.values, None, simulated)
         columns[:, 1:] *= sensor.symmetry
-        yield SensorSeries("wrench", k, columns, COMPONENTS, units=UNITS)
+        yield SERIES_KIND.series(k, columns)
+
+
+def write_predicted(
+    experiment: Experiment, trajectory: Trajectory, folder: Path
+) -> None:
+    """Write the predicted wrench into a folder; the experiment has at most one sensor."""
+    for sensor, wrench in zip(
+        experiment.wrenches, trajectory.wrenches, strict=True
+    ):
+        write_wrench_csv(folder / PREDICTED_FILE, sensor.t_s, values=wrench)
+
+
+def read_predicted(table: dict[str, Any]) -> None:
+    """Let the table of an experiment read the predicted wrench, in place, if its first grasp has a
+    sensor: in newtons and for the modelled part of the body.
+
+    The keys of the original file (`KEYS_OF_FILE`), among them its columns and "symmetry", are left
+    out; `sigma_n` and `sigma_nm` are divided by "symmetry".
+    """
+    grasps = table["grasp"]
+    grasp = grasps[0] if isinstance(grasps, list) else grasps
+    if "wrench" not in grasp:
+        return
+    wrench = grasp["wrench"]
+    parts = wrench.get("symmetry", 1)
+    sigmas = {
+        key: wrench[key] / parts
+        for key in ("sigma_n", "sigma_nm")
+        if key in wrench
+    }
+    remaining = {
+        key: value for key, value in wrench.items() if key not in KEYS_OF_FILE
+    }
+    grasp["wrench"] = remaining | sigmas | {"file": PREDICTED_FILE}
 
 
 def prediction_residuals(
@@ -309,6 +353,15 @@ def _forces_text(*sizes: float | None) -> str:
 WRENCH = Feature(
     "wrench",
     messages={**MESSAGES, **MESSAGE_OF_OFFSET},
+    picture_kinds=[
+        PictureKind(
+            "wrench",
+            "Wrench of a grasp: measured, fitted and simulated.",
+            before="error",
+            is_leading=True,
+        )
+    ],
+    series_kind=SERIES_KIND,
     instruments=instruments,
     predict=predict,
     copied=copied,
@@ -322,6 +375,8 @@ WRENCH = Feature(
     validation_concerns=validation_concerns,
     recorded=recorded,
     simulated_series=simulated_series,
+    write_predicted=write_predicted,
+    read_predicted=read_predicted,
     prediction_residuals=prediction_residuals,
     fit_rms=fit_rms,
     fit_fields=fit_fields,

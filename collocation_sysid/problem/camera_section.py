@@ -31,21 +31,22 @@ from .named_files import existing_file
 
 
 class DepthCameraSection(Section):
-    """A depth camera, or the frame of a scanner; keys that an .npz or a log contains may be left
-    out.
+    """A depth camera, or the frame of a scanner; keys that an .npz or a log contains may be
+    omitted.
 
     Attributes
     ----------
     matrix : list, optional
-        Pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs none; with it
-        a bias and a scale of the depth are estimated, and surfaces that face away are left out.
+        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs
+        no matrix; if it has one, an offset and a scale error of the depth are estimated, and
+        surfaces that face away from the camera are not used.
     distortion : list
         k1, k2, p1, p2, k3 of the model of Brown and Conrady.
     pose : list, optional
-        From the camera's frame to the world, or, with `poses`, to the frame that these move
-        (hand–eye transform).
+        Transform from the frame of the camera to the world or, with `poses`, to the frame whose
+        poses these are (hand–eye transform).
     poses : str, optional
-        File of poses of the body that carries the camera; it is at rest by default.
+        File of poses of the rigid body that carries the camera; by default the camera is at rest.
     """
 
     matrix: tuple[Vector, Vector, Vector] | None = None
@@ -64,11 +65,11 @@ class DepthSection(MeasurementSection):
     sigma_m : float
         Standard deviation of the noise along the normal of the surface.
     spacing_m : float
-        Points are thinned to about this distance, as the noise of neighbouring pixels is
-        correlated.
+        Approximate distance to which the points are thinned, because the noise of neighbouring
+        pixels is correlated.
     gate_m : float
-        Points farther than this from the surface are taken to belong to something else and are left
-        out.
+        Distance from the surface beyond which points are assumed to belong to other objects and are
+        not used.
     faces : Nodes, optional
         Faces that may be visible: those whose corners are all selected. All by default.
     background : {"auto", "empty", "unknown"}
@@ -93,7 +94,7 @@ class DepthSection(MeasurementSection):
     count_m : float, optional
         Depth of one count of an image, 0.001 by default.
     length_unit : {"m", "cm", "mm", "in"}
-        Unit of clouds.
+        Unit of the coordinates of clouds.
     """
 
     name: Annotated[str, AfterValidator(require_file_name)] = "depth"

@@ -69,20 +69,22 @@ class Gauge(SeparateSensor):
         Measured values; NaN where missing. None before they are measured or simulated: such a
         sensor can be simulated, but a problem that contains it cannot be solved.
     sigma : float
-        Standard deviation of the noise of each number, in its unit.
+        Standard deviation of the noise of each measured number, in the unit of that number.
     points_m : (P, 3) array, optional
-        Places [x, y, z] on the undeformed body whose motion the sensor measures.
+        Points [x, y, z] on the undeformed body whose motion the sensor measures.
     unknowns : mapping of name to float
-        Prior standard deviation of each unknown of the sensor, about zero, by the argument's name;
-        none by default. Write an unknown factor as ``1 + gain``. In a simulation unknowns are zero.
+        Prior standard deviation of each unknown of the sensor, by the name of the argument of the
+        function; no unknowns by default. The prior mean is zero: write an unknown factor as ``1 +
+        gain``. In a simulation all unknowns are zero.
     grasp : int, optional
         In place of points: the number of the grasp, counted from 1, whose force and torque the
         sensor measures; obstacles count after the grasps.
     frame : {"grasp", "world"}
-        Axes and origin of force and torque: those of the undeformed body as the grasp carries it,
-        or the poses' world.
+        Axes and origin of force and torque. "grasp": those of the undeformed body, which move with
+        the grasp. "world": those of the world frame of the poses.
     columns : sequence of str, optional
-        Columns of the numbers in the file, in their order; all besides t_s by default.
+        Columns of the file with the measured numbers, in the order in which the function returns
+        them; by default all except t_s.
     unit : str
         Unit of the numbers, for the terminal, reports and figures.
 

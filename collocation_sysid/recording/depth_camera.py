@@ -56,13 +56,14 @@ class DepthCamera:
     Parameters
     ----------
     matrix : (3, 3) array, optional
-        Pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs none; with it
-        a bias and a scale of the depth are estimated, and surfaces that face away are left out.
+        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs
+        no matrix; if it has one, an offset and a scale error of the depth are estimated, and
+        surfaces that face away from the camera are not used.
     distortion : sequence of up to five numbers
         k1, k2, p1, p2, k3 of the model of Brown and Conrady.
     pose : (4, 4) array
-        From the camera's frame to the world, or, with `poses`, to the frame that these move
-        (hand–eye transform).
+        Transform from the frame of the camera to the world or, with `poses`, to the frame whose
+        poses these are (hand–eye transform).
     poses : PoseSequence, optional
         Motion of the frame that carries the camera; at rest by default.
 
@@ -217,11 +218,11 @@ class Depth(SeparateSensor):
         Standard deviation of the noise along the normal of the surface.
     camera : DepthCamera
     spacing_m : float
-        Points are thinned to about this distance, as the noise of neighbouring pixels is
-        correlated.
+        Approximate distance to which the points are thinned, because the noise of neighbouring
+        pixels is correlated.
     gate_m : float
-        Points farther than this from the surface are taken to belong to something else and are left
-        out.
+        Distance from the surface beyond which points are assumed to belong to other objects and are
+        not used.
     faces : Selection, optional
         Faces that may be visible: those whose corners are all selected. All by default.
     background : {"auto", "empty", "unknown"}

@@ -80,17 +80,18 @@ class Experiment:
     name : str
         For messages and reports; experiments of one problem have different names.
     kind : {"dynamic", "static"}
-        A motion ("dynamic"); or samples each of which is an equilibrium of its own ("static"), at
-        any times (with memory, quasi-static in time).
+        "dynamic": a motion. "static": each sample is an equilibrium, and a material with memory
+        relaxes between the samples.
     start : {"equilibrium", "undeformed", "given"}
         State at the first time: at rest under its loads; undeformed and at rest; or as given.
     start_rule : {"standard", "paper"}
-        Inertia of the first step: from the starting velocity, or zero acceleration.
+        Inertia in the first time step. "standard": from the initial velocity. "paper": zero
+        acceleration.
     start_positions_m, start_velocities_m_s : (n, 3) arrays, optional
         The state for "given"; at rest if the velocities are left out.
     loaded_since_s : float
-        How long a body with memory has been in the shape of its equilibrium; by default it has
-        relaxed completely.
+        How long a body with memory has been in the shape of its initial equilibrium [s]; by default
+        the material is completely relaxed.
     validation : bool
         Whether the recording is only predicted, not fitted.
     frames_fault : str

@@ -1070,7 +1070,7 @@ OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n")
 
 @dataclass(frozen=True, kw_only=True)
 class Assumptions(Options):
-    """Standard deviations of systematic effects; "none" for what is exact.
+    """Standard deviations of systematic effects; "none" for an effect that is exactly zero.
 
     An effect that is known to exist, such as the compliance of a machine, has a table of mean and
     deviation. Nuisance parameters of recordings, by their names, count if they are not estimated.
@@ -1127,11 +1127,12 @@ class Assumptions(Options):
     calibration_scale
         Scale error of all lengths that the cameras measure: the factor minus one [1].
     calibration_distortion_1_m2
-        Radial distortion of first order about the body's middle: a factor 1 + k r² [1/m²].
+        Coefficient k of a radial distortion by the cameras: distances r from the middle of the body
+        are multiplied by 1 + k r² [1/m²].
     time_shift_s
-        How much later than stated the markers were measured, on the grasps' clock [s].
+        How much later than stated the markers were measured, by the clock of the grasps [s].
     clock_rate
-        How much slower than the grasps' clock that of the markers runs [1].
+        How much slower the clock of the markers runs than the clock of the grasps [1].
     pose_turn_rad
         A constant rotation of grasps and body in the cameras' frame, which rotates gravity in the
         body's frame [rad].
@@ -1142,17 +1143,18 @@ class Assumptions(Options):
     hand_eye_rad
         A constant rotation of the body in its grasps [rad].
     hand_eye_m
-        A constant translation of the body in its grasps; both if the start is an equilibrium and
-        markers measure it [m].
+        A constant translation of the body in its grasps; rotation and translation are estimated if
+        the start is an equilibrium and there are markers [m].
     strain_zero
         A constant offset of the strains of a specimen [1].
     displacement_zero_m
-        A constant offset of each displacement along each of its axes [m].
+        A constant offset of each prescribed displacement along each of its axes [m].
     obstacle_offset_m
-        A constant offset of each obstacle along its normal, or along the axis of its displacement,
-        which changes when it touches the body [m].
+        A constant offset of each obstacle along its normal, or along the axis of its displacement;
+        it changes the time at which the obstacle touches the body [m].
     obstacle_tilt_rad
-        A constant tilt of each obstacle that is a plane or a box, about its point or middle [rad].
+        A constant tilt of each obstacle that is a plane or a box, about the point of the plane or
+        the middle of the box [rad].
     obstacle_time_s
         Delay of each obstacle's motion, to first order [s].
     tension_factor
@@ -1162,35 +1164,36 @@ class Assumptions(Options):
     pressure_factor
         Scale error of each pressure: the factor minus one [1].
     pressure_lost_pa
-        Offset by which each pressure is lower than stated [Pa].
+        Amount by which each pressure is lower than stated [Pa].
     pressure_lag
-        Lag of each pressure: the logarithm of its ratio to the stated lag_s [1].
+        Logarithm of the ratio of the true lag of each pressure to the stated lag_s [1].
     joining_s
-        Delay with which each point mass or force begins or ends, if it does so within the recording
-        [s].
+        Delay of the time at which each point mass or force begins or ends, if this time is within
+        the recording [s].
     tare
         A constant offset of each component of a force sensor, in multiples of its sigma [σ].
     sensor_time_s
-        Delay of the force sensors; at most three standard deviations [s].
+        Delay of the force sensors, limited to three standard deviations of its prior [s].
     sensor_lag_s
-        Time constant of a first-order low-pass in the sensor; between zero and three
-        standard deviations of its prior [s].
+        Time constant of a first-order low-pass in the sensor, limited to values between zero and
+        three standard deviations of its prior [s].
     tool_kg
         Mass of the tool between a sensor and the body [kg].
     tool_m
-        Centre of the tool relative to the sensor's point; in the world's frame, relative to that of
-        the grasped nodes [m].
+        Centre of the tool relative to the point of the sensor; in the frame of the world, relative
+        to the centre of the grasped nodes [m].
     depth_turn_rad
-        Rotation of each depth camera about the middle of the body, along the camera's axes [rad].
+        Rotation of each depth camera about the middle of the body, stated along the axes of the
+        camera [rad].
     depth_shift_m
-        Translation of each depth camera; if neither is given, the first image is first aligned with
-        the body [m].
+        Translation of each depth camera; if neither prior is stated, the search begins by aligning
+        the first image with the body [m].
     depth_bias_m
         Offset that is added to each depth of an image [m].
     depth_scale
         Scale error of each depth of an image: the factor minus one [1].
     depth_time_s
-        Delay of a depth camera; at most three standard deviations [s].
+        Delay of a depth camera, limited to three standard deviations of its prior [s].
     depth_edge_px
         Distance by which silhouettes in the images of each depth camera end inside the outline of
         the body, in pixels [px].
