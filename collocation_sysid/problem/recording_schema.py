@@ -26,7 +26,7 @@ from ..recording.node_selection import Nodes
 from ..recording.placement import AttachmentRule
 from ..recording.poses import Frame
 from ..recording.solid_sections import SolidSection
-from .depth_section import DepthSection
+from .camera_section import DepthSection
 from .load_schema import (
     ForceSection,
     PointMassSection,
