@@ -146,8 +146,8 @@ class ForceSensorSection(TableSection):
         Axes of the components. "world": those of the world frame of the poses. "grasp": those of
         the undeformed body, which move with the grasp.
     point_m : list
-        Point [x, y, z] about which the torque is measured. In the frame "world" it is fixed; in the
-        frame "grasp" it is stated on the undeformed body and moves with the grasp.
+        Point [x, y, z] about which the torque is measured; it is fixed in the frame "world", and in
+        the frame "grasp" it is stated on the undeformed body and moves with the grasp.
     sensor_frame : str, optional
         Frame of the log in which the sensor measures, instead of frame and point_m. The static
         transforms of the log rotate the components to the axes of the body or of the world, and
@@ -549,8 +549,8 @@ class DepthCameraSection(Section):
     Attributes
     ----------
     matrix : list, optional
-        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs
-        no matrix; if it has one, an offset and a scale error of the depth are estimated, and
+        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels; a cloud needs
+        no matrix. If a cloud has one, an offset and a scale error of the depth are estimated, and
         surfaces that face away from the camera are not used.
     distortion : list
         k1, k2, p1, p2, k3 of the model of Brown and Conrady.
