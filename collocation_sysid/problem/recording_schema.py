@@ -19,7 +19,6 @@ from ..common.validated_types import (
     Positive,
     Text,
 )
-from ..recording.depth_camera import Background, PoseMatrix
 from ..recording.experiment import EARTH_M_S2, Kind, StartRule
 from ..recording.grasp import Axes
 from ..recording.markers import Places
@@ -27,13 +26,18 @@ from ..recording.node_selection import Nodes
 from ..recording.placement import AttachmentRule
 from ..recording.poses import Frame
 from ..recording.solid_sections import SolidSection
+from .depth_section import DepthSection
 from .load_schema import (
     ForceSection,
     PointMassSection,
     PressureSection,
     TendonSection,
 )
+from .measurement_section import MeasurementSection, NamedSection
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
+
+# Fields of `Experiment` by the key of the tables that read themselves.
+MEASUREMENT_TABLES = {"depth": "depths"}
 
 
 class TransformSection(Section):
@@ -470,29 +474,7 @@ class MarkersSection(Section):
         return self
 
 
-def _require_file_name(name: str) -> str:
-    r"""Return a name unchanged if it can be part of a file name on every platform: printable, not
-    empty, no leading dot, and none of / \ : * ? " < > |; raise `ValueError` otherwise.
-    """
-    if (
-        not name.isprintable()
-        or name[:1] in ("", ".")
-        or any(mark in name for mark in '/\\:*?"<>|')
-    ):
-        raise ValueError(
-            f"found {name!r}; expected a valid file name: not empty, no leading dot, none of / \\ "
-            ': * ? " < > |'
-        )
-    return name
-
-
 Grasps = Annotated[list[GraspSection] | GraspSection, ByForm(list)]
-
-
-class NamedSection(Section):
-    """Table with a name that is also part of file names."""
-
-    name: Annotated[str, AfterValidator(_require_file_name)]
 
 
 class ReadingSection(NamedSection):
@@ -540,89 +522,6 @@ class ReadingSection(NamedSection):
     code: Text
     function: Text
     file: Text | None = None
-
-
-class DepthCameraSection(Section):
-    """A depth camera, or the frame of a scanner; keys that an .npz or a log contains may be
-    omitted.
-
-    Attributes
-    ----------
-    matrix : list, optional
-        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels; a cloud needs
-        no matrix. If a cloud has one, an offset and a scale error of the depth are estimated, and
-        surfaces that face away from the camera are not used.
-    distortion : list
-        k1, k2, p1, p2, k3 of the model of Brown and Conrady.
-    pose : list, optional
-        Transform from the frame of the camera to the world or, with `poses`, to the frame whose
-        poses these are (hand–eye transform).
-    poses : str, optional
-        File of poses of the rigid body that carries the camera; by default the camera is at rest.
-    """
-
-    matrix: tuple[Vector, Vector, Vector] | None = None
-    distortion: list[Finite] = Field([])
-    pose: PoseMatrix | None = None
-    poses: Text | None = None
-
-
-class DepthSection(NamedSection):
-    """Depth images or point clouds of the body from a camera or a scanner, without labels.
-
-    Attributes
-    ----------
-    name : str
-        Name in messages, error bars and pictures.
-    sigma_m : float
-        Standard deviation of the noise along the normal of the surface.
-    spacing_m : float
-        Approximate distance to which the points are thinned, because the noise of neighbouring
-        pixels is correlated.
-    gate_m : float
-        Distance from the surface beyond which points are assumed to belong to other objects and are
-        not used.
-    faces : Nodes, optional
-        Faces that may be visible: those whose corners are all selected. All by default.
-    background : {"auto", "empty", "unknown"}
-        Meaning of a pixel without a depth. "empty": nothing is there, so that the body cannot be
-        there. "unknown": anything may be there, as where the sensor gets no echo from dark or steep
-        surfaces. "auto": "empty" in images where hardly any pixel shows something far behind the
-        body, otherwise "unknown". A measured depth well behind the body shows in either case that
-        the body is not there.
-    outline_sigma_px : float
-        Standard deviation [pixels] of the distance between the body's outline and the edge of its
-        silhouette in an image, at points of the outline that are `spacing_m` apart. Rounding to
-        pixels alone gives 0.3.
-    file : str
-        Depth images (.npz, .png of 16 bits, .exr) or clouds of points (.ply, .pcd, .npy, .xyz), or
-        a folder of these in the order of their names, with times.csv or t_s; or a topic of a log,
-        ``run.mcap#/camera/depth/image_rect_raw``.
-    camera : DepthCameraSection
-        Pose and projection of the camera.
-    t_s : list of float, optional
-        Times [s], if the file does not contain them; a single image is assigned to the first sample
-        by default.
-    count_m : float, optional
-        Depth of one count of an image, 0.001 by default.
-    length_unit : {"m", "cm", "mm", "in"}
-        Unit of the coordinates of clouds.
-    """
-
-    name: Annotated[str, AfterValidator(_require_file_name)] = "depth"
-    sigma_m: Positive
-    spacing_m: Positive = 0.004
-    gate_m: Positive = 0.01
-    faces: Nodes | None = None
-    background: Background = "auto"
-    outline_sigma_px: Positive = 0.5
-    file: Text
-    camera: DepthCameraSection = Field(
-        default_factory=lambda: DepthCameraSection.model_construct()
-    )
-    t_s: list[Finite] | None = None
-    count_m: Positive | None = None
-    length_unit: Unit = "m"
 
 
 class ExperimentSection(NamedSection):
@@ -722,12 +621,15 @@ class ExperimentSection(NamedSection):
 
     @property
     def measurement_files(self) -> list[str | None]:
-        """Files of markers, custom sensors, depth cameras, grasps and obstacles; None for those
-        that are not named.
-        """
+        """Files of markers, sensors, grasps and obstacles; None for those that are not named."""
         names = [
             self.markers.file,
-            *(each.file for each in (*self.reading, *self.depth)),
+            *(each.file for each in self.reading),
+            *(
+                each.file
+                for key in MEASUREMENT_TABLES
+                for each in getattr(self, key)
+            ),
         ]
         for grasp in self.moved_sections:
             names += [
@@ -735,6 +637,12 @@ class ExperimentSection(NamedSection):
                 self.file_of(grasp.sensor),
             ]
         return names
+
+    @property
+    def measurement_tables(self) -> dict[str, list[MeasurementSection]]:
+        """Tables that read themselves by their key, of those keys that have any."""
+        tables = {key: getattr(self, key) for key in MEASUREMENT_TABLES}
+        return {key: listed for key, listed in tables.items() if listed}
 
     @property
     def grasp_list(self) -> list[GraspSection]:

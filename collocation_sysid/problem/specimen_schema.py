@@ -17,7 +17,7 @@ from ..common.validated_types import (
 )
 from ..recording.homogeneous_deformation import TESTS
 from ..recording.specimen import AREA_ERROR, LATERAL_SIGMA, STRAIN_ZERO
-from .recording_schema import NamedSection
+from .measurement_section import NamedSection
 
 Prior = Annotated[Literal["none"] | Positive, ByForm(str)]
 

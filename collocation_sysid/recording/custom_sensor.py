@@ -5,7 +5,7 @@ force.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, cast
 
 import casadi as ca
@@ -21,6 +21,7 @@ from ..errors import InputError
 from .checked_arrays import read_only_floats
 from .poses import Frame
 from .sample_times import first_unordered_time
+from .separate_sensor import SeparateSensor
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ GRASP_INPUTS = ("force_n", "torque_nm")
 
 
 @declaration
-class Gauge:
+class Gauge(SeparateSensor):
     """A custom sensor: its reading is an expression of a few points of the body, or of a grasp.
 
     Parameters
@@ -95,6 +96,8 @@ class Gauge:
     """
 
     description_name: ClassVar[str] = "reading"
+    measurement_text: ClassVar[str] = "readings"
+    noise_key: ClassVar[str] = "sigma of the readings"
 
     name: str
     expression: Callable[..., Any]
@@ -216,6 +219,17 @@ class Gauge:
     def is_measured(self) -> NDArray[np.bool_]:
         """(S, m) whether each value is measured."""
         return np.isfinite(self.measured_values)
+
+    def without_later_values(self, end_s: float) -> Gauge:
+        """Return a copy with measurements after `end_s` [s] replaced by NaN; self if none would
+        remain.
+        """
+        values = np.where(
+            (self.sample_times_s > end_s)[:, None], np.nan, self.measured_values
+        )
+        return (
+            replace(self, values=values) if np.isfinite(values).any() else self
+        )
 
     # The expression ---------------------------------------------------------------------------
 

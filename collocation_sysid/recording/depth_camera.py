@@ -22,7 +22,8 @@ from ..fem.meshes.selection import Selection
 from .checked_arrays import read_only_floats
 from .node_selection import Nodes, selection_from_section
 from .poses import PoseSequence
-from .sample_times import TIME_TOLERANCE_S, first_unordered_time
+from .sample_times import first_unordered_time
+from .separate_sensor import SeparateSensor
 
 MatrixRow = tuple[Finite, Finite, Finite, Finite]
 PoseMatrix = tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
@@ -33,6 +34,8 @@ UNDISTORTION_ITERATIONS = 12
 # Largest number of images of a recording whose outlines are compared: they are stored in memory,
 # and one of 640 x 480 pixels takes 1.2 MB.
 MOST_OUTLINE_IMAGES = 40
+# Factor by which the distance of thinned points grows until there are few enough.
+SPACING_FACTOR = 1.2
 
 Background = Literal["auto", "empty", "unknown"]
 
@@ -200,7 +203,7 @@ def _require_selection(faces: Any) -> Selection:
 
 
 @declaration
-class Depth:
+class Depth(SeparateSensor):
     """Depth images, or clouds of points of a body, of one camera, one for each sample time.
 
     Parameters
@@ -244,6 +247,10 @@ class Depth:
     """
 
     description_name: ClassVar[str] = "depth camera"
+    measurement_text: ClassVar[str] = "points of depth cameras"
+    noise_key: ClassVar[str] = "sigma_m of depth"
+    points_name: ClassVar[str] = "depth points"
+    measures_shape: ClassVar[bool] = True
 
     name: str
     t_s: Any
@@ -436,6 +443,33 @@ class Depth:
             images_m=images_m,
         )
 
+    def needed_until_s(self, fewest: int) -> float:
+        """Return the time [s] by which a sample has points, and of as many samples as there are up
+        to the number `fewest`.
+        """
+        last = max(fewest - 1, self.first_sample_with_points)
+        return float(
+            self.sample_times_s[min(last, len(self.sample_times_s) - 1)]
+        )
+
+    @property
+    def point_counts(self) -> list[int]:
+        """Numbers of points of each sample."""
+        return [*map(len, self.clouds)]
+
+    def thinned(self, most: int) -> Depth:
+        """Return a copy whose clouds have at most `most` points each, at least one.
+
+        Points are selected as on construction, at a larger distance, which also applies to the
+        points of outlines; measured values are not averaged.
+        """
+        spacing_m = self.spacing_m * np.sqrt(max(self.point_counts) / most)
+        thinned = replace(self, spacing_m=spacing_m)
+        while max(thinned.point_counts) > most:
+            spacing_m *= SPACING_FACTOR
+            thinned = replace(self, spacing_m=spacing_m)
+        return thinned
+
     @property
     def first_sample_with_points(self) -> int:
         """Index, from 0, of the first sample that has points."""
@@ -453,45 +487,6 @@ def samples_with_outlines(count: int) -> set[int]:
             )
         ).tolist()
     )
-
-
-def until_all_cameras_see(
-    depths: Sequence[Depth], t_s: Array, count: int, fewest: int
-) -> tuple[int, list[Depth]]:
-    """Return how many first samples of an experiment include points of every depth camera, and the
-    images until then.
-
-    Parameters
-    ----------
-    depths : sequence of Depth
-    t_s : (T,) array
-        Times of the experiment.
-    count : int
-        Least number of samples of the experiment; returned unchanged without cameras.
-    fewest : int
-        Least number of images of each camera, as far as it has so many.
-
-    Returns
-    -------
-    count : int
-        Number of first samples of the experiment; the last of them is not before any of the
-        required images.
-    depths : list of Depth
-        Images until then, of the cameras that have points by then.
-    """
-    for depth in depths:
-        last_s = depth.sample_times_s[
-            min(
-                max(fewest - 1, depth.first_sample_with_points),
-                len(depth.sample_times_s) - 1,
-            )
-        ]
-        count = max(
-            count, int(np.searchsorted(t_s, last_s - TIME_TOLERANCE_S)) + 1
-        )
-    end_s = t_s[:count][-1] + TIME_TOLERANCE_S
-    shorter = (depth.until_time(end_s) for depth in depths)
-    return count, [depth for depth in shorter if depth is not None]
 
 
 def points_from_image(image_m: Array, camera: DepthCamera) -> Array:

@@ -34,6 +34,7 @@ from .sample_times import (
     first_unordered_time,
     sample_interval_s,
 )
+from .separate_sensor import SENSORS, SeparateSensor, sensor_fields
 from .tendon import Tendon
 from .time_tables import is_within_experiment
 
@@ -151,8 +152,12 @@ class Experiment:
     forces: tuple[Force, ...] = key(converter=tuple, default=())
     tendons: tuple[Tendon, ...] = key(converter=tuple, default=())
     pressures: tuple[Pressure, ...] = key(converter=tuple, default=())
-    readings: tuple[Gauge, ...] = key(converter=tuple[Gauge, ...], default=())
-    depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=())
+    readings: tuple[Gauge, ...] = key(
+        converter=tuple[Gauge, ...], default=(), metadata=SENSORS
+    )
+    depths: tuple[Depth, ...] = key(
+        converter=tuple[Depth, ...], default=(), metadata=SENSORS
+    )
     nuisance: Nuisance = DEFAULT_NUISANCE
     air_density_kg_m3: float = key(
         converter=air_density, default_factory=usual_air_density
@@ -229,6 +234,15 @@ class Experiment:
         `grasps`.
         """
         return tuple(self.sensors_by_grasp.values())
+
+    @property
+    def separate_sensors(self) -> list[SeparateSensor]:
+        """Sensors with times of their own, besides markers and those of grasps."""
+        return [
+            each
+            for name in sensor_fields(Experiment)
+            for each in getattr(self, name)
+        ]
 
     @property
     def camera_names(self) -> list[str]:
@@ -702,10 +716,10 @@ class Experiment:
                 )
 
     def _require_measurements(self) -> None:
-        """Raise an `InputError` if, besides markers, nothing is measured either: no custom sensor,
-        depth camera or wrench.
+        """Raise an `InputError` if, besides markers, nothing is measured either: by no sensor of its
+        own times and no wrench.
         """
-        if self.readings or self.depths or self.instrumented_grasps:
+        if self.separate_sensors or self.instrumented_grasps:
             return
         if not self.markers.names:
             message = "nothing is measured: there are no markers, no wrench and no reading"

@@ -407,6 +407,9 @@ class Assumption:
         a problem states its deviation.
     description : str
         Description.
+    remedy : str
+        What to measure or state in order to reduce the effect, as an imperative phrase without a
+        full stop.
     effect : callable
         Returns the effect of one unit, from an experiment at the answer and the index of the
         component, from 0; None if there is no effect in this experiment.
@@ -420,6 +423,7 @@ class Assumption:
     unit: str
     sigma: float | None
     description: str
+    remedy: str
     effect: Callable[[ExperimentAtAnswer, int], Effect | None]
     component_names: str = ""
     of_specimens: bool = False
@@ -869,6 +873,7 @@ ASSUMPTIONS = (
         "1",
         sigma=0.01,
         description="relative error of the size of the mesh",
+        remedy="measure two lengths of the real body and scale the mesh to them",
         effect=_size,
     ),
     Assumption(
@@ -877,6 +882,8 @@ ASSUMPTIONS = (
         sigma=0.58,
         description="share of the weight of the body under which the mesh was deformed when "
         "it was made, along each axis, if object.rest_shape is not stated",
+        remedy="state object.rest_shape: whether the mesh is free of stress, or the shape in "
+        "which the body hung or stood during its scan",
         effect=_rest_shape,
         component_names="x y z",
     ),
@@ -886,6 +893,7 @@ ASSUMPTIONS = (
         sigma=0.005,
         description="displacement of the surface of the body from that of the mesh along its "
         "normal, relative to the thickness",
+        remedy="measure the thickness of the real body at several places",
         effect=_surface,
         component_names=_MODES,
     ),
@@ -894,6 +902,7 @@ ASSUMPTIONS = (
         "1",
         sigma=0.01,
         description="relative error of the mass of the body, if the mass is not estimated",
+        remedy="weigh the body",
         effect=_mass,
     ),
     Assumption(
@@ -902,6 +911,7 @@ ASSUMPTIONS = (
         sigma=0.05,
         description="relative difference of the density at one end of the body from that in "
         "its middle",
+        remedy="weigh two halves of a specimen",
         effect=_density_gradient,
         component_names="x y z",
     ),
@@ -910,6 +920,8 @@ ASSUMPTIONS = (
         "1",
         sigma=0.05,
         description="relative difference of the stiffness along one axis from that across it",
+        remedy="record a second motion with the body held the other way round, or press a cube "
+        "along each of its axes",
         effect=_anisotropy,
         component_names="x y z",
         of_specimens=True,
@@ -920,6 +932,7 @@ ASSUMPTIONS = (
         sigma=0.02,
         description="relative change of the stiffness from the beginning to the end of a "
         "recording",
+        remedy="repeat the first recording at the end",
         effect=_drift,
         of_specimens=True,
     ),
@@ -928,6 +941,7 @@ ASSUMPTIONS = (
         "1",
         sigma=1e-4,
         description="relative error of the rate of all clocks",
+        remedy="compare all clocks with a reference clock",
         effect=_time_scale,
     ),
     Assumption(
@@ -935,6 +949,9 @@ ASSUMPTIONS = (
         "",
         sigma=0.02,
         description="error of a stated Poisson's ratio",
+        remedy="measure Poisson's ratio in a tension test, or estimate it; solid rubber is nearly "
+        "incompressible: state poisson = 0.499 in [parameters], and the deviation of this value, "
+        "poisson = 0.0005, in [uncertainty.assumptions]",
         effect=_poisson,
         of_specimens=True,
     ),
@@ -944,6 +961,8 @@ ASSUMPTIONS = (
         sigma=1.0,
         description="effect of another objective damping law, as a fraction of the complete "
         "difference of its damping force from that of the stated law",
+        remedy="compare the laws with compare-models --damping on faster and slower motions, "
+        'or state damping_law = "none" where the law is known',
         effect=_objective_damping,
         component_names=" ".join(OBJECTIVE_DAMPINGS),
     ),
@@ -953,6 +972,8 @@ ASSUMPTIONS = (
         sigma=None,
         description="effect of Rayleigh damping, as a fraction of the complete difference of "
         "its damping force from that of the stated law",
+        remedy="compare the laws with compare-models --damping on motions that rotate "
+        "the body",
         effect=_rayleigh_damping,
     ),
     Assumption(
@@ -960,6 +981,7 @@ ASSUMPTIONS = (
         "m",
         sigma=2e-4,
         description="compliance of grip and skin, as the thickness of a layer of the body's material",
+        remedy="glue the body to a stiff plate, or attach markers to the body beside the grip",
         effect=_grip,
     ),
     Assumption(
@@ -967,6 +989,9 @@ ASSUMPTIONS = (
         "m/N",
         sigma=1e-6,
         description="compliance of the test bench",
+        remedy="press the platens against each other without a specimen and state "
+        "the slope of displacement over force as machine_compliance_m_n = { mean = …, deviation = … } "
+        "in [uncertainty.assumptions]",
         effect=_machine,
         of_specimens=True,
     ),
@@ -975,6 +1000,7 @@ ASSUMPTIONS = (
         "",
         sigma=0.1,
         description="coefficient of friction of platens between which nodes slide",
+        remedy="lubricate the platens, or glue the specimen to them",
         effect=_platen_friction,
     ),
     Assumption(
@@ -983,6 +1009,9 @@ ASSUMPTIONS = (
         sigma=1.0,
         description="slip of faces that are pressed by platens and held along all axes, as a fraction of "
         "that without friction, if only loads are measured",
+        remedy="measure the bulge, by markers on the side or depth images; or state "
+        'platen_slip = "none" in [uncertainty.assumptions] if the faces are glued, or axes = "z" if '
+        "they slide",
         effect=_platen_slip,
     ),
     Assumption(
@@ -990,6 +1019,8 @@ ASSUMPTIONS = (
         "1",
         sigma=1.0,
         description="compliance of the contact with obstacles, as a fraction of that of the pressure law",
+        remedy="refine the mesh at the contact, or state a larger stiffness_pa_m and a "
+        "smaller width_m of the obstacle",
         effect=_contact_stiffness,
     ),
     Assumption(
@@ -997,6 +1028,7 @@ ASSUMPTIONS = (
         "1",
         sigma=AIR_DENSITY_DEVIATION,
         description="relative error of the buoyancy, because of the density of the air",
+        remedy="state the density of the air",
         effect=_buoyancy,
     ),
     Assumption(
@@ -1004,6 +1036,7 @@ ASSUMPTIONS = (
         "1",
         sigma=AIR_COEFFICIENT_DEVIATION,
         description="relative error of the added mass of the air",
+        remedy="repeat the motion more slowly, or with a heavier specimen",
         effect=_added_mass,
     ),
     Assumption(
@@ -1011,6 +1044,7 @@ ASSUMPTIONS = (
         "1",
         sigma=AIR_COEFFICIENT_DEVIATION,
         description="relative error of the drag of the air",
+        remedy="repeat the motion more slowly, or with a heavier specimen",
         effect=_air_drag,
     ),
 )
