@@ -32,12 +32,15 @@ from ..statistics.misspecification.misspecification_hypothesis import (
     rank,
 )
 from .camera_clock_misspecifications import (
+    MESSAGES_OF_TIMES,
     camera_clock_hypotheses,
 )
 from .camera_image_misspecifications import (
+    MESSAGES_OF_IMAGES,
     camera_image_hypotheses,
 )
 from .camera_misspecifications import (
+    MESSAGES_OF_POSES,
     camera_hypotheses,
     require_depth_units,
 )
@@ -50,6 +53,18 @@ from .measurement_results import (
     PredictionErrors,
 )
 
+# Messages of concerns about a fit or a prediction, by code.
+MESSAGES = {
+    "residuals/outline": "{percent:.0f} % of the model's outline are more than {pixels:.0f} pixels "
+    "away from the edge of the body in the images of {camera}: the body may be grasped "
+    "at another place, be partly hidden, or have another stiffness; if depths are "
+    'missing on the body itself, state background = "unknown"',
+    "nuisance/camera": "{name} is {deviations:.1f} standard deviations of its prior away from the "
+    "stated pose: another stiffness may fit equally well with another pose of the "
+    "camera; measure the pose, or state how well it is known (nuisance.depth_pose)",
+    "prediction/unseen": "none of the {seen} points of {camera} is near the predicted surface of "
+    "'{experiment}': check camera.pose and the unit of the depth",
+}
 # Pose of a depth camera in standard deviations of its prior: "check", because it compensates wrong
 # shapes.
 LARGEST_CAMERA_OFFSET = 2.0
@@ -484,6 +499,12 @@ def _distance_text(error: DepthError) -> str:
 
 DEPTH = Feature(
     "depth",
+    messages={
+        **MESSAGES,
+        **MESSAGES_OF_POSES,
+        **MESSAGES_OF_IMAGES,
+        **MESSAGES_OF_TIMES,
+    },
     picture_kinds=[
         PictureKind(
             "depth",

@@ -49,8 +49,8 @@ MESSAGES = {
     "for a log state sensor_frame in the table of the wrench",
     "description/wrench-gain": "its {what} fit if multiplied by {factor:.3g}: check the calibration of "
     "the sensor, and the density or mass of the body",
-    "description/wrench-point": "its torques refer to a point {by_mm:.3g} mm away from point_m: set "
-    "point_m = {point}, with which they fit",
+    "description/wrench-point": "its torques refer to a point {by_mm:.3g} mm away from point_m: "
+    "set point_m = {point}, with which they fit",
     "description/wrench-frame": 'it is expressed in the frame of the {other}: set frame = "{other}"',
     "description/wrench-unit": "its {what} seem to be in {unit}: multiply them by {factor:g}",
     "description/wrench-clock": "it was measured about {by_ms:.3g} ms {when} than its times t_s "

@@ -88,6 +88,8 @@ class SolverSection(Section):
 
     Attributes
     ----------
+    method : str
+        Name of the method that solves the nonlinear program.
     huber : float, optional
         Threshold in standard deviations beyond which residuals count linearly, not squared (Huber's
         loss).

@@ -56,8 +56,8 @@ class DepthCamera:
     Parameters
     ----------
     matrix : (3, 3) array, optional
-        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs
-        no matrix; if it has one, an offset and a scale error of the depth are estimated, and
+        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels; a cloud needs
+        no matrix. If a cloud has one, an offset and a scale error of the depth are estimated, and
         surfaces that face away from the camera are not used.
     distortion : sequence of up to five numbers
         k1, k2, p1, p2, k3 of the model of Brown and Conrady.

@@ -59,8 +59,8 @@ class Wrench:
         Axes of the components. "world": those of the world frame of the poses. "grasp": those of
         the undeformed body, which move with the grasp.
     point_m : (3,) array
-        Point [x, y, z] about which the torque is measured. In the frame "world" it is fixed; in the
-        frame "grasp" it is stated on the undeformed body and moves with the grasp.
+        Point [x, y, z] about which the torque is measured; it is fixed in the frame "world", and in
+        the frame "grasp" it is stated on the undeformed body and moves with the grasp.
     symmetry : int
         Number of equal parts of the specimen that share the load, 4 where a quarter is modelled.
         Values and sigmas are those of the modelled part; results are reported for the specimen.

@@ -148,30 +148,6 @@ TOPICS: dict[str, Topic] = {
             '"strain (%)"',
             "specimen-unit": "its stresses fit if multiplied by {factor:g}: the unit of the column "
             "is probably {unit}",
-            "camera": "only {percent:.0f} % of the body's visible surface have measured points "
-            "within {within_mm:.3g} mm: check camera.pose (camera frame: x to the right, y down, "
-            "z forward) and the unit of the depth; check draws a picture of both",
-            "camera/likely": "hardly any points are near the body; they would be if {mistakes}",
-            "camera-image": "the points fit with rows and columns of the image read {order}: the "
-            "image was flipped or rotated after the camera took it; undo that, or describe the "
-            "camera as it took the image",
-            "camera-matrix/focal": "the points fit with focal lengths {factor:g} times as large: "
-            "check fx and fy of camera.matrix, which are in pixels of these images",
-            "camera-matrix/size": "the points fit with camera.matrix multiplied by {factor:g}, "
-            "except for its last row: it is that of images of another size; state the matrix of "
-            "these images",
-            "camera-matrix/centre": "the points fit with the principal point {centre}, {how}: "
-            "state cx and cy of camera.matrix from the upper left corner, cx along the columns",
-            "camera-rays": "the points fit if the depths are distances along the rays: convert "
-            "them to depths along the optical axis, dividing by the length of K⁻¹ (u, v, 1)",
-            "camera-pose": "the points fit only if the camera is turned by {degrees:.2g}° and "
-            "shifted by {by_mm:.2g} mm, {deviations:.2g} standard deviations of its prior: "
-            "measure camera.pose again, or state nuisance.depth_pose",
-            "camera-clock": "its images fit {by_ms:.3g} ms away from their times: its clock is "
-            "{when} relative to that of the poses; {do} its times",
-            "camera-order": "its images fit in reverse order: sort their files by time",
-            "camera-constant": "all its images show the same moment, although the body moves by "
-            "{by_mm:.3g} mm: check that the images are those of this recording",
         },
     ),
     "noise": Topic(
@@ -203,10 +179,6 @@ TOPICS: dict[str, Topic] = {
         "wrong stiffness or damping. The command compare-models --materials tests whether another "
         "material law predicts better.",
         messages={
-            "outline": "{percent:.0f} % of the model's outline are more than {pixels:.0f} pixels "
-            "away from the edge of the body in the images of {camera}: the body may be grasped "
-            "at another place, be partly hidden, or have another stiffness; if depths are "
-            'missing on the body itself, state background = "unknown"',
             "outlier": f"{SAMPLE}remove it, or set solver.huber",
             "first": f"{SAMPLE}the body is assumed to be relaxed at the first sample; start the "
             "recording before the load, or remove the sample",
@@ -291,9 +263,6 @@ TOPICS: dict[str, Topic] = {
             "far": "{name} is {deviations:.1f} standard deviations of its prior away from zero: "
             "check whether this value is possible, and if it is, widen its prior in "
             "[experiment.nuisance]",
-            "camera": "{name} is {deviations:.1f} standard deviations of its prior away from the "
-            "stated pose: another stiffness may fit equally well with another pose of the "
-            "camera; measure the pose, or state how well it is known (nuisance.depth_pose)",
             "clock": "the markers of '{experiment}' were measured {shift_ms:.2g} ms {when} than "
             "their times state: the estimates are corrected for this, but find the cause of the "
             "difference",
@@ -403,8 +372,6 @@ TOPICS: dict[str, Topic] = {
         messages={
             "misses": "the prediction of '{experiment}' deviates from {what} by {size}{sigmas:.2g} "
             "times {stated}: check the stated parameters, {stated}, and what the model lacks",
-            "unseen": "none of the {seen} points of {camera} is near the predicted surface of "
-            "'{experiment}': check camera.pose and the unit of the depth",
         },
     ),
     "memory": Topic(

@@ -238,3 +238,17 @@ def test_what_a_force_in_a_file_cannot_carry_is_one_message(
     done = run_command("check", "problem.toml", "--allow-code")
     assert done.code == 2
     assert said in " ".join(done.err.split())
+
+
+def test_an_obstacle_that_is_not_touched_does_not_change_the_reference_motion():
+    """Its force precedes the user's among the terms, and is apart while a step is solved."""
+    experiment = tied()
+    far = cs.Obstacle(shape=cs.Plane((0.0, 0.0, 1.0), (0.0, 0.0, -9.0)))
+    beside = replace(experiment, grasps=[*experiment.grasps, far])
+    alone, both = (
+        simulate(each, STATED, "newmark").positions_m
+        for each in (experiment, beside)
+    )
+    np.testing.assert_allclose(
+        both[:, : alone.shape[1]], alone, rtol=0, atol=1e-12
+    )
