@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from synthetic import Swing, measure, unmeasured
+from synthetic import Swing, prepare_experiment, simulate_tracks
 
 from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.recording import write_markers_csv
@@ -38,10 +38,12 @@ def main() -> None:
     cylinder_mesh(radius_m=0.03, height_m=0.16, rings=1, layers=11).write(
         FOLDER / "foam_cylinder.vtu"
     )
-    experiment = unmeasured(
+    experiment = prepare_experiment(
         FOLDER / "problem.toml", "swing_poses.csv", SWING.poses(POSE_STEP_S)
     )
-    tracks = measure(experiment, SWING.poses(FINE_S), TRUTH, NOISE_M, seed=1)
+    tracks = simulate_tracks(
+        experiment, SWING.poses(FINE_S), TRUTH, NOISE_M, seed=1
+    )
     frames = slice(None, None, round(STEP_S / POSE_STEP_S))
     write_markers_csv(
         FOLDER / "swing_markers.csv",

@@ -12,7 +12,13 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from synthetic import Swing, exchanged, measure, occluded, unmeasured
+from synthetic import (
+    Swing,
+    exchanged,
+    occluded,
+    prepare_experiment,
+    simulate_tracks,
+)
 
 from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.recording import (
@@ -58,11 +64,11 @@ def main() -> None:
     cylinder_mesh(radius_m=0.03, height_m=0.16, rings=1, layers=3).write(
         FOLDER / "noisy_cylinder.vtu"
     )
-    experiment = unmeasured(
+    experiment = prepare_experiment(
         FOLDER / "problem.toml", "swing_poses.csv", SWING.poses(POSE_STEP_S)
     )
     names = experiment.markers.names
-    simulated = measure(
+    simulated = simulate_tracks(
         as_glued(experiment), SWING.poses(FINE_S), TRUTH, NOISE_M, seed=1
     )
     frames = slice(None, None, round(STEP_S / POSE_STEP_S))

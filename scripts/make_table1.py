@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from synthetic import Swing, measure, unmeasured
+from synthetic import Swing, prepare_experiment, simulate_tracks
 
 from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.program.simulation import simulate
@@ -36,11 +36,11 @@ def main() -> None:
     cylinder_mesh(radius_m=0.04, height_m=0.16, rings=2, layers=8).write(
         FOLDER / "cylinder.vtu"
     )
-    experiment = unmeasured(
+    experiment = prepare_experiment(
         FOLDER / "problem.toml", "poses.csv", SWING.poses(STEP_S)
     )
     tracks = {
-        "newmark": measure(
+        "newmark": simulate_tracks(
             experiment, SWING.poses(FINE_S), TRUTH, noise_m=0.0, seed=0
         ),
         "scheme": simulate(

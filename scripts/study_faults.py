@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from assumed_twins import wrong
+from assumed_twins import with_wrong_assumptions
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
@@ -346,7 +346,7 @@ def drawn(names: Sequence[str]) -> Callable[..., Pair]:
             name: truth()[name]
             for name in ("young_pa", "poisson", *list(TRUTH)[2:])
         }
-        return wrong(experiment, values, off), experiment
+        return with_wrong_assumptions(experiment, values, off), experiment
 
     return fault
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from studies import HEADS, TRUTH, markdown, save
+from studies import PARAMETER_SYMBOLS, TRUTH, markdown, save
 from study_starts import BOUNDS, hanging_cylinder
 from synthetic import Swing
 
@@ -149,7 +149,7 @@ def table(fits: Sequence[Fit]) -> str:
     heads = (
         "scheme",
         "Δt [ms]",
-        *(f"{name} [%]" for name in HEADS),
+        *(f"{name} [%]" for name in PARAMETER_SYMBOLS),
         "rms [mm]",
         "time [s]",
     )
@@ -175,7 +175,7 @@ def order_table(fits: Sequence[Fit]) -> str:
         for name, chosen in (("all steps", common), ("two finest", common[:2])):
             cells = ["–" if np.isnan(o) else f"{o:.2f}" for o in orders(chosen)]
             lines.append((f"{scheme}, {name}", *cells))
-    return markdown(("order", *HEADS), lines)
+    return markdown(("order", *PARAMETER_SYMBOLS), lines)
 
 
 if __name__ == "__main__":

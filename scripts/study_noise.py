@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from studies import HEADS, TRUTH, markdown, save
+from studies import PARAMETER_SYMBOLS, TRUTH, markdown, save
 from study_coverage import SCHEME, reference
 from study_starts import BOUNDS
 
@@ -152,7 +152,7 @@ def table(
         *("method", "seeds", "converged"),
         *(
             f"{name} {what} [%]"
-            for name in HEADS
+            for name in PARAMETER_SYMBOLS
             for what in ("bias", "spread")
         ),
         "median [s]",

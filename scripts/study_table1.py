@@ -13,7 +13,15 @@ import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from studies import HEADS, TRUTH, Variant, markdown, number, run_variants, save
+from studies import (
+    PARAMETER_SYMBOLS,
+    TRUTH,
+    Variant,
+    markdown,
+    number,
+    run_variants,
+    save,
+)
 
 from collocation_sysid.extras.studies.study_rows import Row
 
@@ -84,7 +92,7 @@ def table(rows: Mapping[str, Sequence[Row]]) -> str:
     heads = (
         *(
             "method",
-            *HEADS,
+            *PARAMETER_SYMBOLS,
             "marker rms [mm]",
             "violation [N]",
             "relative",

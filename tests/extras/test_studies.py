@@ -12,7 +12,14 @@ import study_methods
 import study_mismatch
 import study_noise
 import study_table1
-from studies import HEADS, TRUTH, Variant, markdown, run_variants, worst_error
+from studies import (
+    PARAMETER_SYMBOLS,
+    TRUTH,
+    Variant,
+    markdown,
+    run_variants,
+    worst_error,
+)
 
 pytestmark = pytest.mark.long
 
@@ -198,7 +205,7 @@ def test_noise_is_summed_up_over_converged_runs():
 
 def test_tables_are_markdown():
     assert (
-        markdown(("a", *HEADS[:1]), [("x", "1")])
+        markdown(("a", *PARAMETER_SYMBOLS[:1]), [("x", "1")])
         == "| a | λ |\n| --- | ---: |\n| x | 1 |"
     )
 
