@@ -372,8 +372,6 @@ TOPICS: dict[str, Topic] = {
         messages={
             "misses": "the prediction of '{experiment}' deviates from {what} by {size}{sigmas:.2g} "
             "times {stated}: check the stated parameters, {stated}, and what the model lacks",
-            "unseen": "none of the {seen} points of {camera} is near the predicted surface of "
-            "'{experiment}': check camera.pose and the unit of the depth",
         },
     ),
     "memory": Topic(
