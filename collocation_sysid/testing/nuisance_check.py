@@ -297,7 +297,7 @@ def _check_clock(
             residual.predict_positions(later, np.zeros(data.size))[sample, 0],
             statement=(
                 f"the program predicts the marker {residual.names[0]} at t = {t_s:.4g} s at another "
-                f"position [m] than the motion has {delay:.4g} s later, the delay that "
+                f"position [m] than the motion has {float(delay):.4g} s later, the delay that "
                 "clock(values, t_s, data) returns"
             ),
             tolerance=1e-7,
