@@ -85,7 +85,7 @@ def _with_body(
     return replace(experiment, body=body)
 
 
-# Units ------------------------------------------------------------------------------------------
+# Units --------------------------------------------------------------------------------------------
 
 
 def poses_times(factor: float) -> ExperimentChange:
@@ -112,7 +112,7 @@ def density_times(factor: float) -> ExperimentChange:
     return lambda e, rng: _with_body(e, e.body.mesh.points_m, factor)
 
 
-# Motion -----------------------------------------------------------------------------------------
+# Motion -------------------------------------------------------------------------------------------
 
 
 def inverted(poses: PoseSequence) -> PoseSequence:
@@ -181,7 +181,7 @@ def jumping(experiment: Experiment, rng: Rng) -> Experiment:
     return _with_poses(experiment, change)
 
 
-# Frames -----------------------------------------------------------------------------------------
+# Frames -------------------------------------------------------------------------------------------
 
 
 def _frame(rng: Rng) -> tuple[Rotation, np.ndarray]:
@@ -221,7 +221,7 @@ def in_cameras_frame(experiment: Experiment, rng: Rng) -> Experiment:
     return with_markers(experiment, moved)
 
 
-# Markers, gravity, grasp ------------------------------------------------------------------------
+# Markers, gravity, grasp --------------------------------------------------------------------------
 
 
 def exchanged(experiment: Experiment, rng: Rng) -> Experiment:
@@ -303,7 +303,7 @@ FAULTS = {
 }
 
 
-# Tracks and meshes that no grasped body can have ----------------------------------------------------
+# Tracks and meshes that no grasped body can have --------------------------------------------------
 
 
 def with_track_axes(

@@ -50,7 +50,7 @@ from .shape_error import (
     surface_modes,
     thickness_m,
 )
-from .size_effect import obstacle_shifts_m
+from .contact_effects import obstacle_shifts_m
 
 # Differences by a scale.
 SMALL = 1e-4
@@ -447,7 +447,7 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
 
     From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths. Goals of grasped nodes scale
     about the middle of the grasps; obstacles keep their size and are moved so that they first touch
-    the body as before, see `size_effect.obstacle_shifts_m`. Contact areas grow by s², and a contact
+    the body as before, see `contact_effects.obstacle_shifts_m`. Contact areas grow by s², and a contact
     stiffness that is not stated falls by s, as it follows the edges of the mesh.
 
     Buoyancy and the mass of moved air grow by s³, and drag by s². The own mass grows by s³ unless
