@@ -31,6 +31,7 @@ NEUTRAL = {
     "runs": {
         "check/__init__.py": {"wrench"},
     },
+    "cli": {},
     "extras/design": {},
     "extras/studies": {},
     "program/forward": {},

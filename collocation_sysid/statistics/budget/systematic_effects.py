@@ -41,6 +41,7 @@ from ...recording.homogeneous_deformation import (
     HomogeneousDeformation,
 )
 from ...recording.nuisance import DEGREE
+from .contact_effects import obstacle_shifts_m
 from .platen_slip import slip_displacements_m
 from .shape_error import (
     CORRELATION,
@@ -50,7 +51,6 @@ from .shape_error import (
     surface_modes,
     thickness_m,
 )
-from .contact_effects import obstacle_shifts_m
 
 # Differences by a scale.
 SMALL = 1e-4
