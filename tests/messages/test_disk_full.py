@@ -66,7 +66,7 @@ def refused(folder: Path, names: str, *words: object) -> None:
     assert outcome.code == 2, outcome
     assert outcome.err.startswith("error: ")
     assert outcome.err.count("\n") == 1, outcome.err
-    assert f"{names}: cannot be written: File too large" in outcome.err
+    assert f"{names}: this cannot be written: File too large" in outcome.err
     assert contents(folder) == before
 
 
@@ -115,7 +115,7 @@ def test_a_problem_is_begun_whole_or_not_at_all(tmp_path: Path):
     with room_for(300):
         outcome = run_command("new", tmp_path / "mine")
     assert outcome.code == 2
-    assert "problem.toml: cannot be written" in outcome.err
+    assert "problem.toml: this cannot be written" in outcome.err
     assert not list(tmp_path.rglob("*.toml"))
 
 
@@ -128,7 +128,7 @@ def test_a_simulation_writes_all_its_files_or_none(tiny: Path):
     for size, named in ((300, "swing_markers.csv"), (largest + 1, "swing")):
         outcome = run_without_room(*command, size=size)
         assert outcome.code == 2
-        assert f"data/{named}: cannot be written" in outcome.err
+        assert f"data/{named}: this cannot be written" in outcome.err
         assert not [each for each in Path("data").rglob("*") if each.is_file()]
 
 
@@ -140,7 +140,7 @@ def test_an_answer_that_finds_no_room_leaves_the_earlier_run(tiny: Path):
     for size in (100, 3000):
         outcome = run_without_room(*command, size=size)
         assert outcome.code == 2
-        assert "run: cannot be written" in outcome.err
+        assert "run: this cannot be written" in outcome.err
         assert contents(tiny) == before
 
 
@@ -169,7 +169,9 @@ def test_into_a_pipe_is_written_directly(tmp_path: Path):
 def test_the_message_names_the_folder_and_not_the_passing_one(tmp_path: Path):
     with (
         room_for(10),
-        pytest.raises(ValueError, match="run: cannot be written") as caught,
+        pytest.raises(
+            ValueError, match="run: this cannot be written"
+        ) as caught,
         replaced_folder(tmp_path / "run") as place,
     ):
         write_text_file(place / "table.csv", 100 * "x")

@@ -345,7 +345,8 @@ def test_workers_of_another_version_are_refused():
     }
     client = SimpleNamespace(run=lambda *_, **__: answers)
     with pytest.raises(
-        InputError, match=r"found '0\.0\.1' on the worker tcp://b:1; expected"
+        InputError,
+        match=r"found collocation-sysid 0\.0\.1 on the worker tcp://b:1; expected",
     ):
         DaskExecutor(client)
     answers.clear()

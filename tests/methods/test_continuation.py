@@ -221,7 +221,7 @@ def test_what_a_stage_does_not_reach_the_last_one_reports():
         (
             SHARES,
             {"hessia": "exact"},
-            "'interior-point' has no option 'hessia'; it has hessian,",
+            "'interior-point' has no option 'hessia'; expected one of hessian,",
         ),
     ],
 )

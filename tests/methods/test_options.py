@@ -50,7 +50,7 @@ def test_a_method_is_built_from_a_table():
         (
             "penalty",
             {"rh": 1.0},
-            "solver: 'penalty' has no option 'rh'; .*did you mean 'rho'?",
+            "solver: the method 'penalty' has no option 'rh'; .*did you mean 'rho'?",
         ),
         ("penalty", {"rho": "1"}, "solver.rho: found '1'; expected a number$"),
         (
@@ -86,7 +86,7 @@ def test_a_method_is_built_from_a_table():
         (
             "continuation",
             {"stage": {"rho": 1}},
-            "solver.stage: 'interior-point' has no option",
+            "solver.stage: the method 'interior-point' has no option",
         ),
         (
             "continuation",

@@ -398,7 +398,7 @@ def test_a_force_on_faces_that_are_not_there_is_refused():
             np.zeros(1),
         )
     with pytest.raises(
-        InputError, match="on 'edges'; expected one of nodes, faces"
+        InputError, match="found on = 'edges'; expected one of nodes, faces"
     ):
         NodeForce.from_law(breath, on="edges")  # pyright: ignore[reportArgumentType]
 

@@ -22,7 +22,6 @@ from collocation_sysid.result.pictures.field_intervals import field_picture
 from collocation_sysid.result.replay import (
     ARRAY_LAYOUT,
     GROUP_PREFIXES,
-    WRENCH_PREFIX,
     read_run,
 )
 from collocation_sysid.runs.check.body_check import check_body
@@ -636,7 +635,7 @@ def test_the_documented_arrays_are_those_that_a_run_may_have():
     } - documented
     assert not missing
     fronts = {f"{front}NAME" for front in GROUP_PREFIXES.values()} | {
-        f"{WRENCH_PREFIX}K"
+        "wrench_K"
     }
     assert fronts <= documented
     assert documented <= {

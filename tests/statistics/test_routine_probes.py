@@ -248,7 +248,7 @@ def test_the_concern_names_the_assumption_and_every_corrected_estimate():
     assert Assessment.from_concerns([concern]).verdict == "check"
     assert concern.message == (
         "the data contradict the assumption that the stiffness is constant during a recording: "
-        "with stiffness drift = -0.05 ± 0.01 χ² decreases by 20, and the estimates become E = "
+        "with stiffness drift = -0.05 ± 0.01, χ² decreases by 20, and the estimates become E = "
         "8181 ± 40 Pa and ν not determined; alternatives that decrease χ² less: clock rate (12); a "
         "wrong damping or material law has similar effects: compare the laws first, with "
         "compare-models --damping and --materials"

@@ -211,7 +211,9 @@ def test_a_density_stated_for_a_region_stays(tiny):
         ),
         (
             [("\n[parameters]\n", f"{FREE}mass_kg = {{ guess = 0.1 }}\n")],
-            ["density_kg_m3 and mass_kg both give the density of the body"],
+            [
+                "found density_kg_m3 and mass_kg, which both determine the density of the body"
+            ],
         ),
         (
             [

@@ -487,7 +487,7 @@ def test_an_inclusion_of_few_elements_is_a_concern():
     [
         (
             {"parameter": "density_kg_m3"},
-            "expected 'smooth', or regions with densities",
+            "expected prior = 'smooth', or regions with densities",
         ),
         (
             {"length_m": (0.02, 0.05)},

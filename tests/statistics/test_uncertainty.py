@@ -311,7 +311,10 @@ def test_noise_needs_more_measurements_than_parameters():
     tracks = np.full_like(experiment.markers.positions_m, np.nan)
     tracks[2, 0] = experiment.markers.positions_m[2, 0]
     collocation, z = simulated([with_markers(experiment, tracks)])
-    with pytest.raises(InputError, match="3 measurements of 4 parameters"):
+    with pytest.raises(
+        InputError,
+        match="from 3 measurements, which are not more than the parameters",
+    ):
         uncertainty_at(collocation, z, ErrorModel("estimated"))
 
 
