@@ -145,6 +145,7 @@ class Horizon:
         p: Array,
         trajectories: Sequence[Any],
         known_iterate: Iterate | None = None,
+        accuracy: float = ACCURACY,
     ) -> Iterate:
         """Sweep all experiments at parameters p and trajectories x, and return the iterate.
 
@@ -160,6 +161,8 @@ class Horizon:
             Trajectories, one per experiment, with the rows of the horizon.
         known_iterate : Iterate, optional
             Iterate of the first rows at the same p and positions, which is continued.
+        accuracy : float
+            Relative accuracy of the solution of each time step, see `Sweep.forward`.
 
         Raises
         ------
@@ -171,7 +174,14 @@ class Horizon:
         known = (
             known_iterate.trajectories if known_iterate else self._repeat(None)
         )
-        return self._run(p, sweep, trajectories, known)
+        return self._run(
+            p,
+            sweep,
+            trajectories,
+            known,
+            self._repeat(None),
+            self._repeat(accuracy),
+        )
 
     def evaluate_step(
         self,
