@@ -51,7 +51,7 @@ class Measurement:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Run the benchmark with the options of the command line, and print its table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", choices=[*SIZES], default="2000")
     parser.add_argument("--steps", type=int, default=40)

@@ -15,12 +15,14 @@ from collections.abc import Callable
 import numpy as np
 
 import collocation_sysid as cs
-from collocation_sysid.model.contact import contact_terms
+from collocation_sysid.model.contact.contact_force import contact_terms
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.sweep import Sweep
 
-EDGE_M, STEP_S, SCHEME = 0.1, 0.01, "bdf2"
+EDGE_M = 0.1
+STEP_S = 0.01
+SCHEME = "bdf2"
 UP = np.array([0.0, 0.0, 1.0])
 TRUTH = {"lambda_pa": 2e3, "mu_pa": 3e3, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 UNKNOWN = cs.Parameters(
@@ -78,10 +80,8 @@ def prepared(
     x = simulate_scheme(experiment, dynamics)
     (part,) = collocation.iterates_at(collocation.guess_p, [x])
     for term in contact_terms(experiment):
-        area_m2, nothing = (
-            term.law_of_contact.surface.area_m2,
-            np.zeros((0, len(x), term.points.count)),
-        )
+        area_m2 = term.law_of_contact.surface.area_m2
+        nothing = np.zeros((0, len(x), term.points.count))
         gap_m = term.law_of_contact.gap_function.evaluate(
             term.points.vectors(x), nothing
         )[0]

@@ -18,26 +18,28 @@ READABLE_UNITS = {
 }
 INTRODUCTION = """# Catalogue of identified materials
 
-The materials that the shipped problems identify, from measured data and from simulated recordings
-("twins"). The same entries in SI units: [catalogue.json](catalogue.json). Both files are written
-by `scripts/make_catalogue.py`, which solves the problems; version {version} wrote this page.
+This page lists the materials that the shipped problems identify, from measured data and from
+simulated recordings (*twins*). The file [catalogue.json](catalogue.json) has the same entries in SI
+units. `scripts/make_catalogue.py` solves the problems and writes both files; version {version}
+wrote this page. Symbols of constants are explained on the page [materials](howto/material.md).
 
-**Read the verdict first.** An interval is worth what the verdict says: "doubtful" means that
-model and data do not agree, and that the constants describe this recording alone. The reasons are
+**Verdict.** Read the verdict of an entry first. With the verdict "doubtful" model and data do not
+agree, and the constants describe only the recordings of the entry. The reasons of a verdict are
 those that the solve reports.
 
-**Range of validity.** The stretches are the principal stretches λ = √(eigenvalues of FᵀF) in the
-fitted recordings, over all quadrature points (weighted by volume) and samples: the 5 % quantile
-of the smallest and the 95 % quantile of the largest, then the extremes. The strain rate is the
-largest magnitude of a principal value of the rate of Green's strain, from differences between
-samples: 95 % quantile and maximum. Constants are not supported by data outside these ranges.
-Without a rate, the samples are equilibria without times.
+**Range of validity.** The data do not support the constants outside the stated stretches and strain
+rates. The stretches are the principal stretches λ = √(eigenvalues of FᵀF) over all quadrature points
+(weighted by volume) and all samples of the fitted recordings. An entry states the 5 % quantile of the
+smallest stretch and the 95 % quantile of the largest stretch, then the smallest and the largest value.
+The strain rate is the largest magnitude of a principal value of the rate of Green's strain, from
+differences between samples. An entry states its 95 % quantile and its largest value. It states no
+strain rate if the samples are equilibria without times.
 
 **Intervals** are combined 95 % intervals of noise, discretisation and systematic effects
-([budget](howto/budget.md)). Constants without an interval were stated, or have the reason beside
-them.
+([budget](howto/budget.md)). A constant without an interval was stated in the problem, or the column
+"note" gives the reason.
 
-**Licences** are those of the recordings ([licences](licences.md)); measured data are not part of
+**Licences** are those of the recordings ([licences](licences.md)). Measured data are not part of
 this repository unless their problem is in `collocation_sysid/datasets`.
 """
 
@@ -243,11 +245,10 @@ def _section(entry: CatalogueEntry) -> str:
         + (f"; damping: {', '.join(entry.damping)}" if entry.damping else "")
         + f". Recordings: {', '.join(entry.recordings)}. Problem: `{entry.problem}`.\n",
         _table(shown, rows) + "\n",
-        f"- Stretch: 5 % and 95 % quantiles {stretch.low:.4g} and {stretch.high:.4g}, smallest and "
-        f"largest value {stretch.minimum:.4g} and {stretch.maximum:.4g}.",
+        f"- Stretch: 5 % quantile {stretch.low:.4g}, 95 % quantile {stretch.high:.4g}, smallest "
+        f"value {stretch.minimum:.4g}, largest value {stretch.maximum:.4g}.",
         _rate_sentence(entry.strain_rate_1_s),
-        f"- Verdict: **{entry.verdict}**"
-        + (f", because {'; '.join(entry.reasons)}." if entry.reasons else "."),
+        _verdict_lines(entry),
         f"- Source: {entry.source}. Licence: {entry.licence}.\n",
     ]
     return "\n".join(lines)
@@ -298,11 +299,19 @@ def _rate(rate: QuantileRange | None) -> str:
     return "" if rate is None else f"{rate.high:.2g}"
 
 
+def _verdict_lines(entry: CatalogueEntry) -> str:
+    """Return the verdict and a list of its reasons."""
+    if not entry.reasons:
+        return f"- Verdict: **{entry.verdict}**."
+    reasons = [f"  - {reason}" for reason in entry.reasons]
+    return "\n".join([f"- Verdict: **{entry.verdict}**, because", *reasons])
+
+
 def _rate_sentence(rate: QuantileRange | None) -> str:
     """Return the line about the strain rate."""
     if rate is None:
-        return "- Strain rate: none, the samples are equilibria without times."
-    return f"- Strain rate up to {rate.high:.3g} 1/s (95 % quantile), {rate.maximum:.3g} at most."
+        return "- Strain rate: none, because the samples are equilibria without times."
+    return f"- Strain rate: 95 % quantile {rate.high:.3g} 1/s, largest value {rate.maximum:.3g} 1/s."
 
 
 def _table(heads: Sequence[str], rows: Sequence[Mapping[str, str]]) -> str:

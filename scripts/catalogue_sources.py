@@ -50,7 +50,7 @@ class CatalogueSource:
 
     @property
     def problem_file(self) -> Path:
-        """The problem file."""
+        """Absolute path of the problem file."""
         return ROOT / self.problem
 
 
@@ -79,7 +79,7 @@ SOURCES = (
     CatalogueSource(
         "ecoflex_00_30_lubricated",
         "problems/phantom_compression/sliding.toml",
-        "Ecoflex 00-30, the same loads, platens taken as lubricated",
+        "Ecoflex 00-30, the same loads, platens assumed to be lubricated",
         PHANTOMS,
         CC_BY,
         static_times_are_recorded=True,
@@ -159,7 +159,7 @@ SOURCES = (
     CatalogueSource(
         "twin_foam_cylinder",
         "problems/foam_cylinder/recording.toml",
-        "foam cylinder swung by a robot, places of the markers unknown",
+        "foam cylinder swung by a robot, marker positions unknown",
         OWN,
         MIT,
         "make_foam_cylinder",

@@ -34,7 +34,8 @@ ROOT = Path(__file__).parents[1]
 GALLERY = ROOT / "docs" / "gallery"
 PICTURES = ROOT / "docs" / "pictures"
 # Size of the drawing [mm], with the ratio of the gallery's thumbnails, 400 × 280 pixels.
-WIDTH_MM, HEIGHT_MM = 60.0, 42.0
+WIDTH_MM = 60.0
+HEIGHT_MM = 42.0
 # Margin around the body [mm].
 MARGIN_MM = 3.0
 # Resolution [1/inch]: twice the size of a thumbnail, for screens with a high resolution.

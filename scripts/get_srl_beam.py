@@ -26,7 +26,8 @@ SOURCE = (
 RECORDINGS = tuple(
     f"beam_{trial}_V2_a.c3d" for trial in ("gravity", "load52", "load101")
 )
-SIZE_M, ORIGIN_M = (0.10, 0.03, 0.03), (-0.10, 0.0, 0.0)
+SIZE_M = (0.10, 0.03, 0.03)
+ORIGIN_M = (-0.10, 0.0, 0.0)
 MESHES = {"beam.vtu": (5, 2, 2), "beam_coarse.vtu": (3, 1, 1)}
 
 

@@ -95,7 +95,7 @@ def read_catalogue() -> Catalogue:
 
 
 def write_page(catalogue: Catalogue) -> None:
-    """Write docs/catalogue.md."""
+    """Write the page docs/catalogue.md with the constants of all materials."""
     write_text_file(PAGE_FILE, catalogue_page(catalogue))
 
 

@@ -1,4 +1,4 @@
-"""How often intervals from one depth image hold the truth, and how well it tells E, by twins.
+"""Accuracy of E from one depth image, and coverage of its intervals, for twins.
 
 A bar of 120 x 30 x 20 mm hangs from one end. An image of it has noise of 0.15 mm that is alike over
 three pixels. Where the camera is said to be, bias and scale of its depth are off by what is drawn
@@ -26,6 +26,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
+from collocation_sysid.program.depth.depth_comparison import camera_residuals
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
 from collocation_sysid.statistics.uncertainty import uncertainty_at
@@ -36,15 +37,17 @@ TRUTH = {
     "gamma_r_s": 1e-3,
     "gamma_m_1_s": 0.1,
 }
-MATRIX, SHAPE = [[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]], (120, 160)
-MIDDLE_M, WAY, NOISE_M = (
-    np.array([0.06, 0.015, -0.01]),
-    np.array([0, -0.9, 0.44]),
-    1.5e-4,
-)
+MATRIX = [[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]]
+SHAPE = (120, 160)
+MIDDLE_M = np.array([0.06, 0.015, -0.01])
+WAY = np.array([0, -0.9, 0.44])
+NOISE_M = 1.5e-4
 # Noise is along the rays; along the normals of what is seen it is so much of that.
 ALONG_NORMALS = 0.65
-TURN_RAD, SHIFT_M, BIAS_M, SCALE = 0.09, 0.02, 0.005, 0.005
+TURN_RAD = 0.09
+SHIFT_M = 0.02
+BIAS_M = 0.005
+SCALE = 0.005
 UNKNOWN = cs.Nuisance.none(
     depth_turn_rad=TURN_RAD,
     depth_shift_m=SHIFT_M,
@@ -54,7 +57,7 @@ UNKNOWN = cs.Nuisance.none(
 
 
 def camera(distance_m: float) -> cs.DepthCamera:
-    """One that looks at the middle of the bar from so far."""
+    """Return a camera that looks at the middle of the bar from a distance [m]."""
     pose = np.eye(4)
     ahead = -WAY / np.linalg.norm(WAY)
     right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(
@@ -80,13 +83,11 @@ BODY = cs.box_mesh((0.12, 0.03, 0.02), (4, 1, 1))
 
 
 def image_m(seen_by: cs.DepthCamera) -> np.ndarray:
-    """Without noise."""
+    """Return the depth image without noise [m]."""
     depth = cs.Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
     experiment = bar(depth)
-    x, skin = (
-        cs.simulate(experiment, TRUTH).positions_m[0],
-        VisibleSurface.from_body(experiment.body, depth),
-    )
+    x = cs.simulate(experiment, TRUTH).positions_m[0]
+    skin = VisibleSurface.from_body(experiment.body, depth)
     rotations, translations = seen_by.pose_at([0.0])
     triangles = (
         skin.subdivided_triangles(x[skin.nodes]) - translations[0]
@@ -97,8 +98,9 @@ def image_m(seen_by: cs.DepthCamera) -> np.ndarray:
 def off(
     camera: cs.DepthCamera, turn_rad: np.ndarray, shift_m: np.ndarray
 ) -> cs.DepthCamera:
-    """It, said to be turned about the middle of the bar and shifted."""
-    pose, turn = camera.pose.copy(), Rotation.from_rotvec(turn_rad).as_matrix()
+    """Return the camera with a wrong pose: rotated about the middle of the bar, and shifted."""
+    pose = camera.pose.copy()
+    turn = Rotation.from_rotvec(turn_rad).as_matrix()
     pose[:3, :3] = turn @ pose[:3, :3]
     pose[:3, 3] = turn @ (pose[:3, 3] - MIDDLE_M) + MIDDLE_M + shift_m
     return cs.DepthCamera(MATRIX, pose=pose)
@@ -110,9 +112,9 @@ def fitted(
     noise_m: float = NOISE_M,
     pose: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:
-    """E over the truth, the ends of its interval over that, and the RMS of the points [mm].
+    """Return E and the ends of its interval, each divided by the true E, and the RMS of the points [mm].
 
-    What the camera is off by is drawn from its priors, but for a turn and a shift given.
+    The errors of the camera are drawn from its priors; `pose` states rotation and shift instead.
     """
     seen_by = camera(distance_m)
     noise = gaussian_filter(rng.normal(size=SHAPE), 1.2)
@@ -136,7 +138,7 @@ def fitted(
     ]
     low, high = bars.statistical95 or (0.0, np.inf)
     (part,) = solution.collocation.iterates(solution.z)
-    (reading,) = part.segment.depths
+    (reading,) = camera_residuals(part.segment)
     rms_mm = 1e3 * np.sqrt(
         np.nanmean(
             reading.signed_distances_m(part.observables[-1], part.phi) ** 2
@@ -192,18 +194,17 @@ class SoftTwin:
 
 
 SOFT_TRUTH = {**TRUTH, "young_pa": 2.5e4}
-SOFT_MATRIX, SOFT_SHAPE = (
-    [[420.0, 0, 160], [0, 420.0, 120], [0, 0, 1]],
-    (240, 320),
-)
-SOFT_MIDDLE_M, SOFT_WAY = (
-    np.array([0.045, 0.015, -0.04]),
-    np.array([0, -0.9, 0.35]),
-)
-SOFT_DISTANCE_M, SOFT_NOISE_M = 0.4, 4e-4
-SOFT_TURN_RAD, SOFT_SHIFT_M = np.radians(2.7), 0.008
+SOFT_MATRIX = [[420.0, 0, 160], [0, 420.0, 120], [0, 0, 1]]
+SOFT_SHAPE = (240, 320)
+SOFT_MIDDLE_M = np.array([0.045, 0.015, -0.04])
+SOFT_WAY = np.array([0, -0.9, 0.35])
+SOFT_DISTANCE_M = 0.4
+SOFT_NOISE_M = 4e-4
+SOFT_TURN_RAD = np.radians(2.7)
+SOFT_SHIFT_M = 0.008
 # Standard deviations of the true pose of the camera, from image to image.
-TRUE_TURN_RAD, TRUE_SHIFT_M = np.radians(1.0), 0.003
+TRUE_TURN_RAD = np.radians(1.0)
+TRUE_SHIFT_M = 0.003
 # Parts of each side of a face that images are made of: with 4, chords in place of arcs make E 1.5 %
 # too large.
 SOFT_DIVISIONS = 12
@@ -336,7 +337,7 @@ def holds(seed: int) -> bool:
 
 
 def started(seed: int) -> np.ndarray:
-    """The same from a camera that is said to be 20 mm and 10 degrees off, whichever way."""
+    """Return the result of `fitted` for a camera pose that is wrong by 20 mm and 10° at random."""
     rng = np.random.default_rng(seed)
     ways = rng.normal(size=(2, 3))
     axis, way = ways / np.linalg.norm(ways, axis=1)[:, None]

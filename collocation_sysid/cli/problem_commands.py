@@ -91,7 +91,7 @@ def solve(options: SolveCommand) -> None:
     """Identify the parameters and write a run folder, runs/NAME by default.
 
     Parameters need no guess: a scan over the stiffness finds initial values. --start begins with
-    the result of an earlier run instead, also one with another mesh or time step.
+    the result of an earlier run instead, which may have another mesh or time step.
 
     --scheduler distributes the experiments to the workers of a cluster.
 
@@ -213,9 +213,9 @@ def simulate(options: SimulateCommand) -> None:
     are the guesses or fixed values; set other values with --set. Tables of force sensors, custom
     sensors, test benches and specimens are written, too. The names of the files are printed.
 
-    Files of an earlier simulation are replaced. Other files in the folder are an error unless it is
-    the folder of the problem, whose data files are never replaced. If the body loses its stability,
-    instability.png shows how.
+    Files of an earlier simulation are replaced. If the folder contains other files, nothing is
+    written, unless it is the folder of the problem; data files of the problem are never replaced.
+    If the body loses its stability, instability.png shows how.
     """
     from ..result.solve_progress import SolveProgress
 
@@ -267,9 +267,9 @@ class CheckCommand(ProblemOptions, OutputOptions):
     Attributes
     ----------
     full : bool
-        Simulate the complete recordings, however long that takes.
+        Simulate the complete recordings and make all comparisons, however long this takes.
     out : DIR
-        Folder for pictures of the depth cameras' images; runs/<problem>_check by default.
+        Folder for pictures of the cameras' images; runs/<problem>_check by default.
     """
 
     full: bool = False
@@ -286,12 +286,12 @@ class CheckCommand(ProblemOptions, OutputOptions):
 def check(options: CheckCommand) -> None:
     """Check a problem before solving it, and report probable mistakes.
 
-    Bodies, recordings and grasps are shown immediately. Derivatives, costs and a simulation at the
-    guess follow. If simulating the complete recordings takes more than ten seconds, only their
-    first samples are simulated.
+    The bodies, recordings and grasps are shown immediately. The check of the derivatives, the cost
+    of a solve and a simulation at the guess follow. If a simulation of the complete recordings
+    would take more than ten seconds, only their first samples are simulated.
 
-    For each depth camera, a picture shows the first image and the undeformed body. The pictures are
-    written into runs/NAME_check by default, but not with --json.
+    For each camera, a picture shows the first image and the undeformed body. The pictures are
+    written into runs/NAME_check by default; with --json no pictures are written.
 
     The exit code is 0, and 1 if derivatives disagree or the description is probably wrong, 2 for
     bad input.
@@ -302,7 +302,7 @@ def check(options: CheckCommand) -> None:
     problem = options.read_problem()
     if not options.as_json:
         print_result(quick_check_tables(quick_check(problem)))
-        _write_depth_overlays(
+        _write_camera_overlays(
             problem,
             options.out or Path("runs") / f"{run_name(options.problem)}_check",
         )
@@ -313,22 +313,22 @@ def check(options: CheckCommand) -> None:
     raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)
 
 
-def _write_depth_overlays(problem: Problem, folder: Path) -> None:
-    """Write a picture of each depth camera's first image with the undeformed body into the folder,
-    and print the names of the files.
+def _write_camera_overlays(problem: Problem, folder: Path) -> None:
+    """Write a picture of each camera's first image with the undeformed body into the folder, and
+    print the names of the files.
 
-    The folder is made if necessary. Nothing is written or printed without depth cameras.
+    The folder is made if necessary. Nothing is written or printed without cameras.
 
     Raises
     ------
     InputError
         If the folder cannot be made or written in.
     """
-    if not any(experiment.depths for experiment in problem.experiments):
+    if not any(each.camera_names for each in problem.experiments):
         return
-    from ..result.camera_overlays import save_overlays
+    from ..result.camera_overlays import OVERLAY_TEXT, save_overlays
 
     require_possible(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for file in save_overlays(problem.experiments, folder):
-        typer.echo(f"depth over the undeformed body: {file}")
+        typer.echo(f"{OVERLAY_TEXT}: {file}")

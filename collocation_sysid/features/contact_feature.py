@@ -13,23 +13,28 @@ from ..common.array_types import Array
 from ..common.display import short
 from ..methods.complementarity import with_contact_energy
 from ..methods.solution import Solution
-from ..model.contact import contact_terms
-from ..program.collocation import ExperimentIterate
-from ..program.contact.contact_summary import (
+from ..model.contact.contact_force import contact_terms
+from ..model.contact.contact_summary import (
     ContactSummary,
-    contact_summaries_of_parts,
+    contact_summaries,
     friction_summaries,
     surface_gaps_and_pressures,
 )
+from ..program.collocation import ExperimentIterate
 from ..recording.experiment import Experiment
-from ..statistics.concerns import Concern, concern_if
+from ..statistics.concerns import Concern, Topic, concern_if
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
 from ..statistics.misspecification.obstacle_misspecifications import (
+    MESSAGES,
     obstacle_hypotheses,
 )
 from ..statistics.misspecification.placement_causes import placement_mistakes
 from .feature import Feature
-from .measurement_results import FittedExperiment, InstrumentPrediction
+from .measurement_results import (
+    FittedExperiment,
+    InstrumentPrediction,
+    PictureKind,
+)
 
 # Number of faces below which the mesh determines the width of a contact.
 FEWEST_FACES = 4.0
@@ -37,6 +42,28 @@ FEWEST_FACES = 4.0
 # within.
 STEP_PER_WIDTH = 1e-3
 AT_THE_GUESS = ", at the guess"
+TOPICS = {
+    "contact": Topic(
+        "Contact",
+        "contact",
+        remedy="Check the position, the normal and the motion of the obstacle, and the mesh in the "
+        "contact area.",
+        messages={
+            "never": "in '{experiment}'{more} the body never touches {obstacle}{guess}; the "
+            "smallest gap is {mm:.3g} mm. The contact carries no information: check the place and "
+            "the motion of the obstacle, or remove it",
+            "coarse": "in '{experiment}'{more} only {faces:.2g} faces, {face_mm:.2g} mm large, "
+            "touch {obstacle} at the same time{guess}: the mesh is too coarse for the contact area; "
+            "refine it there",
+            "pressed": "in '{experiment}'{more} the body touches {obstacle} already at the first "
+            "sample{guess}: the beginning of the contact is not recorded; start the "
+            "recording earlier",
+            "lost": "in '{experiment}'{more} the body leaves {obstacle} at t = {t_s:.4g} s{guess}: "
+            "if it remained in contact, check the motion of the obstacle and the guess, or "
+            "end window_s before",
+        },
+    ),
+}
 
 
 def hypotheses(experiment: Experiment) -> tuple[Hypothesis, ...]:
@@ -60,7 +87,7 @@ def guess_concerns(
     `is_complete` is false if only the first samples were simulated: then there are only concerns
     about penetration at the start.
     """
-    concerns = contact_concerns(contact_summaries_of_parts(parts), AT_THE_GUESS)
+    concerns = contact_concerns(summaries_of_parts(parts), AT_THE_GUESS)
     return [
         each
         for each in concerns
@@ -70,7 +97,18 @@ def guess_concerns(
 
 def concerns(parts: Sequence[ExperimentIterate]) -> list[Concern]:
     """Return concerns about contact in the fit, see `contact_concerns`."""
-    return contact_concerns(contact_summaries_of_parts(parts))
+    return contact_concerns(summaries_of_parts(parts))
+
+
+def summaries_of_parts(
+    parts: Iterable[ExperimentIterate],
+) -> Iterator[ContactSummary]:
+    """Yield the contact summaries of each obstacle of each experiment, experiment by experiment, at
+    the positions of its iterate.
+    """
+    for part in parts:
+        t_s = part.equations.dynamics.t_s[: len(part.x)]
+        yield from contact_summaries(part.segment.experiment, part.x, t_s=t_s)
 
 
 def contact_concerns(
@@ -197,6 +235,18 @@ def fit_lines(
 
 CONTACT = Feature(
     "contact",
+    picture_kinds=[
+        PictureKind(
+            "pressure", "Pressure of obstacles on the body.", before="tracks"
+        ),
+        PictureKind(
+            "gap",
+            "Gap between the body's surface and obstacles.",
+            before="tracks",
+        ),
+    ],
+    topics=TOPICS,
+    messages=MESSAGES,
     hypotheses=hypotheses,
     fit_hypotheses=fit_hypotheses,
     guess_concerns=guess_concerns,

@@ -6,7 +6,7 @@ an `Iterate`. It is used by the reduced-space method and by shooting.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -140,6 +140,7 @@ class Horizon:
         self.collocation = collocation
         self.segments = self.workers.store_segments(collocation)
 
+    @one_blas_thread()
     def evaluate(
         self,
         p: Array,
@@ -174,15 +175,19 @@ class Horizon:
         known = (
             known_iterate.trajectories if known_iterate else self._repeat(None)
         )
-        return self._run(
-            p,
+        swept = self.workers.map_experiments(
             sweep,
+            self.solvers,
+            self.segments,
+            self._by_experiment(p),
             trajectories,
             known,
             self._repeat(None),
             self._repeat(accuracy),
         )
+        return self._iterate_from(p, swept)
 
+    @one_blas_thread()
     def evaluate_step(
         self,
         p: Array,
@@ -213,14 +218,18 @@ class Horizon:
         SearchEnded
             If the workers are lost.
         """
-        return self._run(
-            p,
+        swept = self.workers.map_experiments(
             sweep_after_step,
+            self.solvers,
+            self.segments,
+            self._by_experiment(p),
             previous.trajectories,
             self._by_experiment(step),
             self._repeat(accuracy),
         )
+        return self._iterate_from(p, swept)
 
+    @one_blas_thread()
     def reassociate(self, p: Array, iterate: Iterate) -> Iterate:
         """Return an iterate at parameters p (np,) with the measurements of the present collocation;
         positions and sensitivities are those of `iterate`, not computed again.
@@ -228,45 +237,30 @@ class Horizon:
         Its changes since a previous iterate are zero, as in `evaluate`. `SearchEnded` is raised if
         the workers are lost.
         """
-        return self._run(p, reassociate, iterate.trajectories)
+        evaluated = self.workers.map_experiments(
+            reassociate,
+            self.solvers,
+            self.segments,
+            self._by_experiment(p),
+            iterate.trajectories,
+        )
+        return self._iterate_from(p, evaluated)
 
-    @one_blas_thread()
-    def _run(
-        self,
-        p: Array,
-        run: Callable[..., LinearisedTrajectory],
-        *columns: Sequence[Any],
-    ) -> Iterate:
-        """Run a function of `trajectory_sweeps` for every experiment, and return the iterate of the
-        joined results.
+    def _iterate_from(self, p: Array, trajectories: list[Any]) -> Iterate:
+        """Return the iterate of the linearised trajectories of all experiments.
 
         The fit of the iterate, and its products of residuals with previous slopes, are sums over
         the experiments, the priors of the collocation and, if the horizon has one, its own prior
-        about the guess. The times of the sweeps are added to the stopwatch.
+        about the guess. The times of the sweeps are added to the stopwatch. `SearchEnded` is raised
+        if the workers are lost.
 
         Parameters
         ----------
         p : (np,) array
             All parameters (q, φ).
-        run : callable
-            Function of (solver, transcription, p of the experiment, entries of the columns).
-        columns : sequence
-            Further arguments, one entry per experiment each.
-
-        Raises
-        ------
-        SearchEnded
-            If the workers are lost.
-        Exception
-            Those of the function, as `SimulationError`.
+        trajectories : list of LinearisedTrajectory
+            One for each experiment, as the workers store them.
         """
-        trajectories = self.workers.map_experiments(
-            run,
-            self.solvers,
-            self.segments,
-            self._by_experiment(p),
-            *columns,
-        )
         reports: list[SweepReport] = self.workers.fetch(
             self.workers.map_experiments(_report, trajectories)
         )

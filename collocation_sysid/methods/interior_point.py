@@ -136,13 +136,14 @@ class InteriorPoint(Options):
         are large, so that the full Hessian is indefinite and its steps are too long. 0 uses the
         exact Hessian from the start.
     proximal : float
-        Number that is added to the Hessian's diagonal at the positions, most of which is zero
-        otherwise. It changes the steps slightly, but not the solution, and avoids factorisations
-        that fail because of rounding (wrong inertia).
+        Number that is added to the diagonal entries of the Hessian that belong to positions, most
+        of which would otherwise be zero. It changes the steps slightly, but not the solution, and
+        avoids factorisations that fail because of rounding (wrong inertia).
     contact : {"energy", "complementarity"}
-        Model of contact with obstacles: an energy that increases as the body comes near, or
-        pressures as further variables with 0 ≤ pressure ⟂ gap ≥ 0, whose product is decreased in a
-        few more solves. The latter does not support friction.
+        Model of contact with obstacles. "energy": an energy that increases as the body approaches
+        an obstacle. "complementarity": pressures are additional variables with 0 ≤ pressure ⟂ gap ≥
+        0, and the product of pressure and gap is decreased in a few more solves; friction is not
+        supported.
     linear_solver : str
         IPOPT's linear solver; the wheel contains "mumps" and "spral".
     tolerance : float
@@ -305,8 +306,9 @@ class InteriorPoint(Options):
         if "Invalid_Option" not in solution.message:
             return solution
         missing = (
-            f"linear_solver = '{self.linear_solver}' needs a library that is not installed; "
-            "'mumps' and 'spral' come with CasADi"
+            f"IPOPT refused one of its options: linear_solver = '{self.linear_solver}' probably "
+            "needs a library that is not installed; expected 'mumps' or 'spral', which come with "
+            "CasADi"
         )
         return replace(solution, notes=(*solution.notes, missing))
 

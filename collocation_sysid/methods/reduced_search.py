@@ -89,7 +89,7 @@ class SearchOptions(Options):
     Attributes
     ----------
     tolerance : float
-        Largest last step of a parameter's logarithm.
+        The search ends when a step changes the logarithm of no parameter by more than this value.
     max_iterations : int
         Largest number of sweeps, over all horizons; a rejected trial counts.
     trust : float
@@ -98,20 +98,21 @@ class SearchOptions(Options):
         Shares of the recording solved one after another, ending with 1. Not used if the solve
         starts from another run.
     rung_decrease : float
-        Each horizon but the last ends when a step promises to decrease the loss by less than this
-        share.
+        The search on each share of the recording except the last ends when the next step is
+        predicted to decrease the loss by less than this fraction.
     rung_prior : float
-        Standard deviation of a prior of each parameter's logarithm around its guess, for all
-        horizons but the last. A short horizon does not determine all parameters, and without this
-        prior they would move to their bounds.
+        Standard deviation of a prior of the logarithm of each parameter about its guess, for all
+        shares of the recording except the last. A short part of a recording does not determine all
+        parameters; without this prior, undetermined parameters would move to their bounds.
     hessian : {"gauss-newton", "exact"}
-        Once a step moves no parameter by more than 10 %, "gauss-newton" approximates what
-        Gauss–Newton neglects from the steps, and "exact" computes it from the Lagrangian, which
-        takes a second sweep per iteration and helps with large residuals. Before, both are
-        Gauss–Newton.
+        Second derivatives that Gauss–Newton neglects: "gauss-newton" approximates them from the
+        previous steps, and "exact" computes them from the Lagrangian, which takes a second sweep
+        per iteration and helps if residuals are large. Both options are plain Gauss–Newton until a
+        step changes no parameter by more than 10 %.
     factorisation : {"auto", "band", "sparse", "supernodal"}
-        Banded Cholesky, SuperLU, supernodal Cholesky (extra `large`), or whichever is estimated to
-        cost least.
+        Factorisation of the matrix of a time step: banded Cholesky ("band"), SuperLU ("sparse"),
+        supernodal Cholesky ("supernodal", extra `large`), or that with the lowest estimated cost
+        ("auto").
     """
 
     tolerance: Positive = 1e-8
@@ -245,41 +246,7 @@ class ReducedSearch:
 
     # Horizons of increasing length ------------------------------------------------------------
 
-    def run(self) -> tuple[Status, str]:
-        """Solve the complete problem from the given positions or, without any, on increasing
-        horizons.
-
-        Returns
-        -------
-        tuple of Status and str
-            Status and its sentence.
-
-        Raises
-        ------
-        SimulationError
-            If the simulation cannot be extended even after a fit of the rows that were reached, or
-            the sweep at the start of a horizon fails.
-        SearchEnded
-            If the workers are lost.
-        """
-        status = self._solve_from_start()
-        if status is not None:
-            return status, status.sentence
-        status = Status.CONVERGED
-        for share in self.options.ladder:
-            last = share == self.options.ladder[-1]
-            rows = [
-                samples_in_share(segment.grid_times, share)
-                for segment in self.collocation.transcriptions
-            ]
-            rung = self._horizon(rows, last)
-            self._extend_to(rung)
-            status = self._minimise(rung, last)
-            if status is Status.ITERATION_LIMIT:
-                break
-        return status, status.sentence
-
-    def _solve_from_start(self) -> Status | None:
+    def solve_from_start(self) -> Status | None:
         """Return the status of a solve of the complete problem from the given trajectories.
 
         None if there are none, or if the search raises a `SimulationError`; trajectories and point
@@ -294,10 +261,18 @@ class ReducedSearch:
             ]
             horizon = self._horizon(rows, last=True)
             accuracy = self._accuracy_at_start(horizon)
-            return self._minimise(horizon, is_last=True, accuracy=accuracy)
+            return self.minimise(horizon, is_last=True, accuracy=accuracy)
         except SimulationError:
             self.trajectories = self.point = None
             return None
+
+    def horizon_of_share(self, share: float) -> Horizon:
+        """Return the problem on a share of the recording, one of the `ladder` of the options."""
+        rows = [
+            samples_in_share(segment.grid_times, share)
+            for segment in self.collocation.transcriptions
+        ]
+        return self._horizon(rows, last=share == self.options.ladder[-1])
 
     def _horizon(self, rows: list[int], last: bool) -> Horizon:
         """Return the problem on the given numbers of first rows of each experiment; unless it is
@@ -315,7 +290,7 @@ class ReducedSearch:
             workers=self.workers,
         )
 
-    def _extend_to(self, horizon: Horizon) -> None:
+    def extend_to(self, horizon: Horizon) -> None:
         """Extend the trajectories to the length of a horizon by simulation, in place.
 
         If the simulation fails, a simulation from the start is used instead if it reaches further;
@@ -358,11 +333,11 @@ class ReducedSearch:
             furthest = sum(rows)
             self.trajectories = reached
             self._associate_initially(horizon, is_first=previous is None)
-            self._minimise(self._horizon(rows, last=False), is_last=False)
+            self.minimise(self._horizon(rows, last=False), is_last=False)
 
     # Steps on one horizon ---------------------------------------------------------------------
 
-    def _minimise(
+    def minimise(
         self, horizon: Horizon, is_last: bool, accuracy: float = ACCURACY
     ) -> Status:
         """Take Gauss–Newton steps on one horizon until convergence, and return the status.

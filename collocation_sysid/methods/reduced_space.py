@@ -115,40 +115,75 @@ class ReducedSpace(SearchOptions):
         recorder = Recorder(self.name, collocation, watch=watch)
         search = ReducedSearch(self, recorder, start=start, workers=workers)
         try:
-            status, message = search.run()
+            status = search.solve_from_start()
+            is_started = status is not None
+            for share in () if is_started else self.ladder:
+                horizon = search.horizon_of_share(share)
+                search.extend_to(horizon)
+                status = search.minimise(horizon, share == self.ladder[-1])
+                if status is Status.ITERATION_LIMIT:
+                    break
+            status = status or Status.CONVERGED
+            message = status.sentence
         except SEARCH_ENDS as end:
             status, message = status_of_end(end)
-        collocation = recorder.collocation
-        try:
-            trajectories = search.trajectories and workers.fetch(
-                workers.map_experiments(
-                    trajectory_positions, search.trajectories
-                )
-            )
-            recorder.notes += workers.notes()
-        except SearchEnded as lost:
-            status = lost.status
-            message = lost.message
-            trajectories, _ = simulate_trajectories(collocation, search.p)
-        z = complete_variables(collocation, search.p, known_rows=trajectories)
-        rows = [segment.grid_times for segment in collocation.transcriptions]
-        is_complete = (
-            trajectories is not None and [len(x) for x in trajectories] == rows
+        return _solution_of_search(
+            search, workers, status=status, message=message
         )
-        recorder.notes += _notes(
-            collocation, search.indefinite_steps, z=z, status=status
+
+
+def _solution_of_search(
+    search: ReducedSearch,
+    workers: ExperimentExecutor,
+    status: Status,
+    message: str,
+) -> Solution:
+    """Return the solution with the best point of a search.
+
+    Rows that were not simulated are those of a rigid motion with the grasp. If workers are lost
+    while the trajectories are fetched, their status and message replace those given.
+
+    Parameters
+    ----------
+    search : ReducedSearch
+        Search that has ended; notes are added to its recorder.
+    workers : ExperimentExecutor
+        Where the trajectories are stored.
+    status : Status
+        Status of the search.
+    message : str
+        Sentence for the user.
+    """
+    recorder = search.recorder
+    collocation = recorder.collocation
+    try:
+        trajectories = search.trajectories and workers.fetch(
+            workers.map_experiments(trajectory_positions, search.trajectories)
         )
-        multipliers = (
-            None if is_complete else np.zeros(collocation.constraint_count)
-        )
-        return recorder.solution(
-            status,
-            message,
-            z=z,
-            multipliers=multipliers,
-            iterations=search.sweeps,
-            evaluations=search.sweeps,
-        )
+        recorder.notes += workers.notes()
+    except SearchEnded as lost:
+        status = lost.status
+        message = lost.message
+        trajectories, _ = simulate_trajectories(collocation, search.p)
+    z = complete_variables(collocation, search.p, known_rows=trajectories)
+    rows = [segment.grid_times for segment in collocation.transcriptions]
+    is_complete = (
+        trajectories is not None and [len(x) for x in trajectories] == rows
+    )
+    recorder.notes += _notes(
+        collocation, search.indefinite_steps, z=z, status=status
+    )
+    multipliers = (
+        None if is_complete else np.zeros(collocation.constraint_count)
+    )
+    return recorder.solution(
+        status,
+        message,
+        z=z,
+        multipliers=multipliers,
+        iterations=search.sweeps,
+        evaluations=search.sweeps,
+    )
 
 
 def memory_mb(collocation: Collocation) -> float:

@@ -21,6 +21,7 @@ from ..fem.kernels import map_experiments
 from ..program.collocation import Collocation, ExperimentIterate, Violation
 from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
+from ..program.wrench_residual import predict_wrenches
 from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE
 from .stiffness_scan import Scan
@@ -61,11 +62,17 @@ _SENTENCES = {
     "not reached.",
     Status.ITERATION_LIMIT: "Stopped at the iteration limit; raise max_iterations or start from a "
     "better guess.",
-    Status.TIME_LIMIT: "Stopped at the time limit.",
+    Status.TIME_LIMIT: (
+        "Stopped at the time limit before the tolerances were reached; raise max_time_s or "
+        "start from a better guess."
+    ),
     Status.INFEASIBLE: "The equations of motion could not be satisfied from this start; check "
     "grasp, mass and units, or start from another guess.",
-    Status.STALLED: "The steps became too small to make progress; check the likely causes below, "
-    "and the guess if one is given.",
+    Status.STALLED: (
+        "The steps became too small to make progress before the tolerances were reached; "
+        "check the guess, if one is given, and the likely causes of the misfit that the "
+        "report lists."
+    ),
     Status.DIVERGED: "The iterates grew without bound; check units and bounds.",
     Status.NUMERICAL_FAILURE: "A step could not be computed or a function was not finite; another "
     "guess or linear solver may help.",
@@ -373,10 +380,12 @@ class Solution:
         Each experiment with wrench sensors has a list with one array per sensor: force [N] and
         torque [N m]. NaN means that the sensor was not predicted at that sample.
         """
-        parts = [part for part in self.parts if part.segment.sensors]
         return {
-            part.segment.experiment.name: part.predict_wrenches()
-            for part in parts
+            part.segment.experiment.name: predict_wrenches(
+                part.segment.sensors, part.reactions, part.phi
+            )
+            for part in self.parts
+            if part.segment.sensors
         }
 
     @cached_property

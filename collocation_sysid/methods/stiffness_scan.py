@@ -161,7 +161,10 @@ def start_problem(
         return collocation, None
     reason = f"the body cannot be simulated at the guess ({failure})"
     if failure is None:
-        reason = "at the guess, the simulation is farther from the measurements than an undeformed body"
+        reason = (
+            "at the guess, the simulation is farther from the measurements than a body that moves "
+            "rigidly with its grasps"
+        )
     result = rescue(collocation, reason, is_complete=is_complete)
     if result is None:
         return collocation, None  # the method reports what it needs

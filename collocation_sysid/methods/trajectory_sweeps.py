@@ -9,6 +9,7 @@ experiment alone.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import numpy as np
 
@@ -31,6 +32,10 @@ MARCHED = NewtonOptions(tolerance=1e-6)
 # Of equilibria near known ones. Those that are not found at once are too far for it.
 # Their stability is decided by the sweep along them, which factorises the same matrices.
 SETTLED = NewtonOptions(tolerance=1e-9, max_halvings=0, checks_stability=False)
+# Tolerance of these equilibria over the relative change of positions by the step, between that of
+# `SETTLED` and `LOOSEST`: the sweep takes Newton's next step, whose error is far smaller.
+SETTLED_SHARE = 1e-4
+LOOSEST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -267,16 +272,14 @@ def sweep_after_step(
     )
     dynamics = part.equations.dynamics
 
-    def sweep_at(x: Array) -> LinearisedTrajectory:
-        """Return the sweep at positions x (rows, 3n) [m]."""
-        return sweep(
-            solver,
-            transcription,
-            p=p,
-            trajectory=x,
-            previous=previous,
-            accuracy=accuracy,
-        )
+    sweep_from = partial(
+        sweep,
+        solver,
+        transcription,
+        p,
+        previous=previous,
+        accuracy=accuracy,
+    )
 
     def equilibria(options: NewtonOptions) -> Array | None:
         """Return the equilibria near the extrapolated positions; None if one is not found."""
@@ -290,16 +293,16 @@ def sweep_after_step(
         return x if failure is None else None
 
     if not dynamics.is_static:
-        return sweep_at(part.x)
+        return sweep_from(part.x)
     x = equilibria(SETTLED)
     if x is None:
-        return sweep_at(part.x)
-    result = sweep_at(x)
+        return sweep_from(part.x)
+    result = sweep_from(x)
     if not result.report.indefinite_steps:
         return result
     # Only now is it known that the path left the stable equilibria.
     x = equilibria(replace(SETTLED, checks_stability=True))
-    return sweep_at(part.x if x is None else x)
+    return sweep_from(part.x if x is None else x)
 
 
 def reassociate(

@@ -12,6 +12,7 @@ Forces:
 - `force_term`: interface of a force, and forces that have an energy.
 - `weight`: gravity, masses and loads.
 - `contact`: pressure and friction of rigid obstacles.
+- `local_force`: forces on few, changing points within one time step.
 - `point_forces`: custom forces and air drag.
 - `generated_functions`: small expressions with generated derivatives.
 

@@ -20,6 +20,7 @@ from ..common.array_types import Array, Index
 from ..common.time_dependence import over_time
 from ..fem.body import Linearisation, SecondDerivatives
 from ..fem.pattern import SymmetricPattern
+from .local_force import LocalForce
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,8 @@ class ForceTerm(ABC):
         Whether the derivatives by the velocity may be non-symmetric, as for gyroscopic forces.
     internal_variable_count : int
         Number of internal variables of each instance; nonzero only for a `Pointwise` term.
+    is_local : bool
+        Whether the force acts on few, changing points, to which time steps condense it.
     """
 
     size: int
@@ -86,6 +89,7 @@ class ForceTerm(ABC):
     internal_variable_count: int = 0
     is_nonlinear_in_velocity: bool = False
     has_skew_damping: bool = False
+    is_local: bool = False
 
     @abstractmethod
     def with_inputs(self, u: Array) -> Self:
@@ -96,6 +100,25 @@ class ForceTerm(ABC):
     @abstractmethod
     def force(self, states: States) -> Array:
         """Return the forces F (T, 3n) [N]."""
+
+    def local_force(
+        self, theta: Array, pattern: SymmetricPattern
+    ) -> LocalForce:
+        """Return this force in one time step, with forces on the body alone; only if `is_local`.
+
+        Parameters
+        ----------
+        theta : (k,) array
+            Constants of the body.
+        pattern : SymmetricPattern
+            Pattern of the matrices, which contains the couplings of the force.
+
+        Raises
+        ------
+        NotImplementedError
+            If the force is not local.
+        """
+        raise NotImplementedError
 
     def separate_bodies(self, places: Array, shape: Array) -> Array:
         """Return positions (n, 3) [m] with an obstacle, on which the force acts as well, moved out

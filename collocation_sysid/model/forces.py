@@ -2,7 +2,7 @@
 
 Use `Forces.from_experiment` for an experiment and `Forces.of_body_alone` for a body alone. The sum
 includes the internal forces f of materials and damping laws (see `fem.body`), the weight, tendons,
-pressures, contact, air drag and custom forces; no other module adds forces. Derivatives by the
+pressures, obstacles, air drag and custom forces; no other module adds forces. Derivatives by the
 state are on the sparsity pattern of all couplings. Columns of derivatives by θ are followed by
 those by the other inputs u, in the order of the terms, see `inputs`.
 """
@@ -23,9 +23,11 @@ from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.laws.memory import MemoryInput
 from ..fem.pattern import JointPattern, SymmetricPattern
 from ..recording.experiment import Experiment
-from .contact import Contact, contact_terms
+from .contact.contact_force import contact_terms
 from .force_term import AssemblyIndices, ForceTerm, Potential, States
+from .local_force import LocalForces
 from .point_forces import (
+    ComplementarityForce,
     CustomForce,
     Pointwise,
     air_drag_terms,
@@ -83,8 +85,8 @@ class Forces:
             Constants of the body; NaN by default, and with them the masses of parts with free
             densities.
         step_s : float
-            Length of the time steps over which contact pressures are averaged; 0 for the pressures
-            at each state.
+            Length of the time steps over which the pressures of obstacles are averaged; 0 for the
+            pressures at each state.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         potentials = tuple(
@@ -93,10 +95,9 @@ class Forces:
             )
             for actuator in experiment.actuators
         )
-        touching = contact_terms(experiment, step_s)
         further = (
             *potentials,
-            *touching,
+            *contact_terms(experiment, step_s),
             *air_drag_terms(experiment, times),
             *custom_force_terms(experiment.body, times),
         )
@@ -115,7 +116,7 @@ class Forces:
     def of_body_alone(
         cls, body: Body, theta: Sequence[float] | Array
     ) -> Forces:
-        """Return the forces on a body without loads, gravity, air or contact, at one time (0 s).
+        """Return the forces on a body without loads, gravity, air or obstacles, at one time (0 s).
 
         Internal forces at θ (k,) and the custom forces of the body are included.
         """
@@ -201,31 +202,36 @@ class Forces:
         after = self.external_terms[number + 1 :]
         return replace(self, external_terms=(*before, term, *after))
 
-    def without_contact(self) -> tuple[Forces, list[Contact]]:
-        """Return these forces without the contacts that have an energy, and a list of the contacts
-        removed, empty if there were none.
+    @property
+    def has_local_forces(self) -> bool:
+        """Whether any force is local, see `local_forces`."""
+        return any(term.is_local for term in self.external_terms)
 
-        The sparsity pattern is unchanged. Contact as complementarity stays.
+    def without_local_forces(self) -> Forces:
+        """Return these forces without the local ones, see `local_forces`; the sparsity pattern is
+        unchanged.
         """
-        touching = [
-            term
-            for term in self.external_terms
-            if isinstance(term, Contact) and not term.is_complementarity
-        ]
         further = tuple(
-            term for term in self.external_terms if term not in touching
+            term for term in self.external_terms if not term.is_local
         )
         places = [
-            p.entries
-            for t, p in self._terms_with_indices
-            if t.couplings and t not in touching
+            indices.entries
+            for term, indices in self._terms_with_indices
+            if term.couplings and not term.is_local
         ]
         pattern = JointPattern(
             self.pattern, (self.joint_pattern.places[0], *places)
         )
-        return replace(
-            self, external_terms=further, joint_pattern=pattern
-        ), touching
+        return replace(self, external_terms=further, joint_pattern=pattern)
+
+    def local_forces(self) -> LocalForces:
+        """Return the local forces in one time step, which solvers of a step treat apart."""
+        parts = [
+            term.local_force(self.theta, self.pattern)
+            for term in self.external_terms
+            if term.is_local
+        ]
+        return LocalForces(parts, self.pattern)
 
     def only_loads(self) -> Forces:
         """Return these forces without the external terms besides weight and loads; internal forces
@@ -476,12 +482,13 @@ class Forces:
 
     @property
     def complementarity_terms(self) -> list[int]:
-        """Indices in `external_terms` of the contacts as complementarity."""
+        """Indices in `external_terms` of the forces of a complementarity condition."""
         further = enumerate(self.external_terms)
         return [
             k
             for k, term in further
-            if isinstance(term, Contact) and term.is_complementarity
+            if isinstance(term, ComplementarityForce)
+            and term.is_complementarity
         ]
 
     def _with_input_columns(self, by_theta: Array) -> Array:

@@ -424,6 +424,29 @@ class LawDerivatives(NamedTuple):
     b: Array
 
 
+class ComplementarityForce(Pointwise):
+    """Force of a pressure that may be given by a relaxed complementarity condition.
+
+    Under the condition 0 ≤ b ⟂ g ≥ 0 all points have a pressure, in proportion to b [m]. Programs
+    with b as variables give them to the force as its `previous_state`; its internal variables are
+    then the residuals of the condition.
+
+    Attributes
+    ----------
+    is_complementarity : bool
+        Whether b follows from the condition; otherwise from an energy.
+    pressure_unit_m : float
+        Unit of b as a variable [m].
+    """
+
+    is_complementarity: bool
+    pressure_unit_m: float
+
+    @abstractmethod
+    def scaled_pressures(self, xi: Array) -> Array:
+        """Return b (1, T, i) [m] of all i points at positions ξ (T, 3n) [m]."""
+
+
 @dataclass(frozen=True, eq=False)
 class _LawInputs:
     """Inputs u = (y, ẏ, c, h_{k−1}) and data of a law at some states.

@@ -13,8 +13,9 @@ Measurements
     `observables` are measurable quantities, `observable_response` linearises them along the
     equations of motion, and `measurement_residual` compares them with data. Residuals of
     force–torque sensors are in `wrench_residual`, of custom sensors in `custom_sensor_residual`,
-    of others in the packages `markers` and `depth`. The package `reactions` contains the reactions
-    of grasps.
+    of other sensors in packages of their own. `correspondences` is the interface of those that
+    measure unlabelled points, and `unlabelled_points` lists them. The package `reactions` contains
+    the reactions of grasps.
 Linear algebra
     `sweep` solves the linearised equations of motion forward and backward in time,
     `least_squares` accumulates normal equations in square-root form, `stopwatch` measures time, and
@@ -25,7 +26,7 @@ Streaming
 Simulation
     `simulation` simulates an experiment with the package `forward`.
 Analyses of a motion
-    The packages `contact` and `modes`.
+    The package `modes`.
 
 Methods use `Collocation`; statistics use `Transcription`, `ExperimentIterate` and `Sweep`;
 predictions use `simulate`; live estimation uses `streaming`.

@@ -14,11 +14,9 @@ from dataclasses import dataclass, replace
 from ..common.array_types import Array
 from ..fem.body import Body
 from ..recording.experiment import Experiment
-from .depth.surface_correspondences import (
-    SurfaceCorrespondences,
-    initial_correspondences,
-)
+from .correspondences import Correspondences
 from .markers.marker_association import MarkerAssociation
+from .unlabelled_points import declared_points, initial_correspondences
 
 # The clock leaves its sample when its shift differs by more than this [samples].
 SAMPLES_OFF = 1.0
@@ -26,7 +24,7 @@ SAMPLES_OFF = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """Elements of the markers, sample of the clock, and surface points of depth cameras.
+    """Elements of the markers, sample of the clock, and correspondences of unlabelled points.
 
     Attributes
     ----------
@@ -34,18 +32,18 @@ class Association:
         Elements and directions of the marker places.
     clock_samples : int
         Whole samples of the clock's shift.
-    correspondences : tuple of SurfaceCorrespondences
-        Surface correspondences of the depth cameras, in their order.
+    correspondences : tuple of Correspondences
+        Those of each sensor that measures unlabelled points, in the order of the sensors.
     """
 
     markers: MarkerAssociation
     clock_samples: int = 0
-    correspondences: tuple[SurfaceCorrespondences, ...] = ()
+    correspondences: tuple[Correspondences, ...] = ()
 
     @classmethod
     def from_experiment(cls, experiment: Experiment) -> Association:
-        """Return the association for the stated places of an experiment's markers and depth
-        cameras, with a clock that is not shifted.
+        """Return the association for the stated places of an experiment's markers and sensors, with
+        a clock that is not shifted.
         """
         return cls(
             MarkerAssociation.from_experiment(experiment),
@@ -54,11 +52,11 @@ class Association:
 
     def matches(self, experiment: Experiment) -> bool:
         """Return whether the association belongs to the experiment's body (the same object), and
-        has the same priors and cameras.
+        has the same priors and unlabelled points.
         """
         return self.markers.matches(experiment) and [
-            each.camera.depth for each in self.correspondences
-        ] == [*experiment.depths]
+            each.measured for each in self.correspondences
+        ] == declared_points(experiment)
 
     def centred_at(self, places_m: Array) -> Association:
         """Return the association with the markers centred at places (M, 3) [m] on the undeformed
@@ -74,7 +72,7 @@ class Association:
         self,
         markers: MarkerAssociation,
         shift_samples: float,
-        correspondences: Sequence[SurfaceCorrespondences],
+        correspondences: Sequence[Correspondences],
     ) -> Association:
         """Return the association at other estimates; self if nothing has changed.
 
@@ -85,8 +83,8 @@ class Association:
         shift_samples : float
             Shift of the clock over the sample interval. The clock is moved if it differs by more
             than `SAMPLES_OFF`.
-        correspondences : sequence of SurfaceCorrespondences
-            One for each depth camera; the present object where it has not changed.
+        correspondences : sequence of Correspondences
+            One for each sensor; the present object where it has not changed.
         """
         clock_samples = self.clock_samples
         if abs(shift_samples - clock_samples) > SAMPLES_OFF:

@@ -55,6 +55,8 @@ class ResidualExpression:
         means ρ(d) = d².
     group_size : int
         How many numbers of y the loss takes as one vector.
+    is_compiled : bool
+        Whether to compile the residual to native code.
     """
 
     expression: Expression
@@ -64,6 +66,7 @@ class ResidualExpression:
     measured_count: int
     huber: float | None = None
     group_size: int = GROUP
+    is_compiled: bool = False
 
     @cached_property
     def residual(self) -> GeneratedFunction:
@@ -74,6 +77,7 @@ class ResidualExpression:
             self._residual_expression,
             self._input_count,
             data_size=self._data_count,
+            is_compiled=self.is_compiled,
         )
 
     @cached_property
@@ -283,6 +287,8 @@ class MeasurementResidual(ABC):
         Whether error bars never use a noise below σ, and the residuals are not used to estimate the
         noise of other measurements. Set it for measurements with rounding errors, which may happen
         to be small.
+    is_compiled : bool
+        Whether to compile the expression to native code; worthwhile with many entities.
     """
 
     observable: Observable
@@ -300,6 +306,7 @@ class MeasurementResidual(ABC):
     has_offsets: ClassVar[bool] = False
     has_fixed_stencils: ClassVar[bool] = True
     has_noise_floor: ClassVar[bool] = False
+    is_compiled: ClassVar[bool] = False
 
     @property
     def first_needed_s(self) -> float:
@@ -458,6 +465,7 @@ class MeasurementResidual(ABC):
                 measured_count=self.measured.shape[2],
                 huber=self.huber,
                 group_size=self.group_size,
+                is_compiled=self.is_compiled,
             )
         return self._expressions[vectors, data]
 

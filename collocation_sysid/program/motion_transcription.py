@@ -36,7 +36,6 @@ from .custom_sensor_residual import (
     CustomSensorResidual,
     custom_sensor_residuals,
 )
-from .depth.depth_camera_model import DepthCameraModel
 from .linear_algebra.block_band import (
     BandBlock,
     BlockBand,
@@ -47,6 +46,7 @@ from .linear_algebra.block_band import (
 from .motion_jacobian import MotionJacobian, shifted_back
 from .reactions.reaction_resultant import ReactionGrid, sensed_dofs
 from .shared_nuisances import NuisanceIndices
+from .unlabelled_points import SensorModels, sensor_models
 from .wrench_residual import WrenchResidual, wrench_residuals
 
 T = TypeVar("T", bound=np.generic)
@@ -191,15 +191,9 @@ class MotionTranscription:
         )
 
     @cached_property
-    def camera_models(self) -> tuple[DepthCameraModel, ...]:
-        """Camera models of all depth cameras of the experiment, in their order."""
-        cameras = range(len(self.experiment.depths))
-        return tuple(
-            DepthCameraModel.from_experiment(
-                self.experiment, k, nuisance=self.nuisance
-            )
-            for k in cameras
-        )
+    def sensor_models(self) -> SensorModels:
+        """Models of the sensors that measure unlabelled points, in their order."""
+        return sensor_models(self.experiment, self.nuisance)
 
     @cached_property
     def sensed_dofs(self) -> Index:

@@ -737,7 +737,7 @@ class StreamingSweep:
         `failure`.
         """
         model = self.model
-        what = f"the step at row {self.row}"
+        what = f"time step {self.row}"
         time_s = self.row * model.interval_s / model.substeps
         raise simulation_error(
             model.newton, failure, time_s=time_s, what=what

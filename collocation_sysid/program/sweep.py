@@ -859,8 +859,8 @@ class Sweep:
     ) -> SimulationError:
         """Return the error for the user that the equations at a time [s] cannot be solved."""
         return SimulationError(
-            f"experiment '{self.segment.experiment.name}': the linearised equations of "
-            f"motion cannot be solved: {error}",
+            f"experiment '{self.segment.experiment.name}': the linearised equations of motion "
+            f"cannot be solved ({error}); check mass, units and grasps, or give other guesses",
             time_s,
         )
 

@@ -18,8 +18,7 @@ from ..common.cached_values import cached_values
 from ..model.equations_at_parameters import EquationsAtParameters
 from ..recording.nuisance import TIME
 from .association import Association
-from .depth.depth_residual import DepthResidual
-from .depth.outline_residual import OutlineResidual
+from .correspondences import CorrespondenceResidual
 from .local_loss import LocalLoss
 from .markers.marker_residual import MarkerResidual
 from .measurement_residual import MeasurementResidual
@@ -28,6 +27,7 @@ from .motion_transcription import (
     RowWeights,
     WeightedHistory,
 )
+from .unlabelled_points import residuals_of_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,45 +56,33 @@ class Transcription(MotionTranscription):
         )
 
     @cached_property
-    def depths(self) -> tuple[DepthResidual, ...]:
-        """Measurement models of the depth cameras, in their order."""
-        return tuple(
-            DepthResidual.from_correspondences(
-                replace(sighting, camera=view),
-                self.dynamics.t_s,
-                nuisance=self.nuisance,
-                huber=self.huber,
-            )
-            for sighting, view in zip(
-                self.association.correspondences,
-                self.camera_models,
-                strict=True,
-            )
+    def unlabelled(self) -> tuple[CorrespondenceResidual, ...]:
+        """Measurement models of unlabelled points: one for each of the association's
+        correspondences, in their order, then others at the same correspondences.
+        """
+        return residuals_of_points(
+            self.association.correspondences,
+            self.sensor_models,
+            self.dynamics.t_s,
+            nuisance=self.nuisance,
+            huber=self.huber,
         )
 
-    @cached_property
-    def outlines(self) -> tuple[OutlineResidual, ...]:
-        """Measurement models of the outlines in depth images, in the order of the cameras
-        that have images.
-        """
-        with_images = (
-            depth
-            for depth in self.depths
-            if len(depth.correspondences.camera.depth.images_m)
-        )
-        return tuple(OutlineResidual.from_depth(depth) for depth in with_images)
+    @property
+    def reassociable(self) -> tuple[CorrespondenceResidual, ...]:
+        """The first of `unlabelled`, one for each of the association's correspondences."""
+        return self.unlabelled[: len(self.association.correspondences)]
 
     @cached_property
     def residuals(self) -> tuple[MeasurementResidual, ...]:
-        """All measurement models: markers, force–torque sensors, custom sensors, depth cameras,
-        outlines.
+        """All measurement models: markers, force–torque sensors, custom sensors, unlabelled
+        points.
         """
         return (
             self.markers,
             *self.sensors,
             *self.custom_sensors,
-            *self.depths,
-            *self.outlines,
+            *self.unlabelled,
         )
 
     @cached_property
@@ -145,7 +133,8 @@ class Transcription(MotionTranscription):
         """Return the association that belongs to the estimates, and φ relative to it.
 
         Markers get the elements that contain their estimated places, clocks the nearest samples,
-        and depth cameras the correspondences in the current shapes. Neither self nor φ is modified.
+        and unlabelled points the correspondences in the current shapes. Neither self nor φ is
+        modified.
 
         Parameters
         ----------
@@ -153,7 +142,7 @@ class Transcription(MotionTranscription):
             Nuisance parameters in units of their priors, relative to the present association.
         x : (rows, 3n) array
             First rows of the motion [m], at least `rows_to_follow`; it may have no rows if there
-            are no depth cameras.
+            are no unlabelled points.
 
         Returns
         -------
@@ -171,13 +160,13 @@ class Transcription(MotionTranscription):
             np.append(phi, 0.0)[places]
         )
         correspondences = []
-        for depth, present in zip(
-            self.depths, self.association.correspondences, strict=True
+        for residual, present in zip(
+            self.reassociable, self.association.correspondences, strict=True
         ):
-            own = depth.correspondences
-            updated = own.updated(depth.surface_shapes(x, phi), phi)
-            # The measurement model has a copy, with its own camera model.
-            correspondences.append(present if updated is own else updated)
+            updated = residual.reassociated(x, phi)
+            # The measurement model has a copy, with its own model of the sensor.
+            is_same = updated is residual.correspondences
+            correspondences.append(present if is_same else updated)
         association = self.association.updated(
             markers,
             float(shifts_s.sum()) / self.experiment.timestep_s,
@@ -188,13 +177,13 @@ class Transcription(MotionTranscription):
     def place_unknown_markers(
         self, phi: Array, x: Array, only_poses: bool = False
     ) -> tuple[Association, Array]:
-        """Return the association and φ with unknown marker places and depth cameras initialised
+        """Return the association and φ with unknown marker places and poses of sensors initialised
         from the first rows of a motion.
 
         A marker without a stated place is put where its first sample lies on the body; it keeps its
-        place if it has no sample or its first one is later than the rows. Depth cameras are aligned
-        with the first shape that they measure, and the parameters of their poses are set
-        accordingly.
+        place if it has no sample or its first one is later than the rows. Sensors of unlabelled
+        points are aligned with the first shape that they measure, and the parameters of their poses
+        are set accordingly.
 
         Parameters
         ----------
@@ -203,7 +192,8 @@ class Transcription(MotionTranscription):
         x : (rows, 3n) array
             First rows of the motion [m], at least `rows_to_place`.
         only_poses : bool
-            Whether to keep the correspondences of depth cameras and align their poses alone.
+            Whether to keep the correspondences of unlabelled points and align the poses of their
+            sensors alone.
 
         Returns
         -------
@@ -212,17 +202,15 @@ class Transcription(MotionTranscription):
             it.
         """
         phi = phi.copy()
-        sightings = tuple(
-            depth.aligned_correspondences(x, phi, only_pose=only_poses)
-            for depth in self.depths
+        aligned = tuple(
+            each.aligned_correspondences(x, phi, only_pose=only_poses)
+            for each in self.reassociable
         )
-        for each in sightings:
-            phi[each.camera.parameter_indices] = each.camera.parameters_from(
-                each.start_values
-            )[each.camera.parameter_indices]
+        for correspondences in aligned:
+            phi = correspondences.with_start_values(phi)
         chart, phi = self._place_markers(phi, x)
         return (
-            replace(chart, correspondences=sightings) if sightings else chart
+            replace(chart, correspondences=aligned) if aligned else chart
         ), phi
 
     def _place_markers(self, phi: Array, x: Array) -> tuple[Association, Array]:
@@ -257,7 +245,7 @@ class Transcription(MotionTranscription):
     @property
     def rows_to_place(self) -> int:
         """Number of rows of x that `place_unknown_markers` needs; 0 if all places are stated and
-        there is no depth camera.
+        there are no unlabelled points.
         """
         unknown = ~self.experiment.markers.located
         first = self.experiment.markers.is_present[:, unknown].argmax(axis=0)
@@ -265,16 +253,15 @@ class Transcription(MotionTranscription):
             [int(self.markers.sample_rows[first].max())] if len(first) else []
         )
         return 1 + max(
-            rows + [depth.first_row for depth in self.depths], default=-1
+            rows + [each.first_row for each in self.reassociable], default=-1
         )
 
     @property
     def rows_to_follow(self) -> int:
-        """Number of rows of x that `follow_estimates` needs; 0 without depth cameras.
-
-        All grid times are needed.
+        """Number of rows of x that `follow_estimates` needs: all grid times, or 0 without
+        unlabelled points.
         """
-        return self.grid_times if self.depths else 0
+        return self.grid_times if self.reassociable else 0
 
     def marker_places_m(self, phi: Array) -> Array:
         """Return the places (M, 3) of the markers on the undeformed body at φ (k,) [m]."""
@@ -284,8 +271,8 @@ class Transcription(MotionTranscription):
 
     @property
     def guess_phi(self) -> Array:
-        """Nuisance parameters φ (k,) at the start of a solve: zero, except for the clock and camera
-        poses of the association.
+        """Nuisance parameters φ (k,) at the start of a solve: zero, except for the clock and the
+        poses of sensors in the association.
         """
         phi = np.zeros(self.nuisance.size)
         time_shifts = self.nuisance.indices_of_rows(TIME)
@@ -294,10 +281,8 @@ class Transcription(MotionTranscription):
             * self.experiment.timestep_s
             / self.nuisance.scales[time_shifts]
         )
-        for depth in self.depths:
-            phi += depth.correspondences.camera.parameters_from(
-                depth.correspondences.start_values
-            )
+        for each in self.reassociable:
+            phi = each.correspondences.with_start_values(phi)
         return self._with_marker_places(
             phi, self.association.markers.centre_coordinates
         )

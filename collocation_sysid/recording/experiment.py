@@ -34,6 +34,7 @@ from .sample_times import (
     first_unordered_time,
     sample_interval_s,
 )
+from .separate_sensor import SENSORS, SeparateSensor, sensor_fields
 from .tendon import Tendon
 from .time_tables import is_within_experiment
 
@@ -79,17 +80,18 @@ class Experiment:
     name : str
         For messages and reports; experiments of one problem have different names.
     kind : {"dynamic", "static"}
-        A motion ("dynamic"); or samples each of which is an equilibrium of its own ("static"), at
-        any times (with memory, quasi-static in time).
+        "dynamic": a motion. "static": each sample is an equilibrium, and a material with memory
+        relaxes between the samples.
     start : {"equilibrium", "undeformed", "given"}
         State at the first time: at rest under its loads; undeformed and at rest; or as given.
     start_rule : {"standard", "paper"}
-        Inertia of the first step: from the starting velocity, or zero acceleration.
+        Inertia in the first time step. "standard": from the initial velocity. "paper": zero
+        acceleration.
     start_positions_m, start_velocities_m_s : (n, 3) arrays, optional
         The state for "given"; at rest if the velocities are left out.
     loaded_since_s : float
-        How long a body with memory has been in the shape of its equilibrium; by default it has
-        relaxed completely.
+        How long a body with memory has been in the shape of its initial equilibrium [s]; by default
+        the material is completely relaxed.
     validation : bool
         Whether the recording is only predicted, not fitted.
     frames_fault : str
@@ -150,8 +152,12 @@ class Experiment:
     forces: tuple[Force, ...] = key(converter=tuple, default=())
     tendons: tuple[Tendon, ...] = key(converter=tuple, default=())
     pressures: tuple[Pressure, ...] = key(converter=tuple, default=())
-    readings: tuple[Gauge, ...] = key(converter=tuple[Gauge, ...], default=())
-    depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=())
+    readings: tuple[Gauge, ...] = key(
+        converter=tuple[Gauge, ...], default=(), metadata=SENSORS
+    )
+    depths: tuple[Depth, ...] = key(
+        converter=tuple[Depth, ...], default=(), metadata=SENSORS
+    )
     nuisance: Nuisance = DEFAULT_NUISANCE
     air_density_kg_m3: float = key(
         converter=air_density, default_factory=usual_air_density
@@ -228,6 +234,15 @@ class Experiment:
         `grasps`.
         """
         return tuple(self.sensors_by_grasp.values())
+
+    @property
+    def separate_sensors(self) -> list[SeparateSensor]:
+        """Sensors with times of their own, besides markers and those of grasps."""
+        return [
+            each
+            for name in sensor_fields(Experiment)
+            for each in getattr(self, name)
+        ]
 
     @property
     def camera_names(self) -> list[str]:
@@ -613,8 +628,8 @@ class Experiment:
         fewest = 1 if self.is_static else 3
         if len(self.t_s) < fewest:
             raise InputError(
-                f"{len(self.t_s)} samples in time; at least {fewest} are needed: check window_s "
-                "and the marker file"
+                f"found {len(self.t_s)} sample times; expected at least {fewest}: check window_s and "
+                "the marker file"
             )
         if not self.is_static:
             step_s = sample_interval_s(
@@ -629,7 +644,8 @@ class Experiment:
             np.abs(measured - self.t_s).max() > STEP_TOLERANCE * step_s
         ):
             raise InputError(
-                "the markers' times differ from t_s; align poses and markers to one grid first"
+                "the sample times of the markers differ from t_s of the experiment; expected the same "
+                "times: cs.align brings poses and markers to common times"
             )
         if self.markers.sample_count == 0:
             self._require_measurements()
@@ -659,7 +675,7 @@ class Experiment:
             what = f"the reading '{gauge.name}'"
             if [other.name for other in self.readings].count(gauge.name) > 1:
                 raise InputError(
-                    f"two readings are called {gauge.name!r}; expected another name"
+                    f"two readings are called {gauge.name!r}; expected different names"
                 )
             is_within_experiment(
                 gauge.sample_times_s,
@@ -683,7 +699,7 @@ class Experiment:
             what = f"the depth camera '{depth.name}'"
             if [other.name for other in self.depths].count(depth.name) > 1:
                 raise InputError(
-                    f"two depth cameras are called {depth.name!r}; expected another"
+                    f"two depth cameras are called {depth.name!r}; expected different names"
                 )
             is_within_experiment(
                 depth.sample_times_s,
@@ -701,13 +717,16 @@ class Experiment:
                 )
 
     def _require_measurements(self) -> None:
-        """Raise an `InputError` if, besides markers, nothing is measured either: no custom sensor,
-        depth camera or wrench.
+        """Raise an `InputError` if, besides markers, nothing is measured either: by no sensor of its
+        own times and no wrench.
         """
-        if self.readings or self.depths or self.instrumented_grasps:
+        if self.separate_sensors or self.instrumented_grasps:
             return
         if not self.markers.names:
-            message = "nothing is measured: there are no markers, no wrench and no reading"
+            message = (
+                "nothing is measured: there are no markers, no measured wrench, no reading of a "
+                "sensor and no depth camera"
+            )
             raise InputError(f"{message}; expected at least one of them")
         raise InputError(
             "there is no marker sample; check the marker file and window_s"
@@ -730,7 +749,8 @@ class Experiment:
         grasped = prescribed_dofs(self.grasps)
         if grasped.size and grasped[-1] >= 3 * n:
             raise InputError(
-                f"a grasp holds node {grasped[-1] // 3}, but the body has only {n} nodes"
+                f"a grasp holds node {grasped[-1] // 3}; expected node indices from 0 to {n - 1}: the "
+                f"body has {n} nodes"
             )
         for what, loads in (
             ("point mass is attached to", self.masses),
@@ -739,7 +759,8 @@ class Experiment:
             beyond = [load.nodes[-1] for load in loads if load.nodes[-1] >= n]
             if beyond:
                 raise InputError(
-                    f"a {what} node {beyond[0]}, but the body has only {n} nodes"
+                    f"a {what} node {beyond[0]}; expected node indices from 0 to {n - 1}: the body has {n} "
+                    "nodes"
                 )
         placed = self.markers.placement.node_count
         own = len(self.body.nodes.points_m)

@@ -51,7 +51,9 @@ ModelPart = Literal[
 ]
 # Scope of parameters that recordings share, as a pattern and in words for messages.
 SCOPE = r"shared( \S+)?"
-SCOPE_TEXT = '"shared", or "shared" and a word for each of several groups'
+SCOPE_TEXT = (
+    '"shared", or "shared" followed by the name of a group of recordings'
+)
 # Readable units: factor and text by SI unit.
 READABLE_UNITS = {
     "m": (1e3, " mm"),
@@ -252,7 +254,7 @@ def _camera_sharing_key(experiment: Any) -> dict[str, Any]:
     (the same object), and the pose of each camera in order.
     """
     places = [tuple(d.camera.pose.ravel()) for d in experiment.depths]
-    return {"body": id(experiment.body), "pose of its cameras": places}
+    return {"body": id(experiment.body), "pose of its depth cameras": places}
 
 
 def _is_motion(experiment: Any) -> bool:
@@ -287,7 +289,7 @@ def _hand_eye_sharing_key(experiment: Any) -> dict[str, Any]:
     nodes = {
         int(node) for grasp in experiment.body_grasps for node in grasp.nodes
     }
-    return {"body": id(experiment.body), "nodes in its grasps": nodes}
+    return {"body": id(experiment.body), "set of nodes in its grasps": nodes}
 
 
 PLACE = NuisanceRow(
@@ -303,7 +305,10 @@ PLACE = NuisanceRow(
     label="place of {which}, {axis}",
     description="errors of the positions in reference_m without a reference_sigma_m; they rotate "
     "with the body",
-    same=lambda e: {"body": id(e.body), "kind of places": e.markers.on_surface},
+    same=lambda e: {
+        "body": id(e.body),
+        "value of places (on_surface in Python)": e.markers.on_surface,
+    },
 )
 OFFSET = NuisanceRow(
     "camera_offset_m",
@@ -340,7 +345,8 @@ CALIBRATION_DISTORTION = NuisanceRow(
     applies=_has_markers,
     label="distortion of the cameras",
     sentence="distortion of the cameras: {signed}",
-    description="radial distortion of first order about the body's middle: a factor 1 + k r²",
+    description="coefficient k of a radial distortion by the cameras: distances r from the "
+    "middle of the body are multiplied by 1 + k r²",
     reading=_distort_position,
 )
 TIME = NuisanceRow(
@@ -352,7 +358,7 @@ TIME = NuisanceRow(
     applies=_is_motion,
     label="time shift",
     sentence="markers measured {size} {way} than stated{limit}",
-    description="how much later than stated the markers were measured, on the grasps' clock",
+    description="how much later than stated the markers were measured, by the clock of the grasps",
     same=lambda e: {"time between samples": round(e.timestep_s, 12)},
     clock=lambda values, t_s, data: values,
 )
@@ -368,7 +374,7 @@ CLOCK_RATE = NuisanceRow(
     ),
     label="rate of the markers' clock",
     sentence="the markers' clock is slow by {signed}",
-    description="how much slower than the grasps' clock that of the markers runs",
+    description="how much slower the clock of the markers runs than the clock of the grasps",
     clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]),
 )
 POSE_TURN = NuisanceRow(
@@ -437,8 +443,9 @@ GRASP_SHIFT = NuisanceRow(
     by="length",
     label="shift in the grasp, {axis}",
     sentence="translation of the body in the gripper: {size}",
-    description="a constant translation of the body in its grasps; both if the start is an "
-    "equilibrium and markers measure it",
+    description="a constant translation of the body in its grasps; rotation and "
+    "translation are estimated if the start is an equilibrium and there are "
+    "markers",
     same=_hand_eye_sharing_key,
 )
 STRAIN_ZERO = NuisanceRow(
@@ -463,7 +470,7 @@ ZERO = NuisanceRow(
     by="worst",
     label="zero of grasp {which}, {axis}",
     sentence="zero error of a displacement: up to {size}",
-    description="a constant offset of each displacement along each of its axes",
+    description="a constant offset of each prescribed displacement along each of its axes",
 )
 OBSTACLE_OFFSET = NuisanceRow(
     "obstacle_offset_m",
@@ -476,8 +483,9 @@ OBSTACLE_OFFSET = NuisanceRow(
     applies=lambda experiment: bool(experiment.obstacles),
     label="place of {which}",
     sentence="position error of an obstacle: up to {size}",
-    description="a constant offset of each obstacle along its normal, or along the axis of its "
-    "displacement, which changes when it touches the body",
+    description="a constant offset of each obstacle along its normal, or along the axis of "
+    "its displacement; it changes the time at which the obstacle touches the "
+    "body",
 )
 OBSTACLE_TILT = NuisanceRow(
     "obstacle_tilt_rad",
@@ -497,8 +505,8 @@ OBSTACLE_TILT = NuisanceRow(
     ),
     label="tilt of {which}, {axis}",
     sentence="tilt of an obstacle: {size}",
-    description="a constant tilt of each obstacle that is a plane or a box, about its point or "
-    "middle",
+    description="a constant tilt of each obstacle that is a plane or a box, about the "
+    "point of the plane or the middle of the box",
 )
 OBSTACLE_TIME = NuisanceRow(
     "obstacle_time_s",
@@ -561,7 +569,7 @@ PRESSURE_OFFSET = NuisanceRow(
     changes=("drives",),
     label="{which}, lost",
     sentence="{which} {signed}",
-    description="offset by which each pressure is lower than stated",
+    description="amount by which each pressure is lower than stated",
 )
 PRESSURE_LAG = NuisanceRow(
     "pressure_lag",
@@ -573,7 +581,8 @@ PRESSURE_LAG = NuisanceRow(
     applies=lambda experiment: any(each.lag_s for each in experiment.pressures),
     label="{which}, log of lag over stated lag",
     sentence="{which}: log of lag over stated lag {signed}",
-    description="lag of each pressure: the logarithm of its ratio to the stated lag_s",
+    description="logarithm of the ratio of the true lag of each pressure to the stated "
+    "lag_s",
 )
 JOINING = NuisanceRow(
     "joining_s",
@@ -585,8 +594,8 @@ JOINING = NuisanceRow(
     step=lambda experiment: SAMPLES_A_STEP * experiment.timestep_s,
     label="{which}",
     sentence="{which} {number}{error}{unit} {way} than {stated}",
-    description="delay with which each point mass or force begins or ends, if it does so within "
-    "the recording",
+    description="delay of the time at which each point mass or force begins or ends, if "
+    "this time is within the recording",
 )
 TARE = NuisanceRow(
     "tare",
@@ -614,7 +623,7 @@ SENSOR_TIME = NuisanceRow(
     by="worst",
     label="time shift of the sensor{which}",
     sentence="delay of the sensor: {size}",
-    description="delay of the force sensors; at most three standard deviations",
+    description="delay of the force sensors, limited to three standard deviations of its prior",
 )
 SENSOR_LAG = NuisanceRow(
     "sensor_lag_s",
@@ -629,8 +638,8 @@ SENSOR_LAG = NuisanceRow(
     by="worst",
     label="lag of the sensor{which}",
     sentence="time constant of the sensor: {size}",
-    description="time constant of a first-order low-pass in the sensor; between zero and "
-    "three standard deviations of its prior",
+    description="time constant of a first-order low-pass in the sensor, limited to values "
+    "between zero and three standard deviations of its prior",
 )
 TOOL_MASS = NuisanceRow(
     "tool_kg",
@@ -658,8 +667,8 @@ TOOL_CENTRE = NuisanceRow(
     reference=0.05,
     label="centre of the tool{which}, {axis}",
     sentence="offset of the tool's centre: up to {size}",
-    description="centre of the tool relative to the sensor's point; in the world's frame, "
-    "relative to that of the grasped nodes",
+    description="centre of the tool relative to the point of the sensor; in the frame of "
+    "the world, relative to the centre of the grasped nodes",
 )
 DEPTH_TURN = NuisanceRow(
     "depth_turn_rad",
@@ -675,8 +684,8 @@ DEPTH_TURN = NuisanceRow(
     by="length",
     label="turn of {which}, {axis}",
     sentence="rotation of a depth camera: {size}",
-    description="rotation of each depth camera about the middle of the body, along the camera's "
-    "axes",
+    description="rotation of each depth camera about the middle of the body, stated along "
+    "the axes of the camera",
     same=_camera_sharing_key,
 )
 DEPTH_SHIFT = NuisanceRow(
@@ -695,8 +704,8 @@ DEPTH_SHIFT = NuisanceRow(
     by="length",
     label="shift of {which}, {axis}",
     sentence="translation of a depth camera: {size}",
-    description="translation of each depth camera; if neither is given, the first image is first "
-    "aligned with the body",
+    description="translation of each depth camera; if neither prior is stated, the search "
+    "begins by aligning the first image with the body",
     same=_camera_sharing_key,
 )
 DEPTH_BIAS = NuisanceRow(
@@ -749,7 +758,7 @@ DEPTH_TIME = NuisanceRow(
     by="worst",
     label="time shift of {which}",
     sentence="delay of a depth camera: {size}",
-    description="delay of a depth camera; at most three standard deviations",
+    description="delay of a depth camera, limited to three standard deviations of its prior",
 )
 DEPTH_EDGE = NuisanceRow(
     "depth_edge_px",
@@ -793,11 +802,12 @@ class Nuisance:
     calibration_scale : float or None
         Scale error of all lengths that the cameras measure: the factor minus one.
     calibration_distortion_1_m2 : float or None
-        Radial distortion of first order about the body's middle: a factor 1 + k r².
+        Coefficient k of a radial distortion by the cameras: distances r from the middle of the body
+        are multiplied by 1 + k r².
     time_shift_s : float or None
-        How much later than stated the markers were measured, on the grasps' clock.
+        How much later than stated the markers were measured, by the clock of the grasps.
     clock_rate : float or None
-        How much slower than the grasps' clock that of the markers runs.
+        How much slower the clock of the markers runs than the clock of the grasps.
     pose_turn_rad : float or None
         A constant rotation of grasps and body in the cameras' frame, which rotates gravity in the
         body's frame.
@@ -808,17 +818,18 @@ class Nuisance:
     hand_eye_rad : float or None
         A constant rotation of the body in its grasps.
     hand_eye_m : float or None
-        A constant translation of the body in its grasps; both if the start is an equilibrium and
-        markers measure it.
+        A constant translation of the body in its grasps; rotation and translation are estimated if
+        the start is an equilibrium and there are markers.
     strain_zero : float or None
         A constant offset of the strains of a specimen.
     displacement_zero_m : float or None
-        A constant offset of each displacement along each of its axes.
+        A constant offset of each prescribed displacement along each of its axes.
     obstacle_offset_m : float or None
-        A constant offset of each obstacle along its normal, or along the axis of its displacement,
-        which changes when it touches the body.
+        A constant offset of each obstacle along its normal, or along the axis of its displacement;
+        it changes the time at which the obstacle touches the body.
     obstacle_tilt_rad : float or None
-        A constant tilt of each obstacle that is a plane or a box, about its point or middle.
+        A constant tilt of each obstacle that is a plane or a box, about the point of the plane or
+        the middle of the box.
     obstacle_time_s : float or None
         Delay of each obstacle's motion, to first order.
     tension_factor : float or None
@@ -828,35 +839,36 @@ class Nuisance:
     pressure_factor : float or None
         Scale error of each pressure: the factor minus one.
     pressure_lost_pa : float or None
-        Offset by which each pressure is lower than stated.
+        Amount by which each pressure is lower than stated.
     pressure_lag : float or None
-        Lag of each pressure: the logarithm of its ratio to the stated lag_s.
+        Logarithm of the ratio of the true lag of each pressure to the stated lag_s.
     joining_s : float or None
-        Delay with which each point mass or force begins or ends, if it does so within the
-        recording.
+        Delay of the time at which each point mass or force begins or ends, if this time is within
+        the recording.
     tare : float or None
         A constant offset of each component of a force sensor, in multiples of its sigma.
     sensor_time_s : float or None
-        Delay of the force sensors; at most three standard deviations.
+        Delay of the force sensors, limited to three standard deviations of its prior.
     sensor_lag_s : float or None
-        Time constant of a first-order low-pass in the sensor; between zero and three
-        standard deviations of its prior.
+        Time constant of a first-order low-pass in the sensor, limited to values between zero and
+        three standard deviations of its prior.
     tool_kg : float or None
         Mass of the tool between a sensor and the body.
     tool_m : float or None
-        Centre of the tool relative to the sensor's point; in the world's frame, relative to that of
-        the grasped nodes.
+        Centre of the tool relative to the point of the sensor; in the frame of the world, relative
+        to the centre of the grasped nodes.
     depth_turn_rad : float or None
-        Rotation of each depth camera about the middle of the body, along the camera's axes.
+        Rotation of each depth camera about the middle of the body, stated along the axes of the
+        camera.
     depth_shift_m : float or None
-        Translation of each depth camera; if neither is given, the first image is first aligned with
-        the body.
+        Translation of each depth camera; if neither prior is stated, the search begins by aligning
+        the first image with the body.
     depth_bias_m : float or None
         Offset that is added to each depth of an image.
     depth_scale : float or None
         Scale error of each depth of an image: the factor minus one.
     depth_time_s : float or None
-        Delay of a depth camera; at most three standard deviations.
+        Delay of a depth camera, limited to three standard deviations of its prior.
     depth_edge_px : float or None
         Distance by which silhouettes in the images of each depth camera end inside the outline of
         the body, in pixels.
@@ -931,7 +943,8 @@ class Nuisance:
         for name, word in self.scope.items():
             if name not in names:
                 raise InputError(
-                    f"found the scope of {name!r}; expected one of {listed(names)}"
+                    f"scope contains {name!r}, which is not a nuisance parameter; expected one of "
+                    f"{listed(names)}"
                 )
             if not re.fullmatch(SCOPE, word):
                 raise InputError(
@@ -980,5 +993,5 @@ def _check_custom_kind(row: NuisanceRow) -> None:
         raise InputError(
             f"the nuisance parameter {row.name!r} has "
             f"{'a reading and a clock' if row.reading else 'neither a reading nor a clock'}; "
-            "expected exactly one of them"
+            "expected exactly one of these two functions"
         )

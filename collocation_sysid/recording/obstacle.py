@@ -44,7 +44,7 @@ def _require_selection(faces: Any) -> Selection:
     """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
     if not isinstance(faces, Selection):
         raise InputError(
-            f"faces of an obstacle is {faces!r}; expected a selection"
+            f"faces of an obstacle is {faces!r}; expected a selection, such as cs.Named(…)"
         )
     return faces
 
@@ -108,8 +108,8 @@ class Obstacle(Grasp):
         Gap δ at which the pressure begins [m]; by default the mean edge of the face over 5000, or
         over 500 with friction.
     slip : float, optional
-        Sliding speed [m/s], or slip from sample to sample [m] of a static experiment, at which
-        friction is 0.7 of its limit.
+        Sliding speed [m/s] at which friction is 0.7 of its limit; in a static experiment, sliding
+        distance from sample to sample [m].
     wrench : Wrench, optional
         Measured force and torque that it exerts on the body.
     relaxed : float, optional
@@ -153,7 +153,7 @@ class Obstacle(Grasp):
         self._check_times_and_axes()
         if self.axes != "xyz":
             raise InputError(
-                f"axes of {self.name} is {self.axes!r}; expected none: it is rigid"
+                f"axes of {self.name} is {self.axes!r}; expected no axes, because an obstacle is rigid"
             )
         least, largest = FRICTION.bounds
         if isinstance(self.friction, float) and self.friction > largest:

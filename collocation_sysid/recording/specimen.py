@@ -158,7 +158,8 @@ class Specimen:
             values = getattr(self, name)
             if values is not None and len(values) != len(self.strain):
                 raise InputError(
-                    f"found {len(values)} values for {len(self.strain)} strains; expected as many",
+                    f"found {len(values)} values for {len(self.strain)} strains; expected one value "
+                    "for each strain",
                     None,
                     where=name,
                 )
@@ -192,13 +193,14 @@ class Specimen:
             and not self.deformation.second_stress
         ):
             raise InputError(
-                f"{of} does not have a second stress",
+                f"{of} does not have a second stress; leave it out",
                 None,
                 where="second_stress_pa",
             )
         if self.lateral_stretch is not None and not self.deformation.lateral:
             raise InputError(
-                f"{of} has no free direction, and no lateral stretch",
+                f"{of} has no direction in which the specimen is free to contract; leave the lateral "
+                "stretch out",
                 None,
                 where="lateral_stretch",
             )

@@ -196,7 +196,8 @@ def simulate_with_parameters(
     Parameters
     ----------
     problem : Problem
-        Its integrator and step are used.
+        The integrator and step of `problem.rollout` are used: Newmark's scheme by default, and a
+        finer step than in the fit.
     experiment : Experiment
         The recording, with which the simulation is compared.
     segment : Transcription
@@ -218,8 +219,19 @@ def simulate_with_parameters(
     InputError, SimulationError
         Where the simulation fails.
     """
-    trajectory = _simulate(
-        problem, segment, phi=phi, parameters=parameters, report=report
+    integrator = (
+        problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
+    )
+    corrected = segment.corrected_experiment(phi)
+    for feature in FEATURES:
+        corrected = feature.for_simulation(corrected)
+    trajectory = simulate(
+        corrected,
+        segment.body.theta_from_values(parameters),
+        integrator=integrator,
+        timestep_s=_step_s(problem, segment),
+        substeps=segment.substeps,
+        progress=report,
     )
     predicted = InstrumentPrediction(
         **merged_fields(
@@ -236,41 +248,6 @@ def simulate_with_parameters(
         predicted=predicted,
         error=error,
         misfits=tuple(instrument_misfits(experiment, predicted)),
-    )
-
-
-def _simulate(
-    problem: Problem,
-    segment: Transcription,
-    phi: Array,
-    parameters: Mapping[str, float],
-    report: Callable[[float], None] | None = None,
-) -> Trajectory:
-    """Simulate the recording of `segment` with its nuisance parameters `phi` (k,), in units of
-    their prior standard deviations, and the values of the parameters; return the trajectory.
-
-    Integrator and step are those of `problem.rollout`: Newmark's scheme by default, and a finer
-    step than in the fit. `parameters` are in SI units by name. `report` is called with the
-    completed share, from 0 to 1.
-
-    Raises
-    ------
-    InputError, SimulationError
-        Where that fails.
-    """
-    integrator = (
-        problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
-    )
-    experiment = segment.corrected_experiment(phi)
-    for feature in FEATURES:
-        experiment = feature.for_simulation(experiment)
-    return simulate(
-        experiment,
-        segment.body.theta_from_values(parameters),
-        integrator=integrator,
-        timestep_s=_step_s(problem, segment),
-        substeps=segment.substeps,
-        progress=report,
     )
 
 
@@ -291,17 +268,16 @@ def _blind_error(
     """
     phi = nuisance_of_fitted_recordings(segment, solution)
     try:
-        trajectory = _simulate(
-            problem, segment, phi=phi, parameters=solution.parameters
+        simulation = simulate_with_parameters(
+            problem,
+            segment.experiment,
+            segment=segment,
+            phi=phi,
+            parameters=solution.parameters,
         )
     except (InputError, SimulationError):
         return None
-    predicted = InstrumentPrediction(
-        **merged_fields(
-            feature.predict(segment, trajectory, phi) for feature in FEATURES
-        )
-    )
-    return prediction_error(segment.experiment, predicted)
+    return simulation.error
 
 
 def transcription_and_nuisance(

@@ -263,8 +263,9 @@ def uncertainty_from_fit(
     freedom = fit.measurement_count - round(factored.determined_count, 9)
     if error_model.noise == "estimated" and freedom < 1:
         raise InputError(
-            f"the noise cannot be estimated from {fit.measurement_count} measurements of "
-            f"{len(fit.names)} parameters; give sigma_m and use noise = 'given'"
+            f"the noise cannot be estimated from {fit.measurement_count} measurements, which are not "
+            "more than the parameters that they determine; state the standard deviation of the noise "
+            "(sigma_m) and noise = 'given'"
         )
     bars = _error_bars(fit, factored, requested=error_model)
     basis = bars.basis

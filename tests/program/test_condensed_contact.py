@@ -9,10 +9,9 @@ import pytest
 from benchmark_contact import TRUTH, pressed
 from kit.problems import EDGE_M, IDEAL, box, vertex_markers
 
-from collocation_sysid.model.contact import contact_terms
+from collocation_sysid.model.contact.contact_force import contact_terms
 from collocation_sysid.model.dynamics import Dynamics
-from collocation_sysid.program.contact import condensed_contact
-from collocation_sysid.program.forward import newton_solver
+from collocation_sysid.program.forward import condensed_steps, newton_solver
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.linear_algebra.factorisation import Factoriser
 from collocation_sysid.program.linear_algebra.lapack import solve_band_in_blocks
@@ -48,7 +47,7 @@ def residual_n(experiment: Experiment, x: np.ndarray) -> np.ndarray:
 
 def without_condensation(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let every step fall back to the complete equations."""
-    monkeypatch.setattr(condensed_contact, "MAX_TOUCHING_DOFS", -1)
+    monkeypatch.setattr(condensed_steps, "MAX_ACTIVE_DOFS", -1)
 
 
 def counted_factorisations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
@@ -97,11 +96,11 @@ def test_steps_that_cannot_be_condensed_are_solved_completely(monkeypatch):
     experiment = pressed(3, 4, 0.3)
     x = simulated(experiment)
     for name, value in (
-        ("MAX_TOUCHING_DOFS", 3),
-        ("MAX_CONTACT_ITERATIONS", 0),
+        ("MAX_ACTIVE_DOFS", 3),
+        ("MAX_LOCAL_ITERATIONS", 0),
     ):
         with monkeypatch.context() as patched:
-            patched.setattr(condensed_contact, name, value)
+            patched.setattr(condensed_steps, name, value)
             np.testing.assert_allclose(simulated(experiment), x, atol=1e-12)
 
 
@@ -157,13 +156,13 @@ def test_stored_columns_of_the_compliance_are_limited(monkeypatch):
     size = 6
     factor = Mock()
     factor.solve = lambda right: 2.0 * right
-    compliance = condensed_contact.Compliance(factor, size)
-    monkeypatch.setattr(condensed_contact, "MAX_COLUMN_ENTRIES", 3 * size)
+    compliance = condensed_steps.Compliance(factor, size)
+    monkeypatch.setattr(condensed_steps, "MAX_COLUMN_ENTRIES", 3 * size)
     for dofs in ([0, 1], [1, 2], [3, 4, 5], [0, 5], [0, 4, 5]):
         np.testing.assert_array_equal(
             compliance.columns_at(np.array(dofs)), 2.0 * np.eye(size)[dofs]
         )
-    with pytest.raises(condensed_contact.CondensationError):
+    with pytest.raises(condensed_steps.CondensationError):
         compliance.columns_at(np.array([0, 1, 2, 3]))
 
 

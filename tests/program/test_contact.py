@@ -23,12 +23,11 @@ from study_contact import cylinder, sphere, sphere_on_half_space
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import box_mesh
-from collocation_sysid.model.contact import contact_terms
+from collocation_sysid.model.contact.contact_force import contact_terms
+from collocation_sysid.model.contact.contact_summary import friction_summaries
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.force_term import States
 from collocation_sysid.model.forces import Forces
-from collocation_sysid.program.contact.contact_summary import friction_summaries
-from collocation_sysid.program.contact.step_contact import StepContact
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import (
     Capsule,
@@ -191,12 +190,10 @@ def test_a_step_sees_of_contact_what_all_points_of_the_surface_do(friction):
     forces = Forces.from_experiment(
         experiment, experiment.t_s[-1:], states.theta
     )
-    rest, touching = forces.without_contact()
-    assert len(touching) == 2
-    near, rates = (
-        StepContact(touching, states.theta, forces.pattern),
-        (0.7, 30.0),
-    )
+    rest = forces.without_local_forces()
+    near = forces.local_forces()
+    assert len(near.parts) == 2
+    rates = (0.7, 30.0)
     force, *parts = near.linearise(states.xi, states.nu, rates)
     whole, other = (
         each.linearise(states.xi, states.nu) for each in (forces, rest)

@@ -31,6 +31,7 @@ import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
+from collocation_sysid.program.depth.depth_comparison import camera_residuals
 from collocation_sysid.program.depth.surface_correspondences import (
     SurfaceCorrespondences,
 )
@@ -49,7 +50,7 @@ def test_stiffness_is_found_with_the_camera_20_mm_and_10_degrees_off(rng):
     solution = fitted(noisy(rng), pose)
     assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.05
     (part,) = solution.collocation.iterates(solution.z)
-    (reading,) = part.segment.depths
+    (reading,) = camera_residuals(part.segment)
     apart = reading.signed_distances_m(part.observables[-1], part.phi)
     assert np.sqrt(np.nanmean(apart**2)) < 2e-4
     bars = uncertainty_at(solution.collocation, solution.z).estimates[
@@ -208,11 +209,11 @@ def test_clouds_and_images_are_read_from_every_format(tmp_path):
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("flat.npy", "expected x, y, z"),
+        ("flat.npy", "expected 3 columns x, y, z"),
         ("colour.png", "16 bits"),
         ("packed.pcd", "ascii or binary"),
         ("image.tif", "expected one of"),
-        ("two.npz", "expected one of depth_m"),
+        ("two.npz", "expected exactly one of depth_m"),
         ("image.exr", "OpenEXR"),
     ],
 )

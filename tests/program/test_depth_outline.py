@@ -33,6 +33,7 @@ from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
 from collocation_sysid.program.depth.depth_outline import no_depth_is_empty
+from collocation_sysid.program.depth.outline_residual import OutlineResidual
 from collocation_sysid.program.depth.surface_correspondences import (
     SurfaceCorrespondences,
 )
@@ -198,7 +199,9 @@ def test_slopes_of_outline_residuals_agree_with_differences():
         [experiment], cs.Parameters.from_mapping(unknown)
     ).collocation()
     (segment,) = collocation.transcriptions
-    (reading,) = segment.outlines
+    (reading,) = (
+        each for each in segment.unlabelled if isinstance(each, OutlineResidual)
+    )
     rng = np.random.default_rng(0)
     values = segment.body.nodes_m[reading.correspondences.surface.nodes][None]
     phi = 0.1 * rng.normal(size=segment.nuisance.size)

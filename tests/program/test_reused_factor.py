@@ -123,7 +123,7 @@ def test_systems_of_a_rotating_body_are_solved_with_few_factors(
 ):
     monkeypatch.setattr(factorisation, "NARROW", 0)
     # As for a large body, whose factorisations cost much.
-    monkeypatch.setattr(reused_factor, "COST_PER_ENTRY", 1.0)
+    monkeypatch.setattr(reused_factor, "BAND_COST_PER_ENTRY", 1.0)
     factors = sequence(accuracy)
     guess = None
     for angle_rad in np.linspace(0.0, 0.6, 13):

@@ -14,6 +14,7 @@ import collocation_sysid as cs
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Status
+from collocation_sysid.program.depth.depth_comparison import camera_residuals
 from collocation_sysid.program.depth.surface_correspondences import (
     SurfaceCorrespondences,
 )
@@ -68,7 +69,7 @@ def standard_error(solution: cs.Solution) -> float:
 
 
 def test_thinned_points_are_measured_ones_and_few(many):
-    thinned = thinned_start.thinned_depth(depth())
+    thinned = depth().thinned(400)
     (cloud,) = thinned.clouds
     (given,) = depth().clouds
     assert len(given) > 1000
@@ -79,7 +80,6 @@ def test_thinned_points_are_measured_ones_and_few(many):
 
 
 def test_few_points_are_not_thinned():
-    assert thinned_start.thinned_depth(depth()) is depth()
     assert thinned_start.thinned_problem(problem()) is None
 
 
@@ -120,8 +120,9 @@ def test_a_thinned_start_that_fails_is_replaced_by_the_complete_search(
 
     monkeypatch.setattr(solving, "require_determined", fail)
     solution = cs.solve(problem())
-    assert "no start with fewer points: 300 depth points fail" in (
-        solution.notes
+    assert (
+        "the search was not started with fewer points: 300 depth points fail"
+        in (solution.notes)
     )
     assert solution.status.converged
     assert compared(solution) == len(depth().clouds[0])
@@ -189,7 +190,7 @@ def test_an_alignment_with_the_same_shape_is_not_repeated():
     guess = UNKNOWN.with_guess({"young_pa": 1.6e5})
     collocation = cs.Problem([hanging((depth(),))], guess).collocation()
     (segment,) = collocation.transcriptions
-    (reading,) = segment.depths
+    (reading,) = camera_residuals(segment)
     rest = segment.experiment.rigid_positions([0.0]).reshape(1, -1)
     phi = np.zeros(segment.nuisance.size)
     assert reading.aligned_correspondences(rest, phi) is reading.correspondences

@@ -13,7 +13,7 @@ from kit.problems import GUESS, measured, pressed_cube
 import collocation_sysid as cs
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.features.contact_feature import contact_concerns
-from collocation_sysid.program.contact.contact_summary import (
+from collocation_sysid.model.contact.contact_summary import (
     ContactSummary,
     contact_summaries,
 )

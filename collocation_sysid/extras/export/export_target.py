@@ -132,7 +132,7 @@ class TargetCapabilities:
         Sentence for forces on nodes; empty if the simulator has them.
     obstacle_shapes : tuple of str
         Kinds of `Primitive` that obstacles may have.
-    has_rounded_edges, has_contact_faces, has_friction : bool
+    has_rounded_edges, has_face_selection, has_friction : bool
         Whether obstacles may have rounded edges, be limited to some faces of the body, and have
         friction.
     is_tested : bool
@@ -157,7 +157,7 @@ class TargetCapabilities:
         "capsule",
     )
     has_rounded_edges: bool = True
-    has_contact_faces: bool = True
+    has_face_selection: bool = True
     has_friction: bool = True
     is_tested: bool = True
 
@@ -216,10 +216,10 @@ class TargetCapabilities:
                 and not self.has_rounded_edges
             ):
                 yield f"{each.name}: its edges are not rounded"
-            if each.faces is not None and not self.has_contact_faces:
+            if each.faces is not None and not self.has_face_selection:
                 yield f"{each.name}: the whole surface of the body may touch it"
             if each.friction and not self.has_friction:
-                yield f"{each.name}: contact is without friction"
+                yield f"{each.name}: friction is not exported"
             if len(each.poses.t_s) > 1 and not self.has_moving_obstacles:
                 yield (
                     f"{each.name} is fixed at its position of the first sample; its motion is "

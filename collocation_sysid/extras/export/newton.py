@@ -1,22 +1,31 @@
-"""Newton: a Python module that builds the soft mesh from a JSON file beside it."""
+"""Newton: a Python module that builds the soft mesh from a JSON file beside it, and the comparison
+of a body that Newton has read with this package.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from ...common.serialisation import content
+from ...errors import InputError, listed
 from ...recording import Obstacle
 from .export_target import (
     ExportedFiles,
+    PredictionComparison,
     TargetCapabilities,
     comment_lines,
+    equilibria,
     linear_tetrahedra,
+    longest_displacement_m,
 )
 from .identified import IdentifiedBody
-from .obstacle_shapes import Primitive, SharedContact, faceted_obstacles
+from .obstacle_shapes import FacetedObstacle, Primitive, faceted_obstacles
 
 MODULE_FILE = "body.py"
 DATA_FILE = "body.json"
@@ -27,8 +36,16 @@ CAPABILITIES = TargetCapabilities(
     '"material" without its part λ tr(Ė): changes of volume are damped less; the identified law '
     "is {damping}",
     has_rounded_edges=False,
-    has_contact_faces=False,
+    has_face_selection=False,
 )
+# Factor on velocities after each step, so that a body comes to rest.
+VELOCITY_FACTOR = 0.95
+# Iterations of the solver in each step.
+SOLVER_ITERATIONS = 20
+# Steps until a body is at rest.
+REST_STEPS = 400
+# Timestep until a body is at rest.
+REST_STEP_S = 2e-3
 # Size arguments of each shape in Newton; zeros mean an infinite plane.
 SIZE_ARGUMENTS = {
     "plane": ("width", "length"),
@@ -93,6 +110,63 @@ def model(device=None):
         made.soft_contact_mu = body["contact_mu"]
     return made
 '''
+
+
+@dataclass(frozen=True)
+class SharedContact:
+    """Contact constants of Newton, which has one set for all obstacles of a soft body.
+
+    Attributes
+    ----------
+    friction : float
+        Friction coefficient.
+    node_stiffness_n_m : float
+        Contact stiffness of a node.
+    particle_radius_m : float
+        Radius of particles: half of the width δ of the pressure law.
+    limitations : tuple of str
+        Sentence on obstacles that differ in these constants; empty if they agree.
+    """
+
+    friction: float
+    node_stiffness_n_m: float
+    particle_radius_m: float
+    limitations: tuple[str, ...]
+
+    @classmethod
+    def from_obstacles(
+        cls, obstacles: Sequence[FacetedObstacle]
+    ) -> SharedContact:
+        """Return the contact constants that represent all obstacles: the friction of the first one,
+        the largest stiffness of a node, and half of the largest width as the particle radius; zeros
+        without obstacles. If obstacles differ in a constant, `limitations` has one sentence on
+        that, otherwise none.
+        """
+        constants = {
+            "friction": [float(wall.obstacle.friction) for wall in obstacles],
+            "stiffness": [wall.node_stiffness_n_m for wall in obstacles],
+            "width": [wall.width_m for wall in obstacles],
+        }
+        friction, stiffness, width = (
+            values or [0.0] for values in constants.values()
+        )
+        unlike = [
+            name
+            for name, values in constants.items()
+            if not np.allclose(values, values[:1], atol=0)
+        ]
+        sentence = (
+            f"obstacles differ in {listed(unlike)}, but a soft body in Newton has only one value: "
+            f"exported are the friction {friction[0]:.4g} of the first one, with which Newton "
+            f"averages that of each obstacle, and the largest stiffness {max(stiffness):.4g} N/m "
+            f"of a node and width {max(width):.4g} m"
+        )
+        return cls(
+            friction[0],
+            max(stiffness),
+            particle_radius_m=max(width) / 2,
+            limitations=(sentence,) * bool(unlike),
+        )
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
@@ -169,3 +243,78 @@ def _obstacle_data(obstacle: Obstacle, t_s: float) -> dict[str, Any]:
         "quaternion_xyzw": turn.as_quat(),
         "friction": float(obstacle.friction),
     }
+
+
+def compare_at_rest(
+    body: IdentifiedBody, add_to: Callable[[Any], None]
+) -> list[PredictionComparison]:
+    """Run Newton until a body is at rest, and compare the largest displacement.
+
+    Grasped nodes and obstacles stay at their positions of the first sample; the number of steps is
+    fixed, and convergence is not checked.
+
+    Parameters
+    ----------
+    body : IdentifiedBody
+        Body that was exported.
+    add_to : callable
+        Adds the body and its obstacles, as exported, to a `newton.ModelBuilder`. The particles of
+        the body come first, in the order of its nodes.
+
+    Raises
+    ------
+    InputError
+        If Newton is not installed.
+    SimulationError
+        If the equilibrium of this package cannot be computed.
+    """
+    try:
+        newton: Any = import_module("newton")
+    except ImportError as error:
+        raise InputError(
+            "install Newton to verify the export: pip install newton"
+        ) from error
+
+    builder = newton.ModelBuilder()
+    contact = SharedContact.from_obstacles(faceted_obstacles(body))
+    if body.obstacles:
+        builder.default_particle_radius = contact.particle_radius_m
+    add_to(builder)
+    # Particles without mass stay where they are.
+    grasped = np.flatnonzero(body.is_node_prescribed)
+    for k in grasped:
+        builder.particle_mass[k] = 0.0
+    builder.color()
+    model = builder.finalize(device="cpu")
+    if body.obstacles:
+        model.soft_contact_ke = contact.node_stiffness_n_m
+        model.soft_contact_mu = contact.friction
+        model.shape_material_ke.fill_(contact.node_stiffness_n_m)
+    pipeline = newton.CollisionPipeline(model)
+    # Obstacles do not move, so that rigid bodies need not be solved for.
+    solver = newton.solvers.SolverVBD(
+        model,
+        iterations=SOLVER_ITERATIONS,
+        integrate_with_external_rigid_solver=True,
+    )
+    before: Any = model.state()
+    after = model.state()
+    control = model.control()
+    contacts = pipeline.contacts()
+    for _ in range(REST_STEPS):
+        pipeline.collide(before, contacts)
+        solver.step(before, after, control, contacts, REST_STEP_S)
+        before, after = after, before
+        before.particle_qd.assign(VELOCITY_FACTOR * before.particle_qd.numpy())
+    theirs = before.particle_q.numpy().astype(float) - body.nodes_m
+    sag_m = longest_displacement_m(equilibria(body)[0][0])
+    remark = "".join(contact.limitations)
+    return [
+        PredictionComparison(
+            "largest displacement at rest",
+            longest_displacement_m(theirs),
+            ours=sag_m,
+            unit="m",
+            remark=remark,
+        )
+    ]

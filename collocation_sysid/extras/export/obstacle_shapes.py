@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -13,8 +12,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
-from ...errors import listed
-from ...model.contact import contact_terms
+from ...model.contact.contact_force import contact_terms
 from ...recording import (
     Capsule,
     Cuboid,
@@ -444,60 +442,3 @@ def faceted_obstacles(body: IdentifiedBody) -> tuple[FacetedObstacle, ...]:
         nodes = nodes + len(start_m)
         cells = cells + len(shown.triangles)
     return tuple(made)
-
-
-@dataclass(frozen=True)
-class SharedContact:
-    """Contact constants of Newton, which has one set for all obstacles of a soft body.
-
-    Attributes
-    ----------
-    friction : float
-        Friction coefficient.
-    node_stiffness_n_m : float
-        Contact stiffness of a node.
-    particle_radius_m : float
-        Radius of particles: half of the width δ of the pressure law.
-    limitations : tuple of str
-        Sentence on obstacles that differ in these constants; empty if they agree.
-    """
-
-    friction: float
-    node_stiffness_n_m: float
-    particle_radius_m: float
-    limitations: tuple[str, ...]
-
-    @classmethod
-    def from_obstacles(
-        cls, obstacles: Sequence[FacetedObstacle]
-    ) -> SharedContact:
-        """Return the contact constants that represent all obstacles: the friction of the first one,
-        the largest stiffness of a node, and half of the largest width as the particle radius; zeros
-        without obstacles. If obstacles differ in a constant, `limitations` has one sentence on
-        that, otherwise none.
-        """
-        constants = {
-            "friction": [float(wall.obstacle.friction) for wall in obstacles],
-            "stiffness": [wall.node_stiffness_n_m for wall in obstacles],
-            "width": [wall.width_m for wall in obstacles],
-        }
-        friction, stiffness, width = (
-            values or [0.0] for values in constants.values()
-        )
-        unlike = [
-            name
-            for name, values in constants.items()
-            if not np.allclose(values, values[:1], atol=0)
-        ]
-        sentence = (
-            f"obstacles differ in {listed(unlike)}, but a soft body in Newton has only one value: "
-            f"exported are the friction {friction[0]:.4g} of the first one, with which Newton "
-            f"averages that of each obstacle, and the largest stiffness {max(stiffness):.4g} N/m "
-            f"of a node and width {max(width):.4g} m"
-        )
-        return cls(
-            friction[0],
-            max(stiffness),
-            particle_radius_m=max(width) / 2,
-            limitations=(sentence,) * bool(unlike),
-        )

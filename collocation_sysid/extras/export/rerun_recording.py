@@ -80,7 +80,8 @@ def write_rerun(
     replays = [replay for replay in replays if replay.has_shapes]
     if not replays:
         raise InputError(
-            "no experiment of this run has a stored motion of a body; expected one with a mesh",
+            "no experiment of this run has a stored motion of a body with a mesh; expected a run "
+            "with such an experiment",
             run,
         )
     stresses = [_stress_on_faces(run, replay) for replay in replays]
@@ -456,7 +457,7 @@ class _Recording:
         """Write each component of forces and torques as measured, fitted and simulated, as far as
         they are finite; grasps with a sensor are numbered from 1.
         """
-        for series in replay.force_series:
+        for series in replay.sensor_series:
             t_s = series.columns[:, 0]
             values = series.columns[:, 1:].reshape(
                 len(t_s), 3, len(series.names)

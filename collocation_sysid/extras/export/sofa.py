@@ -47,7 +47,7 @@ CAPABILITIES = TargetCapabilities(
     mass_damping="",
     damping_law="rayleigh",
     obstacle_shapes=("plane", "sphere"),
-    has_contact_faces=False,
+    has_face_selection=False,
     has_friction=False,
     is_tested=False,
 )
@@ -101,14 +101,14 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     x += f'<TetrahedronSetTopologyContainer position="{values_as_text(body.nodes_m)}" '
     x += f'tetrahedra="{cells}"/>\n<TetrahedronSetGeometryAlgorithms template="Vec3d"/>\n'
     x += '<MechanicalObject template="Vec3d"/>\n'
-    x += f'<DiagonalMass vertexMass="{mass}"/>\n{force}\n{_contact_xml(body)}'
+    x += f'<DiagonalMass vertexMass="{mass}"/>\n{force}\n{_obstacle_xml(body)}'
     x += f'<FixedProjectiveConstraint indices="{grasped}"/>\n</Node>\n</Node>\n'
     return ExportedFiles({SCENE: x}, tuple(limits))
 
 
-def _contact_xml(body: IdentifiedBody) -> str:
-    """Return the XML of contact penalties on the nodes, proportional to the penetration; empty
-    without obstacles. Shapes other than planes and spheres are left out.
+def _obstacle_xml(body: IdentifiedBody) -> str:
+    """Return the XML of the forces of obstacles on the nodes, proportional to the penetration;
+    empty without obstacles. Shapes other than planes and spheres are left out.
 
     Obstacles stay at their poses at the start of the recording. The surface of the obstacle is
     moved outwards by half the width δ of the pressure law, so that the force is about the same at a

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,23 +23,14 @@ from .export_target import (
     PredictionComparison,
     TargetCapabilities,
     comment_lines,
-    equilibria,
     linear_tetrahedra,
-    longest_displacement_m,
 )
 from .identified import IdentifiedBody, IdentifiedRegion
-from .obstacle_shapes import Primitive, SharedContact, faceted_obstacles
+from .newton import compare_at_rest
+from .obstacle_shapes import Primitive
 
 STAGE_FILE = "body.usda"
 ATTRIBUTE_NAMESPACE = "collocationSysid"
-# Factor on velocities after each step of Newton, so that the body comes to rest.
-VELOCITY_FACTOR = 0.95
-# Iterations of the solver in each step.
-SOLVER_ITERATIONS = 20
-# Steps until the body is at rest.
-REST_STEPS = 400
-# Timestep of Newton.
-REST_STEP_S = 2e-3
 CAPABILITIES = TargetCapabilities(
     {},
     "the simulator chooses the energy for E and ν instead of {material}: in Newton it is the "
@@ -51,7 +41,7 @@ CAPABILITIES = TargetCapabilities(
     has_moving_grasps=True,
     has_moving_obstacles=True,
     has_rounded_edges=False,
-    has_contact_faces=False,
+    has_face_selection=False,
 )
 SINGLE_PRECISION = "numbers are single precision"
 REGIONS = (
@@ -513,55 +503,12 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     SimulationError
         If the equilibrium of this package cannot be computed.
     """
-    try:
-        newton: Any = import_module("newton")
-    except ImportError as error:
-        raise InputError(
-            "install Newton to verify the export: pip install newton"
-        ) from error
 
-    builder = newton.ModelBuilder()
-    contact = SharedContact.from_obstacles(faceted_obstacles(body))
-    if body.obstacles:
-        builder.default_particle_radius = contact.particle_radius_m
-    # Grippers are left out, since Newton would simulate them too; grasped nodes get no mass.
-    builder.add_usd(
-        str(folder / STAGE_FILE), ignore_paths=["/World/Gripper_.*"]
-    )
-    grasped = np.flatnonzero(body.is_node_prescribed)
-    for k in grasped:
-        builder.particle_mass[k] = 0.0
-    builder.color()
-    model = builder.finalize(device="cpu")
-    if body.obstacles:
-        model.soft_contact_ke = contact.node_stiffness_n_m
-        model.soft_contact_mu = contact.friction
-        model.shape_material_ke.fill_(contact.node_stiffness_n_m)
-    pipeline = newton.CollisionPipeline(model)
-    # Obstacles do not move, so that rigid bodies need not be solved for.
-    solver = newton.solvers.SolverVBD(
-        model,
-        iterations=SOLVER_ITERATIONS,
-        integrate_with_external_rigid_solver=True,
-    )
-    before: Any = model.state()
-    after = model.state()
-    control = model.control()
-    contacts = pipeline.contacts()
-    for _ in range(REST_STEPS):
-        pipeline.collide(before, contacts)
-        solver.step(before, after, control, contacts, REST_STEP_S)
-        before, after = after, before
-        before.particle_qd.assign(VELOCITY_FACTOR * before.particle_qd.numpy())
-    theirs = before.particle_q.numpy().astype(float) - body.nodes_m
-    sag_m = longest_displacement_m(equilibria(body)[0][0])
-    remark = "".join(contact.limitations)
-    return [
-        PredictionComparison(
-            "largest displacement at rest",
-            longest_displacement_m(theirs),
-            ours=sag_m,
-            unit="m",
-            remark=remark,
+    def add_to(builder: Any) -> None:
+        """Add the stage to a builder of Newton."""
+        # Grippers are left out, since Newton would simulate them too.
+        builder.add_usd(
+            str(folder / STAGE_FILE), ignore_paths=["/World/Gripper_.*"]
         )
-    ]
+
+    return compare_at_rest(body, add_to)

@@ -217,7 +217,7 @@ def _crash_message(code: int, stderr: IO[bytes]) -> str:
     its error output, if there is any. `stderr` is the file with that output, which is read from its
     start.
     """
-    cause = killed_by(code) or f"its process ended with code {code}"
+    cause = killed_by(code) or f"the process ended with code {code}"
     stderr.seek(0)
     lines = stderr.read()[-2000:].decode(errors="replace").split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), "")
@@ -316,7 +316,8 @@ class RunOptions(Options):
     scheduler : ADDRESS
         Address of a dask.distributed scheduler; its workers need the same files.
     time_limit_s : --time-limit SECONDS
-        Time after which a run is stopped, loading included [s]; it counts as a failure.
+        Time after which a run is stopped, including the time for loading [s]; a stopped run counts
+        as a failure.
     """
 
     workers: AtLeastOne | None = None
@@ -426,7 +427,7 @@ def _result_record(
         return {
             **planned.as_dict(),
             "outcome": CRASHED,
-            "message": f"its worker was lost ({type(error).__name__}: {error})",
+            "message": f"the worker was lost ({type(error).__name__}: {error})",
             "attempts": 1,
             "time_limit_s": limits.time_limit_s,
             "wall_s": None,

@@ -98,6 +98,16 @@ class DepthCameraModel:
         return {}
 
     @cached_property
+    def alignments(self) -> list[Any]:
+        """Alignments of the camera with shapes so far, in their order; empty at first."""
+        return []
+
+    @cached_property
+    def alignment_clouds(self) -> dict[int, Any]:
+        """Points of images for alignments, by index of the image; empty at first."""
+        return {}
+
+    @cached_property
     def outline_expressions(self) -> dict[tuple[int, int], Any]:
         """Cache of the generated functions of its outline residuals, shared by all copies of the
         measurement model; empty at first.
@@ -128,6 +138,22 @@ class DepthCameraModel:
         clouds = self.depth.points_m
         pinhole = self.depth.camera.matrix is not None
         return [p / p[:, 2:] if pinhole else np.zeros_like(p) for p in clouds]
+
+    def share_alignments(self, other: DepthCameraModel) -> None:
+        """Store alignments together with another model of the camera from now on, if both give the
+        same: points, pivot and priors of the pose are equal.
+        """
+        is_same = (
+            self.depth is other.depth
+            and (self.pivot_m == other.pivot_m).all()
+            and all(
+                (self.prior_weights(row) == other.prior_weights(row)).all()
+                for row in (DEPTH_TURN, DEPTH_SHIFT)
+            )
+        )
+        if is_same:
+            vars(self)["alignments"] = other.alignments
+            vars(self)["alignment_clouds"] = other.alignment_clouds
 
     def corrected_expression(
         self, point: ca.SX, ray: ca.SX, values: Mapping[NuisanceRow, ca.SX]
@@ -201,11 +227,19 @@ class DepthCameraModel:
         image : int
             Index of the image.
         """
-        corrected = self._correction.evaluate(
-            phi[self.parameter_indices], np.vstack([points.T, rays.T])
+        # The correction is affine: its values at seven points determine it for all.
+        basis = np.eye(6, 7, k=1)
+        origin, *axes = self._correction.evaluate(
+            phi[self.parameter_indices], basis
         ).T
         rotations, translations = self.poses
-        return corrected @ rotations[image].T + translations[image]
+        turn = rotations[image].T
+        slopes = (np.stack(axes) - origin) @ turn
+        world = points @ slopes[:3]
+        if rays.any():
+            world += rays @ slopes[3:]
+        world += origin @ turn + translations[image]
+        return world
 
     def body_middle_m(self, sample: int) -> Array:
         """Return the middle (3,) of the undeformed body, carried by the first pose, in the camera's

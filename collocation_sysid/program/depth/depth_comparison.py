@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline
 
 from ...common.array_types import Array, root_mean
 from ..experiment_iterate import ExperimentIterate
+from ..transcription import Transcription
 from .depth_residual import HUBER, DepthResidual
 from .outline_residual import OutlineResidual
 from .surface_correspondences import SurfaceCorrespondences, initial_gate_m
@@ -192,13 +193,29 @@ def _positions_at_observable(
     return np.array([np.interp(at_s, t_s, each) for each in position_rows.T]).T
 
 
+def camera_residuals(transcription: Transcription) -> list[DepthResidual]:
+    """Return the measurement models of the points of the depth cameras, in their order, without
+    those of outlines.
+    """
+    return [
+        each
+        for each in transcription.residuals
+        if isinstance(each, DepthResidual)
+        and not isinstance(each, OutlineResidual)
+    ]
+
+
 def depth_residuals(
     iterate: ExperimentIterate,
 ) -> list[tuple[DepthResidual, Array]]:
     """Return the measurement models of the depth cameras, each with the values (n, e, 3) of its
     observable: positions of the surface nodes [m].
     """
-    return surface_residuals(iterate)[: len(iterate.segment.depths)]
+    return [
+        (residual, values)
+        for residual, values in surface_residuals(iterate)
+        if not isinstance(residual, OutlineResidual)
+    ]
 
 
 def surface_residuals(
@@ -207,9 +224,12 @@ def surface_residuals(
     """Return the measurement models of the depth cameras, then of the outlines, each with the
     values (n, e, 3) of its observable.
     """
-    readings = (*iterate.segment.depths, *iterate.segment.outlines)
-    values = iterate.observables
-    return [*zip(readings, values[len(values) - len(readings) :], strict=True)]
+    pairs = zip(iterate.segment.residuals, iterate.observables, strict=True)
+    return [
+        (residual, values)
+        for residual, values in pairs
+        if isinstance(residual, DepthResidual)
+    ]
 
 
 def outline_distances_px(
@@ -219,9 +239,10 @@ def outline_distances_px(
     points from their edges [pixels]; points without an edge are left out.
     """
     distances = []
-    outlines = surface_residuals(iterate)[len(iterate.segment.depths) :]
-    for reading, observation in outlines:
-        assert isinstance(reading, OutlineResidual)
-        distances_px = reading.signed_distances_px(observation, iterate.phi)
-        distances.append((reading, distances_px[np.isfinite(distances_px)]))
+    for residual, values in surface_residuals(iterate):
+        if isinstance(residual, OutlineResidual):
+            distances_px = residual.signed_distances_px(values, iterate.phi)
+            distances.append(
+                (residual, distances_px[np.isfinite(distances_px)])
+            )
     return distances

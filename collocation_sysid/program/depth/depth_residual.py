@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 
 from ...common.array_types import Array
 from ...model.nuisance_map import NuisanceMap
+from ...recording.depth_camera import Depth
 from ...recording.nuisance import DEPTH_TIME
 from ...recording.placement import Placement
 from ...recording.sample_times import TIME_TOLERANCE_S
+from ..correspondences import CorrespondenceResidual
 from ..markers.marker_association import MarkerAssociation
 from ..measurement_residual import (
     GROUP,
-    MeasurementResidual,
     PooledResiduals,
     ResidualExpression,
     RowStencil,
@@ -76,7 +77,7 @@ def _surface_positions(
 
 
 @dataclass(frozen=True, eq=False)
-class DepthResidual(MeasurementResidual):
+class DepthResidual(CorrespondenceResidual):
     """Measurement model of the points of a depth camera, with one number each: the distance from
     the surface, whose measured value is zero.
 
@@ -97,6 +98,7 @@ class DepthResidual(MeasurementResidual):
     group_size = 1
     has_offsets = True
     sigma_key = "sigma_m of depth"
+    is_compiled = True
 
     @classmethod
     def from_correspondences(
@@ -222,6 +224,22 @@ class DepthResidual(MeasurementResidual):
     def first_row(self) -> int:
         """Index of the last time of the observable from which the first image is computed."""
         return int(self._neighbour_times[0, -1])
+
+    def reassociated(self, x: Array, phi: Array) -> SurfaceCorrespondences:
+        """Return the correspondences of the shapes at the images that the first rows x (rows, 3n)
+        [m] reach, see `SurfaceCorrespondences.updated`.
+        """
+        return self.correspondences.updated(self.surface_shapes(x, phi), phi)
+
+    def correspondences_of(
+        self, measured: Depth, x: Array, phi: Array
+    ) -> SurfaceCorrespondences:
+        """Return the correspondences of other points of the same camera and images with the motion
+        x (N, 3n) [m], see `SurfaceCorrespondences.with_depth`.
+        """
+        return self.correspondences.with_depth(
+            measured, self.surface_shapes(x, phi), phi=phi
+        )
 
     def aligned_correspondences(
         self, x: Array, phi: Array, only_pose: bool = False

@@ -18,10 +18,9 @@ from scipy.spatial import KDTree
 
 from ...common.array_types import Array, Index
 from ...fem.body import Body
-from ...model.nuisance_map import NuisanceMap
 from ...recording.depth_camera import Depth
-from ...recording.experiment import Experiment
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
+from ..correspondences import Correspondences
 from .camera_alignment import align_camera, thinned
 from .depth_camera_model import DepthCameraModel
 from .depth_outline import Outline
@@ -38,6 +37,8 @@ SPREAD = 6.0
 NARROWER = 0.8
 # Shapes that change by less than this share of σ keep their correspondences.
 SAME = 0.2
+# Shapes that differ by less than this share of the gate are aligned from the same pose.
+SIMILAR = 0.25
 # Largest alignment in standard deviations of its prior; more belongs to something else.
 FARTHEST = 4.0
 # Reasons for leaving points out, in the order in which they are tested.
@@ -64,7 +65,7 @@ def initial_gate_m(shape_m: Array) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceCorrespondences:
+class SurfaceCorrespondences(Correspondences):
     """Points of a camera and corresponding points of the surface, in S images of at most E points.
 
     Only points within the gate are contained; arrays of images with fewer points are padded with
@@ -126,6 +127,18 @@ class SurfaceCorrespondences:
     outline: Outline
     is_aligned: bool = False
 
+    @property
+    def measured(self) -> Depth:
+        """Measured points of the camera."""
+        return self.camera.depth
+
+    def with_start_values(self, phi: Array) -> Array:
+        """Return a copy of φ (k,) with the camera's nuisance parameters `start_values`."""
+        own = self.camera.parameter_indices
+        updated = phi.copy()
+        updated[own] = self.camera.parameters_from(self.start_values)[own]
+        return updated
+
     @classmethod
     def from_shapes(
         cls,
@@ -135,6 +148,7 @@ class SurfaceCorrespondences:
         phi: Array,
         gate_m: float,
         settled: bool = False,
+        surface: VisibleSurface | None = None,
     ) -> SurfaceCorrespondences:
         """Find the correspondences for given shapes.
 
@@ -152,8 +166,10 @@ class SurfaceCorrespondences:
             Largest distance of points from the surface [m].
         settled : bool
             Whether to leave out points that the body hides; stored as `has_converged`.
+        surface : VisibleSurface, optional
+            Surface of the body, if it is known.
         """
-        skin = VisibleSurface.from_body(body, camera.depth)
+        skin = surface or VisibleSurface.from_body(body, camera.depth)
         images = [
             _match_image(
                 camera,
@@ -249,6 +265,13 @@ class SurfaceCorrespondences:
             is_aligned=False,
         )
 
+    def with_camera(self, camera: DepthCameraModel) -> SurfaceCorrespondences:
+        """Return the same correspondences with another model of their camera, which shares the
+        alignments of the present one if points, pivot and priors of the pose are the same.
+        """
+        camera.share_alignments(self.camera)
+        return replace(self, camera=camera)
+
     def is_aligned_with(self, shapes_m: Array, phi: Array) -> bool:
         """Return whether these are the correspondences after an alignment of the camera with shapes
         (S, n, 3) [m] and with the errors of φ (k,) other than those of the pose, so that another
@@ -310,6 +333,7 @@ class SurfaceCorrespondences:
             phi=phi,
             gate_m=gate_m,
             settled=settled,
+            surface=self.surface,
         )
 
     def with_depth(
@@ -397,14 +421,63 @@ def _aligned_parameters(
     that has points; φ itself if the pose would differ from the stated one by more than `FARTHEST`
     prior standard deviations. The arguments are those of `SurfaceCorrespondences.from_alignment`.
     """
-    first = camera.depth.first_sample_with_points
-    surface = VisibleSurface.from_body(body, camera.depth)
-    turn, shift_m = align_camera(
-        camera, surface, x=shapes_m[first], image=first
+    turn, shift_m = _alignment(
+        camera,
+        VisibleSurface.from_body(body, camera.depth),
+        x=shapes_m[camera.depth.first_sample_with_points],
     )
     moved = camera.with_pose(phi, turn, shift_m=shift_m)
     errors = np.abs(moved[camera.parameter_indices])
     return phi if errors.max(initial=0.0) > FARTHEST else moved
+
+
+class _Alignment(NamedTuple):
+    """Pose of a camera that is aligned with a shape, see `align_camera`.
+
+    Attributes
+    ----------
+    x : (n, 3) array
+        Surface nodes of the shape [m].
+    turn : (3,) array
+        Rotation vector of the camera's error [rad].
+    shift_m : (3,) array
+        Translation of the camera's error [m].
+    """
+
+    x: Array
+    turn: Array
+    shift_m: Array
+
+
+def _alignment(
+    camera: DepthCameraModel, surface: VisibleSurface, x: Array
+) -> tuple[Array, Array]:
+    """Return the rotation vector (3,) [rad] and the translation (3,) [m] of the camera's error that
+    align its first image with points with a shape x (n, 3) [m].
+
+    Alignments are stored with the camera: that of the same shape (to the share `SAME` of σ) is
+    returned again, and that of a shape that differs by less than the share `SIMILAR` of the gate is
+    where the search starts.
+    """
+    known = camera.alignments
+    apart_m = [float(np.abs(each.x - x).max(initial=0.0)) for each in known]
+    nearest = int(np.argmin(apart_m)) if known else None
+    start = None
+    if nearest is not None:
+        pose = known[nearest].turn, known[nearest].shift_m
+        if apart_m[nearest] < SAME * camera.depth.sigma_m:
+            return pose
+        if apart_m[nearest] < SIMILAR * camera.depth.gate_m:
+            start = pose
+    turn, shift_m = align_camera(
+        camera,
+        surface,
+        x=x,
+        image=camera.depth.first_sample_with_points,
+        start=start,
+    )
+    known.append(_Alignment(x, turn, shift_m=shift_m))
+    return turn, shift_m
 
 
 class _NearestPoints(NamedTuple):
@@ -572,28 +645,3 @@ def _nearest_facing(
         x, world[in_box], candidates=facing
     )
     return _NearestPoints(in_box, faces, barycentric=barycentric)
-
-
-def initial_correspondences(
-    experiment: Experiment,
-) -> tuple[SurfaceCorrespondences, ...]:
-    """Return the correspondences of each depth camera of an experiment with the undeformed body in
-    its grasps, after an alignment of the camera; an empty tuple without cameras.
-    """
-    if not experiment.depths:
-        return ()
-    nuisance = NuisanceMap.from_experiment(experiment)
-    sightings = []
-    for number, depth in enumerate(experiment.depths):
-        view = DepthCameraModel.from_experiment(
-            experiment, number, nuisance=nuisance
-        )
-        nodes = VisibleSurface.from_body(experiment.body, depth).nodes
-        shapes_m = experiment.rigid_positions(depth.sample_times_s)[:, nodes]
-        nothing = np.zeros(nuisance.size)
-        sightings.append(
-            SurfaceCorrespondences.from_alignment(
-                view, experiment.body, shapes_m=shapes_m, phi=nothing
-            )
-        )
-    return tuple(sightings)

@@ -283,26 +283,29 @@ class VisibleSurface:
         reach = np.linalg.norm(places - middles[:, None], axis=2).max(
             initial=0.0
         )
-        candidates = KDTree(middles).query_ball_point(projected, reach)
-        point = np.repeat(
-            np.arange(len(projected)), [len(each) for each in candidates]
+        pairs = KDTree(projected).sparse_distance_matrix(
+            KDTree(middles), reach, output_type="ndarray"
         )
-        triangle = np.concatenate([*candidates, []]).astype(int)
-        first = depths[corners[triangle]].min(axis=1) < away[point] - front_m
-        point = point[first]
-        triangle = triangle[first]
-        a, b, c = places[triangle].transpose(1, 0, 2)
-        way = projected[point] - a
-        double_area = _cross_2d(b - a, c - a)
-        of_b = _cross_2d(way, c - a) / double_area
-        of_c = _cross_2d(b - a, way) / double_area
-        shares = np.column_stack([1 - of_b - of_c, of_b, of_c])
-        # In the projection, one over the depth is linear on a triangle.
-        hit = (
-            1 / np.sum(shares / depths[corners[triangle]], axis=1)
-            < away[point] - front_m
-        )
-        behind[point[(shares >= 0).all(axis=1) & hit]] = True
+        point = pairs["i"]
+        triangle = pairs["j"]
+        nearest_m = depths[corners].min(axis=1)
+        is_first = nearest_m[triangle] < (away - front_m)[point]
+        point = point[is_first]
+        triangle = triangle[is_first]
+        a, b, c = places.transpose(1, 0, 2)
+        # Shares of the corners, and one over the depth, are linear on a triangle in the projection.
+        double_areas = _cross_2d(b - a, c - a)
+        slopes_of_b = _turned(c - a) / double_areas[:, None]
+        slopes_of_c = -_turned(b - a) / double_areas[:, None]
+        way = projected[point] - a[triangle]
+        of_b = np.einsum("pi,pi->p", way, slopes_of_b[triangle])
+        of_c = np.einsum("pi,pi->p", way, slopes_of_c[triangle])
+        of_a = 1 - of_b - of_c
+        is_on = (of_a >= 0) & (of_b >= 0) & (of_c >= 0)
+        point = point[is_on]
+        shares = np.column_stack([of_a[is_on], of_b[is_on], of_c[is_on]])
+        inverse = np.sum(shares / depths[corners[triangle[is_on]]], axis=1)
+        behind[point[1 / inverse < away[point] - front_m]] = True
         return behind
 
     def is_near_crease(
@@ -350,8 +353,15 @@ class VisibleSurface:
         away_m = np.linalg.norm(on_crease, axis=1)
         rays = points_m - eye_m
         rays /= np.linalg.norm(rays, axis=1)[:, None]
-        apart, nearest = KDTree(on_crease / away_m[:, None]).query(rays)
-        return apart * away_m[nearest] <= reach_m
+        # Beyond this bound, which is larger than any reach, the query finds nothing, in less time.
+        bound = 1.001 * reach_m / away_m.min()
+        apart, nearest = KDTree(on_crease / away_m[:, None]).query(
+            rays, distance_upper_bound=bound
+        )
+        is_within = np.isfinite(apart)
+        away_m = np.take(away_m, nearest, mode="clip")
+        near[is_within] = (apart * away_m)[is_within] <= reach_m
+        return near
 
     def nearest_points(
         self, x: Array, points: Array, candidates: Index
@@ -377,35 +387,13 @@ class VisibleSurface:
         """
         corners = x[self.plane_triangles[candidates]]
         middles = corners.mean(axis=1)
-        sizes = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
-        neighbours = KDTree(middles).query(points, min(NEARBY, len(corners)))
-        away, nearest_triangles = (
-            np.reshape(each, (len(points), -1)) for each in neighbours
+        _, neighbours = KDTree(middles).query(points, min(NEARBY, len(corners)))
+        triangles, in_triangles = _nearest_of_triangles(
+            points,
+            corners,
+            neighbours=np.reshape(neighbours, (len(points), -1)),
         )
-        # Triangles whose middles are farther than this by their own size cannot be nearer.
-        triangles = nearest_triangles[:, 0].copy()
-        least = np.full(len(points), np.inf)
-        feet = np.zeros_like(points)
-        for rank, own in enumerate(nearest_triangles.T):
-            here = np.flatnonzero(away[:, rank] - sizes[own] < least)
-            on = nearest_points_of_triangles(points[here], corners[own[here]])
-            distances = np.linalg.norm(on - points[here], axis=1)
-            is_closer = distances < least[here]
-            here = here[is_closer]
-            on = on[is_closer]
-            distances = distances[is_closer]
-            triangles[here] = own[here]
-            feet[here] = on
-            least[here] = distances
-        a, b, c = corners[triangles].transpose(1, 0, 2)
-        normal = np.cross(b - a, c - a)
-        squares = np.sum(normal**2, axis=1)
-        of_b = np.sum(np.cross(feet - a, c - a) * normal, axis=1) / squares
-        of_c = np.sum(np.cross(b - a, feet - a) * normal, axis=1) / squares
-        faces, places = self.to_faces(
-            candidates[triangles],
-            np.column_stack([1 - of_b - of_c, of_b, of_c]),
-        )
+        faces, places = self.to_faces(candidates[triangles], in_triangles)
         moving = np.arange(len(points) if self.faces.shape[1] > 3 else 0)
         for _ in range(SETTLING):
             # Faces are curved: the nearest point of a face is beside that of the flat triangle.
@@ -436,6 +424,109 @@ class VisibleSurface:
             places[moving] = settled
             moving = moving[has_moved]
         return faces, places
+
+
+def _turned(vectors: Array) -> Array:
+    """Return plane vectors (P, 2) turned by −90 degrees, so that w · turned(v) = w × v."""
+    return np.column_stack([vectors[:, 1], -vectors[:, 0]])
+
+
+def _nearest_of_triangles(
+    points: Array, triangles: Array, neighbours: Index
+) -> tuple[Index, Array]:
+    """Return the nearest of some flat triangles to each point, and the nearest point on it.
+
+    The distance from the plane of a triangle, and the distances in this plane from the lines of its
+    sides, are lower bounds: only for triangles that these do not exclude is the distance from the
+    sides themselves computed.
+
+    Parameters
+    ----------
+    points : (P, 3) array
+        Points [m].
+    triangles : (T, 3, 3) array
+        Corners of the triangles [m].
+    neighbours : (P, k) array
+        Indices of the triangles that are considered for each point, k ≥ 1.
+
+    Returns
+    -------
+    ((P,) array, (P, 3) array)
+        Indices of the triangles, and barycentric coordinates in them.
+    """
+    first = triangles[:, 0]
+    sides = np.roll(triangles, -1, axis=1) - triangles
+    normals = np.cross(sides[:, 0], -sides[:, 2])
+    double_areas = np.linalg.norm(normals, axis=1)
+    has_area = double_areas > 0
+    normals /= np.where(has_area, double_areas, 1.0)[:, None]
+    outwards = np.cross(sides, normals[:, None])
+    lengths = np.linalg.norm(outwards, axis=2)
+    outwards /= np.where(lengths > 0, lengths, 1.0)[:, :, None]
+    # Distances from the plane and, outwards, from the lines of the sides, as functions of the point.
+    functions = [normals, *outwards.transpose(1, 0, 2)]
+    through = [first, *triangles.transpose(1, 0, 2)]
+    height, *beyond = (
+        _affine_values(slopes, through=origin, points=points, rows=neighbours)
+        for slopes, origin in zip(functions, through, strict=True)
+    )
+    beside = np.maximum(np.maximum(beyond[0], beyond[1]), beyond[2])
+    bounds = np.hypot(height, np.maximum(beside, 0.0))
+    is_above = (beside <= 0) & has_area[neighbours]
+    rows = np.arange(len(points))
+    rank = np.where(is_above, bounds, np.inf).argmin(axis=1)
+    least = np.where(is_above[rows, rank], bounds[rows, rank], np.inf)
+    nearest = neighbours[rows, rank]
+    feet = points - height[rows, rank, None] * normals[nearest]
+    # Then the one with the smallest bound, and all others whose bounds are smaller than its distance.
+    bounds[is_above] = np.inf
+    lowest = bounds.argmin(axis=1)
+    for only in (True, False):
+        is_possible = bounds < least[:, None]
+        if only:
+            is_possible &= np.arange(neighbours.shape[1]) == lowest[:, None]
+        point, rank = np.nonzero(is_possible)
+        bounds[point, rank] = np.inf
+        triangle = neighbours[point, rank]
+        on = nearest_points_of_triangles(points[point], triangles[triangle])
+        apart = np.linalg.norm(on - points[point], axis=1)
+        # Of several triangles of a point, the nearest is written last.
+        order = np.argsort(-apart, kind="stable")
+        order = order[apart[order] < least[point[order]]]
+        nearest[point[order]] = triangle[order]
+        feet[point[order]] = on[order]
+        least[point[order]] = apart[order]
+    return nearest, _barycentric(feet, triangles[nearest])
+
+
+def _affine_values(
+    slopes: Array, through: Array, points: Array, rows: Index
+) -> Array:
+    """Return the values s · (p − o) (P, k) at points p (P, 3), with the slopes s and the origins o
+    `through` (T, 3) each, of those of the T functions that `rows` (P, k) states for each point.
+    """
+    values = np.take(-np.einsum("ti,ti->t", slopes, through), rows)
+    for slope, coordinate in zip(slopes.T, points.T, strict=True):
+        values += np.take(slope, rows) * coordinate[:, None]
+    return values
+
+
+def _barycentric(points: Array, triangles: Array) -> Array:
+    """Return the barycentric coordinates (P, 3) of points (P, 3) in the planes of triangles
+    (P, 3, 3).
+    """
+    a, b, c = triangles.transpose(1, 0, 2)
+    ab = b - a
+    ac = c - a
+    away = points - a
+    bb, bc, cc, to_b, to_c = (
+        np.einsum("pi,pi->p", u, v)
+        for u, v in ((ab, ab), (ab, ac), (ac, ac), (away, ab), (away, ac))
+    )
+    determinants = bb * cc - bc**2
+    of_b = (cc * to_b - bc * to_c) / determinants
+    of_c = (bb * to_c - bc * to_b) / determinants
+    return np.column_stack([1 - of_b - of_c, of_b, of_c])
 
 
 def _cross_2d(a: Array, b: Array) -> Array:

@@ -1,12 +1,12 @@
 """Implicit Newmark method (β = ¼, γ = ½, average acceleration): the reference integrator.
 
-All forces but contact are evaluated at both ends of a step. Contact acts by its mean over the step,
-C(ξ, ν) at ξ = (x_0 + x_1)/2 and ν = (x_1 − x_0)/h, whose work is the loss of its energy, see
-`model.contact`; forces at both ends would add energy at every impact:
+All forces F but local ones (`model.local_force`) are evaluated at both ends of a step. Local forces
+act by their mean over the step, C(ξ, ν) at ξ = (x_0 + x_1)/2 and ν = (x_1 − x_0)/h, whose work is
+the loss of their energy; forces at both ends would add energy at every impact:
 
     M (v_1 − v_0) = h/2 (F_0 + F_1) + h C,    x_1 − x_0 = h/2 (v_0 + v_1).
 
-The accelerations a = M⁻¹ F of states are therefore those without contact.
+The accelerations a = M⁻¹ F of states are therefore those without local forces.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.array_types import Array, Index
-from ...model.contact import Contact
 from ...model.force_term import States
 from ...model.forces import Forces
 from ...model.internal_variables import (
@@ -29,10 +28,9 @@ from ...model.internal_variables import (
 )
 from ...model.weight import Weight
 from ...recording.experiment import Experiment
-from ..contact.condensed_contact import StepEquations
-from ..contact.step_contact import StepContact
 from ..linear_algebra.lapack import one_blas_thread
 from ..observables import ReactionForces
+from .condensed_steps import StepEquations
 from .initial_equilibrium import initial_state
 from .newton_solver import (
     NewtonFailure,
@@ -56,11 +54,12 @@ class _State:
     t_s : float
         Time [s].
     x, v, a : (3n,) arrays
-        Positions [m], velocities [m/s] and accelerations without contact [m/s²].
+        Positions [m], velocities [m/s] and accelerations without local forces
+        [m/s²].
     previous_histories : tuple
         History variables after the step; empty if there are none.
-    contact_n : (3n,) array or None
-        Mean contact force over the step that led here [N]; None if there is no contact.
+    local_n : (3n,) array or None
+        Mean of the local forces over the step that led here [N]; None if there are none.
     """
 
     t_s: float
@@ -68,7 +67,7 @@ class _State:
     v: Array
     a: Array
     previous_histories: tuple[PreviousState, ...] = ()
-    contact_n: Array | None = None
+    local_n: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,8 +151,8 @@ def simulate_newmark(
         state, sensed
     )
     means_n = np.zeros_like(reactions_and_positions[0])
-    if state.contact_n is not None:
-        means_n[0] = state.contact_n[sensed]
+    if state.local_n is not None:
+        means_n[0] = state.local_n[sensed]
     for k in range(1, len(times)):
         for j in range(1, steps_per_sample + 1):
             state = stepper.advance(state, float(times[k - 1] + j * step))
@@ -161,13 +160,13 @@ def simulate_newmark(
             reactions_and_positions[:, row] = stepper.reactions_and_positions(
                 state, sensed
             )
-            if state.contact_n is not None:
-                means_n[row] = state.contact_n[sensed]
+            if state.local_n is not None:
+                means_n[row] = state.local_n[sensed]
         x[k] = state.x
         v[k] = state.v
         if progress:
             progress(k / (len(times) - 1))
-    # Contact at a time is the mean over the steps before and after it.
+    # Local forces at a time are the mean over the steps before and after it.
     reactions_and_positions[0, 1:-1] -= (means_n[1:-1] + means_n[2:]) / 2
     reactions_and_positions[0, [0, -1]] -= means_n[[0, -1]]
     reactions, positions = reactions_and_positions
@@ -178,7 +177,7 @@ def simulate_newmark(
 
 class _NewmarkEquations(StepEquations):
     """Force balance F + 2 C − M a of one Newmark step as a function of the positions at its end,
-    with the contact forces C in the middle of the step.
+    with the local forces C in the middle of the step.
 
     Attributes
     ----------
@@ -192,9 +191,7 @@ class _NewmarkEquations(StepEquations):
     step_s : float
         Length of the step [s].
     forces : Forces
-        Forces at the end of the step, without contact.
-    contact : StepContact
-        Contact in the step.
+        All forces, with loads of the end of the step and local forces averaged over the step.
     prescribed_dofs : (p,) array
         Prescribed dofs.
     prescribed : _PrescribedMotion
@@ -206,15 +203,16 @@ class _NewmarkEquations(StepEquations):
         state: _State,
         step_s: float,
         forces: Forces,
-        contact: StepContact,
         prescribed_dofs: Index,
         prescribed: _PrescribedMotion,
     ) -> None:
-        super().__init__(contact, rates=(0.5, 1 / step_s), contact_weight=2.0)
+        super().__init__(
+            forces.local_forces(), rates=(0.5, 1 / step_s), local_weight=2.0
+        )
         self.mass_kg = forces.mass.inertia_kg[0]
         self._state = state
         self._step_s = step_s
-        self._forces = forces
+        self._forces = forces.without_local_forces()
         self._prescribed_dofs = prescribed_dofs
         self._prescribed = prescribed
         # Derivative of the velocity at the end by the position at the end.
@@ -226,16 +224,16 @@ class _NewmarkEquations(StepEquations):
     def extrapolation(self) -> Array:
         """Return a guess (3n,) of the positions at the end of the step [m].
 
-        Free dofs move at the acceleration of the start plus that by the mean contact force of the
+        Free dofs move at the acceleration of the start plus that by the mean local forces of the
         previous step; prescribed dofs are at their prescribed positions.
         """
         state = self._state
         h = self._step_s
         mass = self.mass_kg
         guess = state.x + h * state.v + 0.5 * h * h * state.a
-        if state.contact_n is not None:
+        if state.local_n is not None:
             guess += (
-                0.5 * h * h * state.contact_n / np.where(mass > 0, mass, np.inf)
+                0.5 * h * h * state.local_n / np.where(mass > 0, mass, np.inf)
             )
         return self.with_prescribed_positions(guess)
 
@@ -249,7 +247,8 @@ class _NewmarkEquations(StepEquations):
 
     def kinematics(self, x: Array) -> tuple[Array, Array]:
         """Return velocities [m/s] and accelerations [m/s²], (3n,) each, at the end of the step at
-        positions x (3n,) [m]; the accelerations include those due to contact.
+        positions x (3n,) [m]; the accelerations include those due to local
+        forces.
         """
         v = self._slope * x + self._known_v
         a = self._slope**2 * x + self._known_a
@@ -265,16 +264,17 @@ class _NewmarkEquations(StepEquations):
         before = self._state.x
         return (before + x)[None] / 2, (x - before)[None] / self._step_s
 
-    def residual(self, x: Array, with_contact: bool = True) -> Array:
-        """Return the force balance (3n,) [N] at the end positions x (3n,) [m]."""
+    def residual_without_local(self, x: Array) -> Array:
+        """Return the force balance (3n,) [N] without local forces at the end positions x (3n,)
+        [m].
+        """
         v, a = self.kinematics(x)
-        residual = self._forces.total(x, v)[0] - self.mass_kg * a
-        return self.add_contact_force(residual, x) if with_contact else residual
+        return self._forces.total(x, v)[0] - self.mass_kg * a
 
-    def linearise(
-        self, x: Array, with_contact: bool = True
-    ) -> NewtonLinearisation:
-        """Return the force balance (3n,) [N] at x (3n,) [m], and its derivative by x."""
+    def linearise_without_local(self, x: Array) -> NewtonLinearisation:
+        """Return the force balance (3n,) [N] without local forces at x (3n,) [m], and its
+        derivative by x.
+        """
         v, a = self.kinematics(x)
         slope = self._slope
         at = self._forces.linearise(x, v)
@@ -283,13 +283,8 @@ class _NewmarkEquations(StepEquations):
         skew = -at.by_position_skew[0]
         if at.by_velocity_skew.size:
             skew = skew - slope * at.by_velocity_skew[0]
-        linearisation = NewtonLinearisation(
+        return NewtonLinearisation(
             at.force[0] - self.mass_kg * a, matrix, skew=skew
-        )
-        return (
-            self.add_contact(linearisation, x)
-            if with_contact
-            else linearisation
         )
 
 
@@ -343,10 +338,8 @@ class _Stepper:
             a=np.zeros_like(x),
             previous_histories=previous_histories,
         )
-        if self.experiment.obstacles:
-            state = replace(
-                state, contact_n=self._contact_n(x, v, load_s=time_s)
-            )
+        if self._forces(time_s).has_local_forces:
+            state = replace(state, local_n=self._local_n(x, v, load_s=time_s))
         return self._balanced(state, time_s, dofs=solver.free)
 
     def advance(self, state: _State, target_s: float) -> _State:
@@ -376,14 +369,17 @@ class _Stepper:
                 step /= 2
                 if step < smallest:
                     raise simulation_error(
-                        solver, failure, time_s=state.t_s, what="a Newmark step"
+                        solver,
+                        failure,
+                        time_s=state.t_s,
+                        what="a time step of the Newmark method",
                     ) from failure
         return state
 
     def reactions_and_positions(
         self, state: _State, dofs: Index
     ) -> tuple[Array, Array]:
-        """Return the reaction forces without contact on dofs (g,) [N], and their positions (g,)
+        """Return the reaction forces without local ones on dofs (g,) [N], and their positions (g,)
         [m].
         """
         if not len(dofs):
@@ -394,33 +390,33 @@ class _Stepper:
         return reaction[dofs], state.x[dofs]
 
     def _force(self, state: _State, load_s: float) -> Array:
-        """Return all forces (3n,) [N] except contact in a state, under the loads at the time
+        """Return all forces (3n,) [N] except local ones in a state, under the loads at the time
         `load_s`.
         """
-        forces, _ = self._forces(load_s).without_contact()
+        forces = self._forces(load_s)
         for each in state.previous_histories:
             forces = each.insert_at_same_time(forces)
-        return forces.total(state.x, state.v)[0]
+        return forces.without_local_forces().total(state.x, state.v)[0]
 
     def _forces(self, load_s: float, step_s: float = 0.0) -> Forces:
-        """Return the forces under the loads at the time `load_s` [s]; contact is averaged over a
+        """Return the forces under the loads at the time `load_s` [s]; local ones are averaged over a
         step of `step_s` [s], or evaluated at the state if that is zero.
         """
         return Forces.from_experiment(
             self.experiment, load_s, theta=self.theta, step_s=step_s
         )
 
-    def _contact_n(
+    def _local_n(
         self, x: Array, v: Array, load_s: float, step_s: float = 0.0
     ) -> Array:
-        """Return the contact forces (3n,) [N] at positions x and velocities v, (3n,) each, under
-        the loads at the time `load_s`; averaged over a step of `step_s` [s] about this state,
-        unless that is zero. Contact as a complementarity problem is left out.
+        """Return the sum of the local forces (3n,) [N] at positions x and velocities v, (3n,) each,
+        under the loads at the time `load_s`; averaged over a step of `step_s` [s] about this state,
+        unless that is zero.
         """
         forces = self._forces(load_s, step_s)
         total_n = np.zeros_like(x)
         for term in forces.external_terms:
-            if isinstance(term, Contact) and not term.is_complementarity:
+            if term.is_local:
                 total_n += term.force(
                     States(x[None], v[None], theta=self.theta)
                 )[0]
@@ -456,7 +452,7 @@ class _Stepper:
         self, state: _State, load_s: float, dofs: NDArray[np.int64]
     ) -> _State:
         """Return the state with the accelerations of some dofs (indices) computed from the forces
-        on them, without contact, under the loads at the time `load_s`; the other accelerations are
+        on them, without local forces, under the loads at the time `load_s`; the other accelerations are
         kept.
         """
         acceleration = state.a.copy()
@@ -477,16 +473,15 @@ class _Stepper:
             If Newton's method does not converge.
         """
         h = end_s - state.t_s
-        forces, touching = insert_previous_states(
+        forces = insert_previous_states(
             self._forces(load_s, step_s=h),
             state.previous_histories,
             interval_s=h,
-        ).without_contact()
+        )
         equations = _NewmarkEquations(
             state,
             h,
             forces=forces,
-            contact=StepContact(touching, self.theta, pattern=forces.pattern),
             prescribed_dofs=solver.is_prescribed,
             prescribed=self._prescribed_motion(
                 solver, end_s, step_s=h, holding_s=load_s
@@ -497,15 +492,15 @@ class _Stepper:
             guess = equations.with_prescribed_positions(state.x)
         x = solver.solve_step(guess, equations)
         v, a = equations.kinematics(x)
-        contact_n = None
-        if equations.contact.acts:
+        local_n = None
+        if equations.local.has_forces:
             mass = equations.mass_kg
             xi, nu = equations.states(x)
-            contact_n = self._contact_n(xi[0], nu[0], load_s=load_s, step_s=h)
+            local_n = self._local_n(xi[0], nu[0], load_s=load_s, step_s=h)
             # Prescribed dofs have the acceleration of the grasp.
             free = solver.free
             a[free] -= (
-                2 * contact_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
+                2 * local_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
             )
         previous_histories = advance_states(
             forces, state.previous_histories, x=x, v=v, interval_s=h
@@ -516,7 +511,7 @@ class _Stepper:
             v=v,
             a=a,
             previous_histories=previous_histories,
-            contact_n=contact_n,
+            local_n=local_n,
         )
 
     def _prescribed_motion(

@@ -13,12 +13,6 @@ from numpy.typing import NDArray
 from ...common.array_types import Array
 from ...errors import SimulationError
 from ...recording.experiment import Experiment
-from ..contact.condensed_contact import (
-    Compliance,
-    CondensationError,
-    CondensedSteps,
-    StepEquations,
-)
 from ..linear_algebra.factorisation import Factor, Factoriser
 from ..linear_algebra.reused_factor import (
     FactorSequence,
@@ -28,6 +22,12 @@ from ..linear_algebra.reused_factor import (
     relative_cost,
 )
 from ..stopwatch import Stopwatch
+from .condensed_steps import (
+    Compliance,
+    CondensationError,
+    CondensedSteps,
+    StepEquations,
+)
 from .newton_linearisation import NewtonLinearisation
 from .retraction import Retraction, add_increment
 
@@ -48,8 +48,8 @@ SLOWEST_CHORD_RATE = 0.5
 # Largest number of chord steps towards an equilibrium with one factor.
 LARGEST_STATIC_CHORD_STEP_COUNT = 20
 # Cost of a factorisation, in solutions, above which a factor is reused for the matrices of later
-# time steps: some 2,000 nodes.
-LEAST_COST_OF_FACTOR = 4.5
+# time steps: some 3,000 nodes. Smaller bodies would gain a few percent.
+LEAST_COST_OF_FACTOR = 6.0
 # Relative accuracy of chord steps with such a factor: they shrink about as fast as with an exact one.
 CHORD_ACCURACY = 1e-3
 # Chord steps towards an equilibrium end at this expected error, over the tolerance.
@@ -158,7 +158,7 @@ class NewtonSolver:
     last_factor : Factor or None
         Factor of the last solution of complete equations, with which the next one begins.
     compliance : Compliance or None
-        Inverse of the matrix of the body without contact, of the last step with contact.
+        Inverse of the matrix of the body without local forces, of the last step with such forces.
     definite_factor : Factor or None
         Last positive definite factor on the way to an equilibrium, with which the next search for
         one begins.
@@ -185,7 +185,7 @@ class NewtonSolver:
         self.stopwatch = stopwatch or Stopwatch()
         self.body = experiment.body
         # A retraction moves surfaces off the obstacles that hold them.
-        self._is_free_of_contact = not experiment.obstacles
+        self._has_no_obstacle = not experiment.obstacles
         self.options = options or NewtonOptions()
         at_start = experiment.is_prescribed(experiment.t_s[:1])[0]
         holding = at_start if prescribed is None else prescribed
@@ -246,16 +246,35 @@ class NewtonSolver:
         x, done = self._with_known_factor(x, residual)
         if done and not self.options.checks_stability:
             return x
-        return self._solve_with_backtracking(
-            x, residual, linearise=linearise, keep_definite=True
-        )
+        iterate = self._iterate_at(x, linearise, keep_definite=True)
+        for _ in range(self.options.max_iterations):
+            if self._is_last(iterate.step):
+                self.last_factor = iterate.factor
+                iterate.x[self.free] += iterate.step
+                return iterate.x
+            self.definite_factor = iterate.factor
+            chords = self._static_chords(iterate, residual)
+            if chords is not None:
+                if chords.converged and not self.options.checks_stability:
+                    return chords.x
+                try:
+                    iterate = self._iterate_at(
+                        chords.x, linearise, keep_definite=True
+                    )
+                    continue
+                except NewtonFailure:
+                    pass
+            iterate = self._backtrack(
+                iterate, residual, linearise=linearise, keep_definite=True
+            )
+        raise self._iteration_failure(iterate)
 
     def solve_step(self, x: Array, equations: StepEquations) -> Array:
-        """Solve one implicit time step, with contact or without, for the free dofs.
+        """Solve one implicit time step for the free dofs.
 
-        Contact is condensed to the dofs that touch, with the factor of the body without contact of
-        earlier steps. Where that does not converge, the complete equations are solved, first with
-        the factor of the previous solution as long as steps shrink fast.
+        Local forces are condensed to the dofs on which they act, with the factor of the body
+        without them of earlier steps. Where that does not converge, the complete equations are
+        solved, first with the factor of the previous solution as long as steps shrink fast.
 
         Parameters
         ----------
@@ -274,7 +293,7 @@ class NewtonSolver:
         NewtonFailure
             If no method converges, or an element is inverted at the start.
         """
-        if equations.contact.acts and self.has_no_inverted_element(x):
+        if equations.local.has_forces and self.has_no_inverted_element(x):
             improved, done = self._simplified_newton(
                 x, _CondensedIteration(self, equations)
             )
@@ -287,69 +306,52 @@ class NewtonSolver:
         )
         if done:
             return improved
-        return self._solve_with_backtracking(
-            x.copy(),
-            equations.residual,
-            linearise=equations.linearise,
-            keep_definite=False,
+        iterate = self._iterate_at(
+            x.copy(), equations.linearise, keep_definite=False
         )
-
-    def _solve_with_backtracking(
-        self,
-        x: Array,
-        residual: Residual,
-        linearise: Linearise,
-        keep_definite: bool,
-    ) -> Array:
-        """Return the solution (3n,) [m] of residual(x) = 0 by Newton's method with backtracking.
-
-        A step is accepted when the next one, computed with the same factor, is shorter (Deuflhard's
-        natural monotonicity test), and no element is inverted.
-
-        Parameters
-        ----------
-        x : (3n,) array
-            First guess [m]; modified.
-        residual, linearise : callable
-            Functions of the state, see `solve_equilibrium`.
-        keep_definite : bool
-            Whether the matrix must be positive definite. Chord steps then replace those of Newton
-            where they shrink fast.
-
-        Raises
-        ------
-        NewtonFailure
-            If the method does not converge or a matrix is singular.
-        """
-        with self.stopwatch.evaluating():
-            at = linearise(x)
-        factor = self.factorise(at, x, keep_definite=keep_definite)
-        iterate = _Iterate(x, factor, step=self.step(factor, at.residual))
         for _ in range(self.options.max_iterations):
             if self._is_last(iterate.step):
                 self.last_factor = iterate.factor
                 iterate.x[self.free] += iterate.step
                 return iterate.x
-            if keep_definite:
-                self.definite_factor = iterate.factor
-                chords = self._static_chords(iterate, residual)
-                if chords is not None:
-                    if chords.converged and not self.options.checks_stability:
-                        return chords.x
-                    following = self._definite_iterate(chords.x, linearise)
-                    if following is not None:
-                        iterate = following
-                        continue
             iterate = self._backtrack(
                 iterate,
-                residual,
-                linearise=linearise,
-                keep_definite=keep_definite,
+                equations.residual,
+                linearise=equations.linearise,
+                keep_definite=False,
             )
-        raise NewtonFailure(
+        raise self._iteration_failure(iterate)
+
+    def _iteration_failure(self, iterate: _Iterate) -> NewtonFailure:
+        """Return the failure of a search that has taken the largest number of iterations."""
+        return NewtonFailure(
             iterate.x,
             f"Newton's method took more than {self.options.max_iterations} iterations",
         )
+
+    def _iterate_at(
+        self, x: Array, linearise: Linearise, keep_definite: bool
+    ) -> _Iterate:
+        """Return the iterate at x (3n,) [m], with its own factor and the step of Newton's method.
+
+        Parameters
+        ----------
+        x : (3n,) array
+            State; stored, not copied.
+        linearise : callable
+            `NewtonLinearisation` at a state.
+        keep_definite : bool
+            Whether a matrix that is not positive definite is a failure.
+
+        Raises
+        ------
+        NewtonFailure
+            If the matrix is singular or, with `keep_definite`, not positive definite.
+        """
+        with self.stopwatch.evaluating():
+            at = linearise(x)
+        factor = self.factorise(at, x, keep_definite=keep_definite)
+        return _Iterate(x, factor, step=self.step(factor, at.residual))
 
     def _with_known_factor(
         self, x: Array, residual: Residual
@@ -409,20 +411,6 @@ class NewtonSolver:
                 x[self.free] += step
                 return _Chords(x, converged=True)
         return _Chords(x, converged=False) if has_moved else None
-
-    def _definite_iterate(
-        self, x: Array, linearise: Linearise
-    ) -> _Iterate | None:
-        """Return the iterate at x (3n,) [m] with a factor of its own, or None if the matrix is
-        singular or not positive definite there.
-        """
-        with self.stopwatch.evaluating():
-            at = linearise(x)
-        try:
-            factor = self.factorise(at, x, keep_definite=True)
-        except NewtonFailure:
-            return None
-        return _Iterate(x, factor, step=self.step(factor, at.residual))
 
     def _simplified_newton(
         self, x: Array, iteration: ChordIteration
@@ -519,6 +507,9 @@ class NewtonSolver:
     ) -> _Iterate:
         """Return the next iterate, with the first of the halved steps that is acceptable.
 
+        A step is acceptable when the next one, computed with the same factor, is shorter
+        (Deuflhard's natural monotonicity test), and no element is inverted.
+
         Parameters
         ----------
         iterate : _Iterate
@@ -539,7 +530,7 @@ class NewtonSolver:
         share = 1.0
         update = (
             self._retraction
-            if keep_definite and self._is_free_of_contact
+            if keep_definite and self._has_no_obstacle
             else add_increment
         )
         for _ in range(self.options.max_backtracks):
@@ -733,7 +724,7 @@ class _CompleteIteration:
 
 
 class _CondensedIteration:
-    """Steps with the factor of the body without contact, and contact condensed.
+    """Steps with the factor of the body without local forces, which are condensed.
 
     Parameters
     ----------
@@ -755,7 +746,7 @@ class _CondensedIteration:
     def factorise_at(self, x: Array) -> None:
         solver = self._solver
         with solver.stopwatch.evaluating():
-            at = self._equations.linearise(x, with_contact=False)
+            at = self._equations.linearise_without_local(x)
         symmetric = at._replace(skew=NO_SKEW_PART)
         factor = solver.factorise(symmetric, x, keep_definite=False)
         solver.compliance = Compliance(factor, len(solver.free))
@@ -905,9 +896,10 @@ def simulation_error(
     """
     element = solver.worst_element(failure.x)
     ratio = float(solver.body.volume_ratios(failure.x)[0, element].min())
+    remedy = "smaller loads" if static else "a smaller time step"
     return SimulationError(
-        f"{what} failed: {failure.reason}; the worst element has det F = {ratio:.3g}. "
-        "Stiffer parameters, a smaller timestep or a finer mesh may help",
+        f"{what} failed: {failure.reason}; the most deformed element has the volume ratio "
+        f"det F = {ratio:.3g}. Stiffer parameters, {remedy} or a finer mesh may help",
         time_s,
         element=element,
         state_m=failure.x if static else None,

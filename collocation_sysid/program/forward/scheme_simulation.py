@@ -20,10 +20,9 @@ from ...model.internal_variables import (
     insert_previous_states,
 )
 from ...recording.experiment import Experiment
-from ..contact.condensed_contact import StepEquations
-from ..contact.step_contact import StepContact
 from ..linear_algebra.lapack import one_blas_thread
 from ..stopwatch import Stopwatch
+from .condensed_steps import StepEquations
 from .initial_equilibrium import initial_state
 from .newton_solver import (
     NewtonFailure,
@@ -165,7 +164,7 @@ def continue_simulation(
                 solver,
                 failure,
                 time_s=float(dynamics.t_s[t]),
-                what=f"the step at row {t}",
+                what=f"time step {t}",
                 static=dynamics.is_static,
             )
         forces[t] = row.force(x[t])
@@ -289,17 +288,17 @@ class RowEquations(StepEquations):
                 previous,
                 interval_s=float(dynamics.interval_to_next_s[t - 1]),
             )
-        self.rest, contacts = self.forces.without_contact()
+        self.rest = self.forces.without_local_forces()
         self.rest_before = (
-            at_times(dynamics.forces, slice(t - 1, t)).without_contact()[0]
+            at_times(dynamics.forces, slice(t - 1, t)).without_local_forces()
             if dynamics.is_static
             else None
         )
         row = self.row
         super().__init__(
-            StepContact(contacts, self.rest.theta, pattern=self.rest.pattern),
+            self.forces.local_forces(),
             rates=(row.p[0], row.q[0]),
-            contact_weight=row.w[0],
+            local_weight=row.w[0],
         )
         first = max(0, t - dynamics.largest_lag)
         shape = x.shape[1:]
@@ -326,11 +325,13 @@ class RowEquations(StepEquations):
 
     def force(self, x: Array) -> Array:
         """Return the force F_t (3n,) [N] at the evaluation state that follows from x_t = `x` (3n,)
-        [m], with contact.
+        [m], with local forces.
         """
         states = self.states(x)
         rest = self.rest.total(*states)[0]
-        return rest + self.contact.force(*states) if self.contact.acts else rest
+        return (
+            rest + self.local.force(*states) if self.local.has_forces else rest
+        )
 
     def states(self, x: Array) -> tuple[Array, Array]:
         """Return ξ_t [m] and ν_t [m/s], each (1, 3n), from x_t (3n,)."""
@@ -343,28 +344,22 @@ class RowEquations(StepEquations):
         row = self.row
         return row.w[0] * force + self.known - row.s[0] * row.mass_kg * x
 
-    def residual(self, x: Array, with_contact: bool = True) -> Array:
-        """Return the constraints c_t (3n,) [N] at positions x_t (3n,) [m]."""
-        residual = self._residual_from(self.rest.total(*self.states(x))[0], x)
-        return self.add_contact_force(residual, x) if with_contact else residual
+    def residual_without_local(self, x: Array) -> Array:
+        """Return the constraints c_t (3n,) [N] without local forces at positions x_t (3n,) [m]."""
+        return self._residual_from(self.rest.total(*self.states(x))[0], x)
 
-    def linearise(
-        self, x: Array, with_contact: bool = True
-    ) -> NewtonLinearisation:
-        """Return c_t (3n,) [N] at x_t = `x` (3n,) [m], and its derivative by x_t."""
+    def linearise_without_local(self, x: Array) -> NewtonLinearisation:
+        """Return c_t (3n,) [N] without local forces at x_t = `x` (3n,) [m], and its derivative by
+        x_t.
+        """
         row = self.row
         at = self.rest.linearise(*self.states(x))
         matrix = row.block(
             at.by_position[0], at.by_velocity[0], pattern=self.rest.pattern
         )
         skew = row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
-        linearisation = NewtonLinearisation(
+        return NewtonLinearisation(
             self._residual_from(at.force[0], x), matrix, skew=skew
-        )
-        return (
-            self.add_contact(linearisation, x)
-            if with_contact
-            else linearisation
         )
 
 

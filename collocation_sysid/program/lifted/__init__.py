@@ -7,7 +7,7 @@ has simpler equations; reduced space eliminates them.
   `lifted_variables`: their base class.
 - `lifted_memory`: internal variables of viscoelastic materials; `lifted_force_histories`: those of
   forces with a history.
-- `lifted_contact_pressures`: contact pressures with complementarity conditions.
+- `lifted_pressures`: pressures with complementarity conditions.
 - `lifted_reactions`, `lifted_resultants`: reactions of grasps and their measured resultants.
 - `expression_patterns`: constraints that repeat one small expression.
 """

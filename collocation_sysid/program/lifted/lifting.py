@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..transcription import Transcription
-from .lifted_contact_pressures import LiftedContactPressure
 from .lifted_force_histories import LiftedForceHistory
 from .lifted_memory import LiftedMemory
+from .lifted_pressures import LiftedPressure
 from .lifted_reactions import LiftedReactions
 from .lifted_resultants import LiftedResultant
 from .lifted_variables import LiftedOffsets, LiftedVariables
@@ -21,7 +21,7 @@ def lift_variables(
     """Create the groups of lifted variables of all experiments.
 
     For each experiment, in this order: reaction forces of instrumented grasps, memory of the
-    material, history variables of forces, contact pressures of complementarity problems, and
+    material, history variables of forces, pressures of complementarity problems, and
     measured resultants of reactions. Quantities that an experiment does not have are left out.
 
     Parameters
@@ -80,7 +80,7 @@ def lift_variables(
             segment.dynamics.forces.complementarity_terms, histories
         ):
             groups.append(
-                LiftedContactPressure(
+                LiftedPressure(
                     **lift,
                     offsets=offsets,
                     motion_history=history,

@@ -27,9 +27,12 @@ SLOWEST_REDUCTION = 0.5
 LARGEST_CORRECTION_COUNT = 12
 # Expected error of a solution over the required one, because it is estimated from residuals.
 SAFETY = 0.3
-# A factorisation costs this number of solutions per mean number of entries of a column of the factor
-# and seven columns of the right-hand side (measured from 800 to 20,000 nodes, see `relative_cost`).
+# A factorisation costs this number of solutions per mean number of entries of a column of a
+# supernodal factor, for `MEASURED_COLUMNS` columns of the right-hand side (measured from 800 to 20,000
+# nodes, see `relative_cost`).
 COST_PER_ENTRY = 0.01
+# The same of a banded factor, which is solved in blocks (measured from 1,300 to 5,000 nodes).
+BAND_COST_PER_ENTRY = 0.0065
 # Part of the time of a solution that does not depend on the number of right-hand sides, in columns.
 FIXED_COLUMNS = 2
 # Columns of a right-hand side at which `COST_PER_ENTRY` was measured.
@@ -44,7 +47,8 @@ def relative_cost(factoriser: Factoriser, columns: int) -> float:
     """
     entries = factoriser.factor_size / max(1, factoriser.size)
     share = (FIXED_COLUMNS + columns) / (FIXED_COLUMNS + MEASURED_COLUMNS)
-    return COST_PER_ENTRY * entries / share
+    each = BAND_COST_PER_ENTRY if factoriser.is_banded else COST_PER_ENTRY
+    return each * entries / share
 
 
 class Matrix(NamedTuple):

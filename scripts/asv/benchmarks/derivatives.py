@@ -17,11 +17,11 @@ class Assembly:
         return measure(PROBLEM, "backward-euler", 7)
 
     def track_jacobian_ms(self, measured: dict) -> float:
-        """Compiled, on one thread."""
+        """Time of the compiled Jacobian on one thread [ms]."""
         return measured["jacobian"]["simd_1_ms"]
 
     def track_ratio_to_casadi_map(self, measured: dict) -> float:
-        """How many times longer the same expressions take through casadi.Function.map."""
+        """Time of the Jacobian by casadi.Function.map, divided by that of the compiled kernels."""
         return (
             measured["jacobian"]["casadi_map_ms"]
             / measured["jacobian"]["simd_1_ms"]
@@ -39,7 +39,7 @@ class Contact:
         self.works = prepared(4, 12, CASES[case])
 
     def time_sweep(self, case: str) -> None:
-        """Sensitivities along the motion."""
+        """Time a sweep: the sensitivities along the motion, with their factorisations."""
         self.works["sweep"]()
 
     def time_forward_simulation(self, case: str) -> None:
@@ -51,7 +51,7 @@ class Sensitivities:
     """Sensitivities of the shipped recording."""
 
     def setup(self) -> None:
-        """Start at the guess."""
+        """Evaluate the first experiment at the guess, with the body moving rigidly."""
         collocation = Problem.read(PROBLEM).collocation()
         shapes = [
             s.experiment.rigid_positions(s.dynamics.t_s)
@@ -61,9 +61,9 @@ class Sensitivities:
         self.part = next(iter(collocation.iterates(z)))
 
     def time_sweep(self) -> None:
-        """Forward, all columns."""
+        """Time a forward sweep with the columns of all parameters."""
         Sweep(self.part.segment).forward(self.part.x, self.part.equations)
 
     def peakmem_sweep(self) -> None:
-        """The same."""
+        """Measure the peak memory of the sweep that `time_sweep` times."""
         Sweep(self.part.segment).forward(self.part.x, self.part.equations)

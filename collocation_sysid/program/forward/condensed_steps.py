@@ -1,40 +1,40 @@
-"""Time steps of a body in contact, with the contact condensed to the dofs that touch.
+"""Time steps of a body with local forces, which are condensed to the dofs on which they act.
 
-The stiffness of contact changes with every point that begins or ceases to touch, whereas the matrix
-A of the body without contact hardly changes from one step to the next. Here only A is factorised.
-With the residual c of the body and the contact forces f, the step d from the state x satisfies
+The stiffness of local forces changes with every point at which they begin or cease to act, whereas
+the matrix A of the body without them hardly changes from one step to the next. Here only A is
+factorised. With the residual c of the body and the local forces f, the step d from the state x
+satisfies
 
     d = A⁻¹ (c(x) + f(x + d)),
 
-in which f depends on the few dofs that touch. Columns of A⁻¹ at these dofs, their compliance, are
+in which f depends on the few active dofs. Columns of A⁻¹ at these dofs, their compliance, are
 computed once for each factor of A. The equation is solved for the step of these dofs by Newton's
-method with small dense matrices, so that it contains any change of the contact, and the iteration
-over x converges as fast as that of a body without contact.
+method with small dense matrices, so that it contains any change of the active points, and the
+iteration over x converges as fast as that of a body without local forces.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
 
 from ...common.array_types import Array, Index
-from ...model.contact import ContactLaw
-from ..forward.newton_linearisation import NewtonLinearisation
+from ...model.local_force import ActivePoints, LocalForces
 from ..linear_algebra.factorisation import Factor
-from .step_contact import StepContact, TouchingPoints
+from .newton_linearisation import NewtonLinearisation
 
-# Largest number of dofs that touch: dense matrices of this size take as long as the factor of a
-# body of some thousand nodes.
-MAX_TOUCHING_DOFS = 900
-# Largest number of Newton iterations for the dofs that touch; usually 1 to 5.
-MAX_CONTACT_ITERATIONS = 20
+# Largest number of active dofs: dense matrices of this size take as long as the factor of a body of
+# some thousand nodes.
+MAX_ACTIVE_DOFS = 900
+# Largest number of Newton iterations for the active dofs; usually 1 to 5.
+MAX_LOCAL_ITERATIONS = 20
 # Largest remaining error of the step of these dofs, as a share of the longest step: the iteration
 # over the state of the body reduces the error by a similar factor.
-CONTACT_ACCURACY = 0.05
+LOCAL_ACCURACY = 0.05
 # Remaining error that is due to rounding, as a share of the size of the body.
 ROUND_OFF = 1e-13
 # Largest number of entries of all columns that are stored, 240 MB.
@@ -46,82 +46,84 @@ _getrf, _getrs = get_lapack_funcs(("getrf", "getrs"), dtype=np.float64)
 
 
 class CondensationError(Exception):
-    """The contact of a step cannot be condensed: too many dofs touch, or the iteration for them
-    does not converge.
+    """The local forces of a step cannot be condensed: too many dofs are active, or the iteration
+    for them does not converge.
     """
 
 
 class StepEquations(ABC):
-    """Equations of motion of one time step as functions of the positions at its end, contact apart.
+    """Equations of motion of one time step as functions of the positions at its end.
+
+    Derived classes state the equations without local forces; the complete ones contain these.
 
     Attributes
     ----------
-    contact : StepContact
-        Contact in the step.
+    local : LocalForces
+        Local forces in the step.
     rates : (float, float)
-        Derivatives of the state ξ and of the velocity ν of contact by the positions.
-    contact_weight : float
-        Factor of the contact forces in the residual.
+        Derivatives of the state ξ and of the velocity ν of the local forces by the positions.
+    local_weight : float
+        Factor of the local forces in the residual.
 
     Parameters
     ----------
-    contact, rates, contact_weight
+    local, rates, local_weight
         See the attributes.
     """
 
     def __init__(
         self,
-        contact: StepContact,
+        local: LocalForces,
         rates: tuple[float, float],
-        contact_weight: float,
+        local_weight: float,
     ) -> None:
-        self.contact = contact
+        self.local = local
         self.rates = rates
-        self.contact_weight = contact_weight
+        self.local_weight = local_weight
 
     @abstractmethod
     def states(self, x: Array) -> tuple[Array, Array]:
-        """Return the state ξ [m] and velocity ν [m/s], (1, 3n) each, at which contact acts if the
-        step ends at x (3n,) [m].
+        """Return the state ξ [m] and velocity ν [m/s], (1, 3n) each, at which local forces act if
+        the step ends at x (3n,) [m].
         """
 
     @abstractmethod
-    def residual(self, x: Array, with_contact: bool = True) -> Array:
-        """Return the residual (3n,) [N] at positions x (3n,) [m]."""
+    def residual_without_local(self, x: Array) -> Array:
+        """Return the residual (3n,) [N] without local forces at positions x (3n,) [m]."""
 
     @abstractmethod
-    def linearise(
-        self, x: Array, with_contact: bool = True
-    ) -> NewtonLinearisation:
-        """Return the residual (3n,) [N] at positions x (3n,) [m], and its derivative by x."""
+    def linearise_without_local(self, x: Array) -> NewtonLinearisation:
+        """Return the residual (3n,) [N] without local forces at positions x (3n,) [m], and its
+        derivative by x.
+        """
 
-    def add_contact_force(self, residual: Array, x: Array) -> Array:
-        """Return the residual (3n,) [N] without contact at x (3n,) [m] plus that of contact."""
-        if not self.contact.acts:
+    def residual(self, x: Array) -> Array:
+        """Return the complete residual (3n,) [N] at positions x (3n,) [m]."""
+        residual = self.residual_without_local(x)
+        if not self.local.has_forces:
             return residual
-        return residual + self.contact_weight * self.contact.force(
-            *self.states(x)
-        )
+        return residual + self.local_weight * self.local.force(*self.states(x))
 
-    def add_contact(
-        self, at: NewtonLinearisation, x: Array
-    ) -> NewtonLinearisation:
-        """Return the linearisation without contact at x (3n,) [m] plus that of contact."""
-        if not self.contact.acts:
+    def linearise(self, x: Array) -> NewtonLinearisation:
+        """Return the complete residual (3n,) [N] at positions x (3n,) [m], and its derivative by
+        x.
+        """
+        at = self.linearise_without_local(x)
+        if not self.local.has_forces:
             return at
-        contact = self.contact.linearise(*self.states(x), self.rates)
+        local = self.local.linearise(*self.states(x), self.rates)
         skew = at.skew
-        if contact.skew.size:
-            skew = skew - self.contact_weight * contact.skew
+        if local.skew.size:
+            skew = skew - self.local_weight * local.skew
         return NewtonLinearisation(
-            at.residual + self.contact_weight * contact.force,
-            at.symmetric - self.contact_weight * contact.symmetric,
+            at.residual + self.local_weight * local.force,
+            at.symmetric - self.local_weight * local.symmetric,
             skew=skew,
         )
 
-    def touching_points(self, x: Array) -> list[TouchingPoints]:
-        """Return the points that touch at positions x (3n,) [m]."""
-        return self.contact.touching_points(*self.states(x), self.rates)
+    def active_points(self, x: Array) -> list[ActivePoints]:
+        """Return the points on which local forces act at positions x (3n,) [m]."""
+        return self.local.active_points(*self.states(x), self.rates)
 
 
 class Compliance:
@@ -130,7 +132,7 @@ class Compliance:
     Parameters
     ----------
     factor : Factor
-        Factor of the matrix of the body without contact.
+        Factor of the matrix of the body without local forces.
     size : int
         Number k of free dofs.
     """
@@ -184,15 +186,15 @@ class Compliance:
 
 
 @dataclass(frozen=True, eq=False)
-class TouchingDofs:
-    """Free dofs of the nodes whose faces touch, and the assembly of forces on them.
+class ActiveDofs:
+    """Free dofs of the nodes of active points, and the assembly of forces on them.
 
     Attributes
     ----------
     dofs : (s,) array
         Sorted indices among the free dofs.
     places : sequence of (t, 3v) arrays
-        For each obstacle the index in `dofs` of the dofs of each touching point; s for dofs that
+        For each local force the index in `dofs` of the dofs of each active point; s for dofs that
         are prescribed.
     """
 
@@ -201,30 +203,30 @@ class TouchingDofs:
 
     @classmethod
     def from_points(
-        cls, points: Sequence[TouchingPoints], number: Index
-    ) -> TouchingDofs:
-        """Return the dofs of touching points.
+        cls, points: Sequence[ActivePoints], number: Index
+    ) -> ActiveDofs:
+        """Return the dofs of active points.
 
         Parameters
         ----------
-        points : sequence of TouchingPoints
-            Points of each obstacle.
+        points : sequence of ActivePoints
+            Points of each local force.
         number : (3n,) array
             Index of each dof among the free ones; −1 for prescribed dofs.
         """
         numbers = [
             number[each.candidates.dofs[each.indices]] for each in points
         ]
-        touches = np.zeros(len(number) + 1, dtype=bool)
+        is_active = np.zeros(len(number) + 1, dtype=bool)
         for each in numbers:
-            touches[each] = True
-        touches[-1] = False
-        (dofs,) = touches.nonzero()
-        place_of_dof = np.full(len(touches), len(dofs))
+            is_active[each] = True
+        is_active[-1] = False
+        (dofs,) = is_active.nonzero()
+        place_of_dof = np.full(len(is_active), len(dofs))
         place_of_dof[dofs] = np.arange(len(dofs))
         return cls(dofs, [place_of_dof[each] for each in numbers])
 
-    def assemble_force(self, points: Sequence[TouchingPoints]) -> Array:
+    def assemble_force(self, points: Sequence[ActivePoints]) -> Array:
         """Return the forces (s,) [N] on the dofs."""
         count = len(self.dofs) + 1
         total = np.zeros(count)
@@ -236,7 +238,7 @@ class TouchingDofs:
             )
         return total[:-1]
 
-    def assemble_stiffness(self, points: Sequence[TouchingPoints]) -> Array:
+    def assemble_stiffness(self, points: Sequence[ActivePoints]) -> Array:
         """Return the negative derivative (s, s) of the forces on the dofs by their positions
         [N/m].
         """
@@ -254,35 +256,36 @@ class TouchingDofs:
 
 
 @dataclass(frozen=True, eq=False)
-class ContactForces:
-    """Contact forces of a state on the free dofs that touch.
+class ForcesOnActiveDofs:
+    """Local forces of a state on the active dofs.
 
     Attributes
     ----------
     x : (3n,) array
         Positions [m].
-    points : sequence of TouchingPoints
-        Touching points of each obstacle.
-    touching : TouchingDofs
-        Free dofs that touch.
+    points : sequence of ActivePoints
+        Active points of each local force.
+    active : ActiveDofs
+        Active dofs.
     force : (s,) array
-        Forces on these dofs, multiplied by the weight of contact in the equations [N].
+        Forces on these dofs, multiplied by the weight of local forces in the equations [N].
     """
 
     x: Array
-    points: Sequence[TouchingPoints]
-    touching: TouchingDofs
+    points: Sequence[ActivePoints]
+    active: ActiveDofs
     force: Array
 
     @property
     def dofs(self) -> Index:
         """Sorted indices (s,) among the free dofs."""
-        return self.touching.dofs
+        return self.active.dofs
 
 
 @dataclass(frozen=True, eq=False)
 class CondensedStiffness:
-    """Contact stiffness K and compliance C of the body at free dofs, with the factor of 1 + C K.
+    """Stiffness K of local forces and compliance C of the body at active dofs, with the factor of
+    1 + C K.
 
     Attributes
     ----------
@@ -293,7 +296,7 @@ class CondensedStiffness:
     compliance : (s, s) array
         C, the entries of these columns at the dofs [m/N].
     stiffness : (s, s) array
-        K, the negative derivative of the contact forces [N/m].
+        K, the negative derivative of the local forces [N/m].
     factor : tuple
         LU factorisation of 1 + C K.
     """
@@ -308,7 +311,8 @@ class CondensedStiffness:
     def at_dofs(
         cls, dofs: Index, compliance: Compliance, stiffness: Array
     ) -> CondensedStiffness:
-        """Return the matrices at sorted free dofs (s,) with a contact stiffness (s, s).
+        """Return the matrices at sorted free dofs (s,) with a stiffness (s, s) of
+        local forces.
 
         Raises
         ------
@@ -336,14 +340,14 @@ class CondensedStiffness:
 
 
 class CondensedSteps:
-    """Steps of the free dofs towards the solution of a time step with contact.
+    """Steps of the free dofs towards the solution of a time step with local forces.
 
     Parameters
     ----------
     equations : StepEquations
         Equations of the time step.
     compliance : Compliance
-        Inverse of the matrix of the body without contact.
+        Inverse of the matrix of the body without local forces.
     free : (k,) array
         Indices of the free dofs.
     size_m : float
@@ -361,13 +365,11 @@ class CondensedSteps:
         self._size_m = size_m
         self._compliance = compliance
         self._free = free
-        self._number = np.full(equations.contact.dof_count, -1)
+        self._number = np.full(equations.local.dof_count, -1)
         self._number[free] = np.arange(len(free))
-        self._last: ContactForces | None = None
+        self._last: ForcesOnActiveDofs | None = None
         self._condensed: CondensedStiffness | None = None
-        self._known_dofs: dict[
-            tuple[tuple[ContactLaw, bytes], ...], TouchingDofs
-        ] = {}
+        self._known_dofs: dict[tuple[Hashable, ...], ActiveDofs] = {}
 
     def step_from(self, x: Array) -> Array:
         """Return the step (k,) [m] from positions x (3n,) [m].
@@ -375,19 +377,19 @@ class CondensedSteps:
         Raises
         ------
         CondensationError
-            If too many dofs touch, or if the iteration for them does not converge.
+            If too many dofs are active, or if the iteration for them does not converge.
         """
         start = self._last
         if start is None or not np.array_equal(start.x, x):
             # A copy, because the caller may change x in place.
             start = self._forces_at(x.copy())
-        residual = self._equations.residual(x, with_contact=False)[self._free]
+        residual = self._equations.residual_without_local(x)[self._free]
         residual[start.dofs] += start.force
         without_change = self._compliance.factor.solve(residual)
         now = start
         step = np.zeros_like(without_change)
         if not len(start.dofs):
-            # Before any point touches, the step is that of the body.
+            # Before any point is active, the step is that of the body.
             step = without_change
             now = self._forces_at(self._advanced(x, step))
             if not len(now.dofs):
@@ -400,7 +402,7 @@ class CondensedSteps:
             or not np.array_equal(condensed.dofs, start.dofs)
         ):
             condensed = self._condensed_at(start, now)
-        for _ in range(MAX_CONTACT_ITERATIONS):
+        for _ in range(MAX_LOCAL_ITERATIONS):
             dofs = condensed.dofs
             change = _spread(now, dofs) - _spread(start, dofs)
             known = change + condensed.stiffness @ step[dofs]
@@ -422,58 +424,57 @@ class CondensedSteps:
     def _is_converged(
         self,
         step: Array,
-        start: ContactForces,
-        now: ContactForces,
+        start: ForcesOnActiveDofs,
+        now: ForcesOnActiveDofs,
         forces: Array,
         condensed: CondensedStiffness,
     ) -> bool:
-        """Whether the contact forces at the end of a step are those of the step.
+        """Whether the local forces at the end of a step are those of the step.
 
         Parameters
         ----------
         step : (k,) array
             Step [m].
-        start, now : ContactForces
-            Contact forces before and after the step.
+        start, now : ForcesOnActiveDofs
+            Local forces before and after the step.
         forces : (s,) array
             Change of the forces that the step contains [N].
         condensed : CondensedStiffness
             Matrices with which the step was computed.
         """
         dofs = condensed.dofs
-        if now.touching is not start.touching and not (
+        if now.active is not start.active and not (
             np.isin(now.dofs, dofs).all()
         ):
             return False
         change = _spread(now, dofs) - _spread(start, dofs)
         error_m = condensed.compliance @ (change - forces)
         limit_m = max(
-            CONTACT_ACCURACY * float(np.abs(step).max()),
+            LOCAL_ACCURACY * float(np.abs(step).max()),
             ROUND_OFF * self._size_m,
         )
         return bool(np.abs(error_m).max() <= limit_m)
 
     def _condensed_at(
-        self, start: ContactForces, now: ContactForces
+        self, start: ForcesOnActiveDofs, now: ForcesOnActiveDofs
     ) -> CondensedStiffness:
-        """Return the condensed matrices at present forces and at the dofs that touch at the start
-        of the step or now.
+        """Return the condensed matrices at present forces and at the dofs that are active at the
+        start of the step or now.
 
         Raises
         ------
         CondensationError
-            If too many dofs touch, or the matrix is singular.
+            If too many dofs are active, or the matrix is singular.
         """
         dofs = (
             start.dofs
-            if now.touching is start.touching
+            if now.active is start.active
             else np.union1d(start.dofs, now.dofs)
         )
-        if len(dofs) > MAX_TOUCHING_DOFS:
+        if len(dofs) > MAX_ACTIVE_DOFS:
             raise CondensationError
-        present = (
-            self._equations.contact_weight
-            * now.touching.assemble_stiffness(now.points)
+        present = self._equations.local_weight * now.active.assemble_stiffness(
+            now.points
         )
         stiffness = present
         if len(dofs) > len(now.dofs):
@@ -490,31 +491,22 @@ class CondensedSteps:
         advanced[self._free] += step
         return advanced
 
-    def _forces_at(self, x: Array) -> ContactForces:
-        """Return the contact forces on free dofs at positions x (3n,), which are not copied."""
-        points = self._equations.touching_points(x)
-        key = tuple(
-            (
-                each.candidates.law,
-                each.candidates.point_indices[each.indices].tobytes(),
-            )
-            for each in points
-        )
+    def _forces_at(self, x: Array) -> ForcesOnActiveDofs:
+        """Return the local forces on free dofs at positions x (3n,), which are not copied."""
+        points = self._equations.active_points(x)
+        key = tuple(each.key for each in points)
         if key not in self._known_dofs:
-            self._known_dofs[key] = TouchingDofs.from_points(
-                points, self._number
-            )
-        touching = self._known_dofs[key]
-        return ContactForces(
+            self._known_dofs[key] = ActiveDofs.from_points(points, self._number)
+        active = self._known_dofs[key]
+        return ForcesOnActiveDofs(
             x,
             points,
-            touching=touching,
-            force=self._equations.contact_weight
-            * touching.assemble_force(points),
+            active=active,
+            force=self._equations.local_weight * active.assemble_force(points),
         )
 
 
-def _spread(forces: ContactForces, dofs: Index) -> Array:
+def _spread(forces: ForcesOnActiveDofs, dofs: Index) -> Array:
     """Return forces at sorted dofs (s,), which contain those of the forces."""
     if len(dofs) == len(forces.dofs):
         return forces.force

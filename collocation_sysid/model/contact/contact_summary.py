@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...common.array_types import Array
-from ...model.contact import Contact, contact_terms
-from ...model.dynamics import Dynamics
-from ...model.force_term import States
 from ...recording.experiment import Experiment
-from ..experiment_iterate import ExperimentIterate
+from ..dynamics import Dynamics
+from ..force_term import States
+from .contact_force import Contact, contact_terms
 
 # Times with a normal force below this share of the largest are ignored.
 GRAZE = 0.01
@@ -156,17 +155,6 @@ def friction_summaries(
             dissipated_j=float(power_w.sum() * dynamics.step_s),
         )
     return summaries
-
-
-def contact_summaries_of_parts(
-    iterates: Iterable[ExperimentIterate],
-) -> Iterator[ContactSummary]:
-    """Yield the contact summaries of each obstacle of each experiment, experiment by experiment, at
-    the positions of its iterate.
-    """
-    for part in iterates:
-        t_s = part.equations.dynamics.t_s[: len(part.x)]
-        yield from contact_summaries(part.segment.experiment, part.x, t_s=t_s)
 
 
 def contact_summaries(

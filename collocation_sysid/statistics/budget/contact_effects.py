@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...common.array_types import Array
-from ...model.contact import Contact
+from ...model.contact.contact_force import Contact
 from ...program.experiment_iterate import ExperimentIterate
 from ...recording.obstacle import Obstacle
 
@@ -67,10 +67,8 @@ class FirstContact:
             if len(touching):
                 break
         y = contact.points.vectors(x[row : row + 1])
-        gaps_m, slopes = law.gap_function.evaluate_with_jacobian(
-            y, np.zeros((0, *y.shape[1:]))
-        )
-        gaps_m = gaps_m[0, 0]
+        gaps_m, slopes = law.gaps_with_slopes(y)
+        gaps_m = gaps_m[0]
         weights = (
             law.surface.area_m2
             * contact.scaled_pressures(x[row : row + 1])[0, 0]
@@ -78,7 +76,7 @@ class FirstContact:
         if not weights.any():
             weights = (gaps_m == gaps_m.min()).astype(float)
         weights = weights / weights.sum()
-        normal = slopes[0, :3, 0] @ weights
+        normal = slopes[:3, 0] @ weights
         # The row before has the surface as it is without contact.
         before = max(row - 1, 0)
         origin_m = x[before].reshape(-1, 3)[law.obstacle.nodes[0]]

@@ -1,12 +1,13 @@
-"""Contact pressures of a complementarity problem as variables of the program, with their equations.
+"""Pressures of a complementarity problem as variables of the program, with their equations.
 
-For evaluations k with an equation of motion, in widths δ of the contact law,
+For evaluations k with an equation of motion, in the unit δ of the pressures,
 
     (b_k + g(ξ_k) − √((b_k − g(ξ_k))² + 4 r δ²)) / δ = 0,   variables b_k / δ,
 
-with the pressure variable b, the gap g and the relaxation r, see `model.contact`. The structure is
-that of a force history (`lifted_force_histories`), but b belongs to the evaluation itself instead
-of the one before. The variables are not negative.
+with the pressure variable b, the gap g and the relaxation r of a
+`model.point_forces.ComplementarityForce`. The structure is that of a force history
+(`lifted_force_histories`), but b belongs to the evaluation itself instead of the one before. The
+variables are not negative.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...common.array_types import Array
-from ...model.contact import Contact
+from ...model.point_forces import ComplementarityForce
 from ..experiment_iterate import ExperimentIterate
 from ..linear_algebra.sparse_assembly import EntryBlock
 from ..motion_transcription import WeightedHistory
@@ -25,8 +26,8 @@ from .lifted_force_histories import LiftedForceHistory
 
 
 @dataclass(frozen=True, eq=False)
-class LiftedContactPressure(LiftedForceHistory):
-    """Lifted pressure variables b of one obstacle of one experiment; their lower bound is 0."""
+class LiftedPressure(LiftedForceHistory):
+    """Lifted pressure variables b of one force of one experiment; their lower bound is 0."""
 
     kind = "pressure"
     lower_bound = 0.0  # type: ignore[override]
@@ -40,20 +41,20 @@ class LiftedContactPressure(LiftedForceHistory):
 
     @property
     def unit_m(self) -> float:
-        """Unit of the variables and of the equations [m]: the width δ of the contact law."""
-        return self._contact.law_of_contact.largest_width_m
+        """Unit δ of the variables and of the equations [m]."""
+        return self._force.pressure_unit_m
 
     @property
-    def _contact(self) -> Contact:
-        """Contact force of the obstacle."""
+    def _force(self) -> ComplementarityForce:
+        """Force that has the pressures."""
         term = self.segment.dynamics.forces.external_terms[self.force_index]
-        assert isinstance(term, Contact)
+        assert isinstance(term, ComplementarityForce)
         return term
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape (1, evaluations, I): evaluations with an equation
-        of motion, and I contact points.
+        of motion, and I points.
         """
         return 1, self.segment.constraint_times, self._points.count
 
@@ -62,12 +63,12 @@ class LiftedContactPressure(LiftedForceHistory):
         positions.
         """
         xi, _ = iterate.equations.dynamics.evaluation_states(iterate.x)
-        return self._contact.scaled_pressures(xi).ravel() / self.unit_m
+        return self._force.scaled_pressures(xi).ravel() / self.unit_m
 
     def with_lifted(
         self, iterate: ExperimentIterate, z: Array
     ) -> ExperimentIterate:
-        """Return a copy of the iterate with the scaled pressures b (1, N, I) [m] of this obstacle
+        """Return a copy of the iterate with the scaled pressures b (1, N, I) [m] of this force
         taken from z; b is zero at a stated initial state.
         """
         b = np.zeros((1, self.segment.grid_times, self._points.count))

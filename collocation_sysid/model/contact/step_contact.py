@@ -1,0 +1,246 @@
+"""Contact within one time step, restricted to the points that may touch.
+
+Other points of the surface contribute nothing, and obstacles do not move while the step is solved.
+Candidate points are therefore searched once a step, with a margin, and only the forces on the nodes
+of their faces are evaluated, with exact derivatives for Newton's method.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...fem.contact_surface import VECTORS_PER_POINT
+from ...fem.pattern import SymmetricPattern
+from ..local_force import ActivePoints, CandidatePoints, LocalForce
+from .contact_law import POINT_BATCH, ContactLaw
+
+# Distance within which points are candidates, in edges of the surface.
+MARGIN = 0.25
+# Share of this distance by which a coordinate may change before candidates are searched again.
+CHANGE = 1 / 3
+
+
+class LawInputs(NamedTuple):
+    """Inputs of a law's `point_force_function` at i candidates.
+
+    Attributes
+    ----------
+    u : (3 or 6, i) array
+        Positions [m] and, if the law depends on them, velocities [m/s], relative to the obstacle's
+        frame.
+    data : (d, i) array
+        Data of the points.
+    """
+
+    u: Array
+    data: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ContactCandidates:
+    """Contact points that an obstacle may touch in a time step.
+
+    Attributes
+    ----------
+    law : ContactLaw
+        Contact law of the obstacle.
+    points : CandidatePoints
+        The points.
+    """
+
+    law: ContactLaw
+    points: CandidatePoints
+
+    @cached_property
+    def _last_data(self) -> dict[tuple[float, bytes], Array]:
+        """Data of the law at the last evaluation, by the length of the step and the frame."""
+        return {}
+
+    @staticmethod
+    @lru_cache(maxsize=64)
+    def from_indices(
+        law: ContactLaw, pattern: SymmetricPattern, chosen: bytes
+    ) -> ContactCandidates:
+        """Build the candidates of an obstacle; the last 64 are cached by their arguments, because
+        successive steps are similar.
+
+        Parameters
+        ----------
+        law : ContactLaw
+            Contact law of the obstacle.
+        pattern : SymmetricPattern
+            Pattern of the matrices.
+        chosen : bytes
+            Indices of the points among all contact points, an array of int64 as bytes.
+        """
+        some = np.frombuffer(chosen, dtype=np.int64)
+        points = law.surface.points
+        return ContactCandidates(
+            law,
+            CandidatePoints.from_nodes(
+                some,
+                points.nodes[some, :-VECTORS_PER_POINT],
+                weights=points.node_weights[some, 0, :-VECTORS_PER_POINT],
+                pattern=pattern,
+            ),
+        )
+
+    def inputs(
+        self, xi: Array, nu: Array, theta: Array, step_s: float
+    ) -> LawInputs:
+        """Return the inputs of the law at the candidates.
+
+        Parameters
+        ----------
+        xi, nu : (3n,) arrays
+            State [m] and velocity [m/s].
+        theta : (k,) array
+            Constants of the body.
+        step_s : float
+            Length of the time step over which the pressure is averaged [s]; 0 if it is not.
+        """
+        frame = self.law.obstacle.nodes
+        nodes = self.points.nodes
+        moving = [
+            each.reshape(-1, 3)
+            for each in (xi, nu)[: 1 + self.law.depends_on_velocity]
+        ]
+        own = [
+            np.einsum("ik,ikj->ji", self.points.weights, x[nodes] - x[frame[0]])
+            for x in moving
+        ]
+        ends = [(x[frame[1:]] - x[frame[0]]).ravel() for x in moving]
+        same = np.concatenate([*ends, theta[self.law.constant_columns]])
+        return LawInputs(
+            own[0] if len(own) == 1 else np.concatenate(own),
+            self._data_with(same, step_s),
+        )
+
+    def _data_with(self, same: Array, step_s: float) -> Array:
+        """Return the data (d, i) of the law from those that are the same at all points (s,), and
+        the length of the step [s].
+
+        The last data are stored, because the frame of the obstacle does not move within a step.
+        """
+        key = step_s, same.tobytes()
+        if key not in self._last_data:
+            indices = self.points.point_indices
+            data = np.broadcast_to(same[:, None], (len(same), len(indices)))
+            self._last_data.clear()
+            self._last_data[key] = np.concatenate(
+                [data, self.law.data_of(indices, step_s)]
+            )
+        return self._last_data[key]
+
+
+class StepContact(LocalForce):
+    """Contact with one obstacle in one time step of a body with constants θ (k,).
+
+    The obstacle is treated as fixed in the derivatives, and the reaction on it is left out. The
+    candidates are stored, and searched again when the state has changed too much.
+
+    Parameters
+    ----------
+    law : ContactLaw
+        Contact law of the obstacle.
+    theta : (k,) array
+        Constants of the body.
+    pattern : SymmetricPattern
+        Pattern of the matrices.
+    step_s : float
+        Length of the time step over which the pressure is averaged [s]; 0 if it is not.
+    """
+
+    def __init__(
+        self,
+        law: ContactLaw,
+        theta: Array,
+        pattern: SymmetricPattern,
+        step_s: float,
+    ) -> None:
+        self.depends_on_velocity = law.depends_on_velocity
+        self._law = law
+        self._theta = theta
+        self._pattern = pattern
+        self._step_s = step_s
+        self._from = np.full((1, 1), np.nan)
+        self._last_candidates: ContactCandidates | None = None
+        self._margin_m = MARGIN * law.surface.edge_m
+
+    def force(self, xi: Array, nu: Array) -> Array:
+        """Return the contact forces (3n,) [N] at ξ [m] and ν [m/s], each (1, 3n); zero without
+        contact.
+        """
+        candidates = self._candidates(xi[0], nu[0])
+        if candidates is None:
+            return np.zeros(xi.size)
+        inputs = self._inputs(candidates, xi, nu)
+        push = self._law.point_force_function.evaluate(inputs.u, inputs.data)
+        return candidates.points.assemble(push, xi.size)
+
+    def active_points(
+        self, xi: Array, nu: Array, rates: tuple[float, float]
+    ) -> ActivePoints | None:
+        """Return the points that touch, see `LocalForce.active_points`."""
+        candidates = self._candidates(xi[0], nu[0])
+        if candidates is None:
+            return None
+        inputs = self._inputs(candidates, xi, nu)
+        force, slopes = self._law.point_force_function.evaluate_with_jacobian(
+            inputs.u, inputs.data
+        )
+        (touching,) = np.nonzero(force.any(axis=0))
+        return ActivePoints(
+            self._law,
+            candidates.points,
+            indices=touching,
+            force=force[:, touching],
+            slopes=slopes,
+            rates=rates,
+        )
+
+    def _inputs(
+        self, candidates: ContactCandidates, xi: Array, nu: Array
+    ) -> LawInputs:
+        """Return the inputs of the law at candidates in the state ξ and ν, (1, 3n) each."""
+        return candidates.inputs(
+            xi[0], nu[0], theta=self._theta, step_s=self._step_s
+        )
+
+    def _candidates(self, xi: Array, nu: Array) -> ContactCandidates | None:
+        """Return the candidates at ξ and ν, (3n,) each; None if no point may touch.
+
+        The search for candidates is repeated if the state has changed by more than the margin
+        allows.
+        """
+        ends = xi[None]
+        if self._step_s:
+            # A pressure that is averaged over a step depends on the states at both ends.
+            half_step = self._step_s / 2 * nu
+            ends = np.array([xi - half_step, xi + half_step])
+        if not np.abs(ends - self._from).max() <= CHANGE * self._margin_m:
+            self._from = ends
+            self._last_candidates = self._candidates_near(ends)
+        return self._last_candidates
+
+    def _candidates_near(self, states: Array) -> ContactCandidates | None:
+        """Return the points within the margin in any of the states (s, 3n) [m]; None if there are
+        none.
+        """
+        law = self._law
+        gaps_m = law.gaps(law.surface.points.vectors(states)).min(axis=0)
+        is_near = gaps_m < law.widths_m + self._margin_m
+        # Others fill the last vector of the compiled law.
+        (others,) = np.nonzero(~is_near)
+        is_near[others[: -is_near.sum() % POINT_BATCH]] = True
+        (chosen,) = np.nonzero(is_near)
+        if not len(chosen):
+            return None
+        return ContactCandidates.from_indices(
+            law, self._pattern, chosen=chosen.tobytes()
+        )
