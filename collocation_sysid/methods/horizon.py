@@ -146,6 +146,7 @@ class Horizon:
         p: Array,
         trajectories: Sequence[Any],
         known_iterate: Iterate | None = None,
+        accuracy: float = ACCURACY,
     ) -> Iterate:
         """Sweep all experiments at parameters p and trajectories x, and return the iterate.
 
@@ -161,6 +162,8 @@ class Horizon:
             Trajectories, one per experiment, with the rows of the horizon.
         known_iterate : Iterate, optional
             Iterate of the first rows at the same p and positions, which is continued.
+        accuracy : float
+            Relative accuracy of the solution of each time step, see `Sweep.forward`.
 
         Raises
         ------
@@ -179,6 +182,8 @@ class Horizon:
             self._by_experiment(p),
             trajectories,
             known,
+            self._repeat(None),
+            self._repeat(accuracy),
         )
         return self._iterate_from(p, swept)
 

@@ -67,10 +67,17 @@ LEAST_VISIBLE_SHARE = 0.97
 EQUAL_MISFIT_RATIO = 1.01
 # Largest step from which the curvature at the solution is learned.
 LOCAL = 0.1
-# Step above which sweeps of large bodies need less accuracy: Gauss–Newton's error is larger there.
-LARGE_STEP = 1e-2
-# Relative accuracy of the solutions of the time steps in these sweeps.
-ROUGH_ACCURACY = 1e-4
+# Relative accuracy of the solutions of the time steps after long steps of the parameters, in sweeps
+# of large bodies.
+ROUGH_ACCURACY = 1e-3
+# That accuracy after a short step, over the square of its length: the terms of second order that
+# Gauss–Newton neglects are larger.
+SECOND_ORDER_SHARE = 0.1
+# Highest relative accuracy of these solutions, over the tolerance: that of the parameters is better,
+# because only the part of the residuals that the model does not explain is multiplied by the error.
+ACCURACY_SHARE = 0.01
+# Relative accuracy over the tolerance above which the point of a sweep is not the result.
+FINAL_ACCURACY_SHARE = 0.1
 # Largest number of new associations of the measurements.
 REREADINGS = 40
 
@@ -252,7 +259,9 @@ class ReducedSearch:
                 segment.grid_times
                 for segment in self.collocation.transcriptions
             ]
-            return self.minimise(self._horizon(rows, last=True), is_last=True)
+            horizon = self._horizon(rows, last=True)
+            accuracy = self._accuracy_at_start(horizon)
+            return self.minimise(horizon, is_last=True, accuracy=accuracy)
         except SimulationError:
             self.trajectories = self.point = None
             return None
@@ -328,7 +337,9 @@ class ReducedSearch:
 
     # Steps on one horizon ---------------------------------------------------------------------
 
-    def minimise(self, horizon: Horizon, is_last: bool) -> Status:
+    def minimise(
+        self, horizon: Horizon, is_last: bool, accuracy: float = ACCURACY
+    ) -> Status:
         """Take Gauss–Newton steps on one horizon until convergence, and return the status.
 
         It starts at `p` and `trajectories`, which must exist and have the rows of the horizon, and
@@ -344,6 +355,8 @@ class ReducedSearch:
         is_last : bool
             Whether it is the complete problem. Otherwise the status is also that of convergence if
             the predicted relative decrease of the loss is less than `rung_decrease`.
+        accuracy : float
+            Relative accuracy of the time steps' solutions in the first sweep.
 
         Raises
         ------
@@ -357,14 +370,17 @@ class ReducedSearch:
         point = self._accept(
             horizon,
             horizon.evaluate(
-                self.p, self.trajectories, known_iterate=self.point
+                self.p,
+                self.trajectories,
+                known_iterate=self.point,
+                accuracy=accuracy,
             ),
         )
         rejections = 0
         curvature = np.zeros((len(point.p), len(point.p)))
         previous = np.inf
         # Points of little accuracy are not the result.
-        is_rough = False
+        is_rough = not self._is_final_accuracy(accuracy)
         while True:
             step = self._next_step(point, curvature)
             length = self._step_length(step)
@@ -411,7 +427,9 @@ class ReducedSearch:
                 point = self._accept(horizon, trial)
                 rejections = 0
                 previous = length
-                is_rough = self._accuracy_after(length) > ACCURACY
+                is_rough = not self._is_final_accuracy(
+                    self._accuracy_after(length)
+                )
                 continue
             if (
                 is_short
@@ -489,8 +507,30 @@ class ReducedSearch:
         """Return the relative accuracy of the time steps' solutions in the sweep after a step of
         the parameters of a given length, see `_step_length`.
         """
-        is_rough = self.refines_solutions and length > LARGE_STEP
-        return ROUGH_ACCURACY if is_rough else ACCURACY
+        if not self.refines_solutions:
+            return ACCURACY
+        highest = max(ACCURACY, ACCURACY_SHARE * self.options.tolerance)
+        return max(highest, min(ROUGH_ACCURACY, SECOND_ORDER_SHARE * length**2))
+
+    def _accuracy_at_start(self, horizon: Horizon) -> float:
+        """Return the relative accuracy of the time steps' solutions in the first sweep at given
+        positions: low if they do not satisfy the equations of motion, because steps follow then.
+        """
+        if not self.refines_solutions:
+            return ACCURACY
+        assert self.trajectories is not None
+        summaries = horizon.fit_summaries(self.p, self.trajectories)
+        is_exact = self._are_feasible(summaries)
+        return self._accuracy_after(0.0 if is_exact else np.inf)
+
+    def _is_final_accuracy(self, accuracy: float) -> bool:
+        """Whether a point whose sweep had a relative accuracy can be the result."""
+        tolerance = self.options.tolerance
+        return (
+            not self.refines_solutions
+            or accuracy <= ACCURACY
+            or accuracy <= FINAL_ACCURACY_SHARE * tolerance
+        )
 
     def _judge(self, point: Iterate, step: Array, trial: Iterate) -> bool:
         """Return whether a trial is accepted.

@@ -204,7 +204,8 @@ def sweep(
     known_sweep : LinearisedTrajectory, optional
         Sweep of the first rows at the same p and positions, which is continued.
     previous : LinearisedTrajectory, optional
-        Previous trajectory, from which changes are measured; without one they are zero.
+        Previous trajectory, from which changes are measured; without one they are zero. Its
+        sensitivities are the first guess of solutions that are refined.
     accuracy : float
         Relative accuracy of the solution of each time step, see `Sweep.forward`.
 
@@ -220,7 +221,11 @@ def sweep(
     return _linearised_trajectory(
         part,
         solver.forward(
-            part.x, part.equations, known=known_sweep, accuracy=accuracy
+            part.x,
+            part.equations,
+            known=known_sweep,
+            accuracy=accuracy,
+            similar=previous,
         ),
         previous=previous,
         times_s=solver.stopwatch.read_and_reset(),

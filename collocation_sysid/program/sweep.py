@@ -21,7 +21,7 @@ Use `Sweep.forward` for Gauss–Newton steps, `Sweep.sensitivities` where memory
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -41,6 +41,14 @@ from ..model.viscoelasticity import MemoryForwardColumns
 from .linear_algebra.block_band import Submatrix
 from .linear_algebra.factorisation import ACCURACY, Choice, Factor, Factoriser
 from .linear_algebra.lapack import one_blas_thread
+from .linear_algebra.reused_factor import (
+    MEASURED_COLUMNS,
+    FactorSequence,
+    Matrix,
+    NodeRotation,
+    ReusedFactor,
+    relative_cost,
+)
 from .reactions.reaction_forces import GraspForces
 from .stopwatch import Stopwatch
 from .transcription import Transcription
@@ -53,6 +61,12 @@ CHUNK_BYTES = 128e6
 # Largest number of time steps with skyline factors that are stored at a time. They reuse memory:
 # allocating it again costs half as much as a factorisation.
 LARGEST_CHUNK_ROWS = 16
+# Cost of a factorisation for each thread, in solutions, above which factors are reused in later time
+# steps: the reuse costs about one more solution, and the factorisations are not concurrent.
+LEAST_COST_OF_FACTOR = 1.5
+# Number of earlier time steps from which the solution of the next one is extrapolated, and the
+# weights of their solutions, latest first, by the number of those that exist.
+EXTRAPOLATION = ((), (1.0,), (2.0, -1.0), (3.0, -3.0, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +138,8 @@ class FactorisedStep(NamedTuple):
         Lower triangles of the symmetric parts of G = ∂F/∂ξ and C = ∂F/∂ν, in the order of the
         sparsity pattern.
     factor : Factor
-        Factorised matrix −∂c_t/∂x_t on the free dofs.
+        Factorised matrix −∂c_t/∂x_t on the free dofs. If it is a `ReusedFactor`, the time steps
+        must be solved in their order.
     skew, rate_skew : arrays
         Lower triangles of the skew parts of G and C; empty where there is none.
     """
@@ -408,6 +423,7 @@ class Sweep:
         equations: EquationsAtParameters,
         known: SweepResult | None = None,
         accuracy: float = ACCURACY,
+        similar: SweepResult | None = None,
     ) -> SweepResult:
         """Compute the feasibility step p and the sensitivities Z at all grid times of this sweep.
 
@@ -423,6 +439,9 @@ class Sweep:
         accuracy : float
             Relative accuracy of the solution of each time step where it is refined, as for large
             bodies; others have that of the arithmetic.
+        similar : SweepResult, optional
+            Result at other parameters and positions, not modified. Its sensitivities are the first
+            guess of solutions that are refined, which need fewer corrections then.
 
         Raises
         ------
@@ -440,6 +459,7 @@ class Sweep:
             last=known.last if known else None,
             grasp_forces=grasp_forces,
             accuracy=accuracy,
+            similar=None if similar is None else similar.by_p,
         )
         if known is not None:
             done = len(known.step)
@@ -559,7 +579,7 @@ class Sweep:
                     )
                 # (w_0 (p_0 G + q_0 C) − s_0 M) y_t = what is left; the factor is of its negative.
                 right = self.without_prescribed(t, remaining[t])
-                y[t, free] = -step.factor.solve(right, transposed=True)
+                y[t, free] = -self.solve(step, right, transposed=True)
                 force_weight = known + row.w[0] * y[t]
                 by_position = (
                     self.matrix.extract(step.by_position, -step.skew)
@@ -603,13 +623,23 @@ class Sweep:
     @property
     def chunk_bytes(self) -> int:
         """Memory of one chunk [bytes]."""
-        return self.chunk_rows * self._step_bytes
+        factor_bytes = self._factor_bytes if self.reuses_factors else 0
+        return self.chunk_rows * self._step_bytes + factor_bytes
 
     @property
     def _step_bytes(self) -> int:
-        """Memory of one time step: element results and one factor [bytes], the latter of an
-        unsymmetric matrix if the body's is.
+        """Memory of one time step [bytes]: element results, and its factor or, where factors are
+        reused, its matrix.
         """
+        results_bytes = 8 * self.body.linearisation_width
+        if self.reuses_factors:
+            parts = 1 + self.body.is_unsymmetric
+            return results_bytes + 8 * parts * self.pattern.entry_count
+        return results_bytes + self._factor_bytes
+
+    @property
+    def _factor_bytes(self) -> int:
+        """Memory of one factor [bytes], that of an unsymmetric matrix if the body's is."""
         solver = self.factoriser
         values = (
             solver.unsymmetric_factor_size
@@ -617,7 +647,7 @@ class Sweep:
             else solver.factor_size
         )
         bytes_each = 4 if self.has_single_precision else 8
-        return 8 * self.body.linearisation_width + bytes_each * values
+        return bytes_each * values
 
     @property
     def has_single_precision(self) -> bool:
@@ -627,6 +657,51 @@ class Sweep:
         return (
             not self.dynamics.is_static and self.factoriser.has_single_precision
         )
+
+    @property
+    def reuses_factors(self) -> bool:
+        """Whether a factor is used for several time steps, see `linear_algebra.reused_factor`: of
+        bodies so large that a factorisation costs several solutions even if every thread computes
+        one.
+        """
+        if not self.has_single_precision:
+            return False
+        cost = relative_cost(self.factoriser, MEASURED_COLUMNS)
+        return cost > LEAST_COST_OF_FACTOR * self.body.threads
+
+    def solve(
+        self,
+        step: FactorisedStep,
+        right: Array,
+        transposed: bool = False,
+        guess: Array | None = None,
+    ) -> Array:
+        """Return the solution of the system of a time step for right-hand sides (free,) or (free, c),
+        in the same shape.
+
+        Parameters
+        ----------
+        step : FactorisedStep
+            The time step; if factors are reused, steps must be solved in their order.
+        right : (free,) or (free, c) array
+            Right-hand sides; not modified.
+        transposed : bool
+            Whether to solve with the transposed matrix.
+        guess : (free, c) array, optional
+            Guess of the solution; only used if factors are reused.
+
+        Raises
+        ------
+        SimulationError
+            If the matrix is singular or not finite.
+        """
+        if not isinstance(step.factor, ReusedFactor):
+            return step.factor.solve(right, transposed=transposed)
+        try:
+            return step.factor.solve(right, transposed=transposed, guess=guess)
+        except np.linalg.LinAlgError as error:
+            time_s = float(self.dynamics.t_s[step.t])
+            raise self._singular(error, time_s) from error
 
     def dynamics_at(self, equations: EquationsAtParameters) -> Dynamics:
         """Return the discrete equations of motion of `equations`, truncated to the grid times of
@@ -673,6 +748,15 @@ class Sweep:
         starts = range(
             max(first, dynamics.first_row), dynamics.row_count, self.chunk_rows
         )
+        sequence = (
+            FactorSequence(
+                self.factoriser,
+                NodeRotation(self.free, self.pattern.size // 3),
+                accuracy=accuracy,
+            )
+            if self.reuses_factors
+            else None
+        )
         buffers = [
             self.factoriser.allocate(1 + self.body.is_unsymmetric)
             for _ in range(self.chunk_rows)
@@ -693,13 +777,29 @@ class Sweep:
                     StencilRow.from_dynamics(dynamics, t)
                     for t in range(start, here.stop)
                 ]
-                factors = self._factorise(
-                    dynamics,
-                    at,
-                    grid_times=here,
+                matrix = partial(
+                    self._matrix,
                     rows=rows,
-                    buffers=buffers,
-                    accuracy=accuracy,
+                    linearisation=at,
+                    is_prescribed=dynamics.is_temporarily_prescribed[here],
+                )
+                factors: Sequence[Factor] = (
+                    self._factorise(
+                        matrix,
+                        len(rows),
+                        time_s=float(dynamics.t_s[start]),
+                        buffers=buffers,
+                        accuracy=accuracy,
+                    )
+                    if sequence is None
+                    else [
+                        ReusedFactor(
+                            sequence,
+                            Matrix(*matrix(k)),
+                            points_m=points_m.reshape(-1, 3),
+                        )
+                        for k, points_m in enumerate(xi[evaluations])
+                    ]
                 )
             steps = map(
                 FactorisedStep,
@@ -716,28 +816,22 @@ class Sweep:
 
     def _factorise(
         self,
-        dynamics: Dynamics,
-        linearisation: Linearisation,
-        grid_times: slice,
-        rows: list[StencilRow],
+        matrix: Callable[[int], tuple[Array, Array]],
+        count: int,
+        time_s: float,
         buffers: Sequence[FactorMemory | None] = (),
         accuracy: float = ACCURACY,
     ) -> list[Factor]:
         """Return the factors of −∂c_t/∂x_t of some rows, computed on several threads.
 
-        A dof that a grasp prescribes for a part of the time has, at these times, only a diagonal
-        entry of the mean size of the diagonal.
-
         Parameters
         ----------
-        dynamics : Dynamics
-            Equations of motion.
-        linearisation : Linearisation
-            Derivatives of the forces at these rows alone.
-        grid_times : slice
-            Grid times of the rows.
-        rows : list of StencilRow
-            Coefficients of each row.
+        matrix : callable
+            Matrix of row k of them, see `_matrix`.
+        count : int
+            Number of rows.
+        time_s : float
+            Time of the first row, for the error [s].
         buffers : sequence of FactorMemory or None
             Memory that the factors reuse, see `Factoriser.factorise_each`.
         accuracy : float
@@ -748,48 +842,73 @@ class Sweep:
         SimulationError
             If a matrix is singular or not finite.
         """
-        pattern = self.pattern
-        is_prescribed = dynamics.is_temporarily_prescribed[grid_times]
-
-        def matrix(k: int) -> tuple[Array, Array]:
-            values = rows[k].block(
-                linearisation.by_position[k],
-                linearisation.by_velocity[k],
-                pattern=pattern,
-            )
-            skew = rows[k].skew_block(
-                linearisation.by_position_skew[k],
-                linearisation.by_velocity_skew[k],
-            )
-            if is_prescribed[k].any():
-                size = np.abs(values[pattern.diagonal]).mean()
-                removed = (
-                    is_prescribed[k][pattern.rows]
-                    | is_prescribed[k][pattern.columns]
-                )
-                values[removed] = 0
-                values[pattern.diagonal[is_prescribed[k]]] = size
-                if skew.size:
-                    skew[removed] = 0
-            return values, skew
-
         try:
-            count = len(linearisation.force)
-            threads = self.body.threads
             return self.factoriser.factorise_each(
                 matrix,
                 count,
-                threads=threads,
+                threads=self.body.threads,
                 buffers=buffers,
                 is_single=self.has_single_precision,
                 accuracy=accuracy,
             )
         except np.linalg.LinAlgError as error:
-            raise SimulationError(
-                f"experiment '{self.segment.experiment.name}': the linearised equations of motion "
-                f"cannot be solved ({error}); check mass, units and grasps, or give other guesses",
-                float(dynamics.t_s[grid_times.start]),
-            ) from error
+            raise self._singular(error, time_s) from error
+
+    def _singular(
+        self, error: np.linalg.LinAlgError, time_s: float
+    ) -> SimulationError:
+        """Return the error for the user that the equations at a time [s] cannot be solved."""
+        return SimulationError(
+            f"experiment '{self.segment.experiment.name}': the linearised equations of motion "
+            f"cannot be solved ({error}); check mass, units and grasps, or give other guesses",
+            time_s,
+        )
+
+    def _matrix(
+        self,
+        k: int,
+        rows: list[StencilRow],
+        linearisation: Linearisation,
+        is_prescribed: NDArray[np.bool_],
+    ) -> tuple[Array, Array]:
+        """Return the lower triangles (m,) of the symmetric and of the skew part of −∂c_t/∂x_t of row
+        k of some rows; the latter is empty if there is no such part.
+
+        A dof that a grasp prescribes for a part of the time has, at these times, only a diagonal
+        entry of the mean size of the diagonal.
+
+        Parameters
+        ----------
+        k : int
+            Index of the row among them.
+        rows : list of StencilRow
+            Coefficients of each row.
+        linearisation : Linearisation
+            Derivatives of the forces at these rows alone.
+        is_prescribed : (rows, 3n) array of bool
+            Dofs that are prescribed for a part of the time, at each row.
+        """
+        pattern = self.pattern
+        values = rows[k].block(
+            linearisation.by_position[k],
+            linearisation.by_velocity[k],
+            pattern=pattern,
+        )
+        skew = rows[k].skew_block(
+            linearisation.by_position_skew[k],
+            linearisation.by_velocity_skew[k],
+        )
+        if is_prescribed[k].any():
+            size = np.abs(values[pattern.diagonal]).mean()
+            removed = (
+                is_prescribed[k][pattern.rows]
+                | is_prescribed[k][pattern.columns]
+            )
+            values[removed] = 0
+            values[pattern.diagonal[is_prescribed[k]]] = size
+            if skew.size:
+                skew[removed] = 0
+        return values, skew
 
 
 class ForwardSubstitution:
@@ -814,6 +933,8 @@ class ForwardSubstitution:
         Filled in place with the forces on instrumented grasps; ignored if there are none.
     accuracy : float
         Relative accuracy of the solution of each row where it is refined.
+    similar : (N, 3n, m) array, optional
+        Sensitivities at other parameters, as a guess of the last m columns; not modified.
     """
 
     def __init__(
@@ -823,9 +944,13 @@ class ForwardSubstitution:
         last: ForwardState | None = None,
         grasp_forces: GraspForces | None = None,
         accuracy: float = ACCURACY,
+        similar: Array | None = None,
     ) -> None:
         self.solver = solver
         self.accuracy = accuracy
+        self._similar = similar
+        # Solutions of the last rows minus similar ones, latest first.
+        self._deviations = deque[Array](maxlen=len(EXTRAPOLATION) - 1)
         self.columns = columns
         self.grasp_forces = grasp_forces if len(solver.sensed) else None
         self.violation_n = 0.0
@@ -929,10 +1054,10 @@ class ForwardSubstitution:
                 free=solver.free,
             )
             for step, right, force in zip(chunk.steps, *sides, strict=True):
-                self.indefinite += not step.factor.positive_definite
                 solution = np.zeros(self.shape) if out is None else out[step.t]
                 with solver.stopwatch.solving():
                     self.solve_step(step, right, force=force, out=solution)
+                self.indefinite += not step.factor.positive_definite
                 complete_steps(StepUnit.TIME_STEP)
                 yield solution
 
@@ -992,7 +1117,12 @@ class ForwardSubstitution:
             forced += prescribed.force(solver, step)
         solver.without_prescribed(t, right)
         solver.without_prescribed(t, forced)
-        solution = step.factor.solve(right + w[0] * forced)
+        similar = self._similar_solution(step)
+        solution = solver.solve(
+            step, right + w[0] * forced, guess=self._guess(similar)
+        )
+        if isinstance(step.factor, ReusedFactor):
+            self._deviations.appendleft(solution - similar)
         if self.weighs_past:
             self.past_increments.appendleft(
                 (s[0] * mass * solution - right) / w[0]
@@ -1010,6 +1140,30 @@ class ForwardSubstitution:
                 self.grasp_forces, step, force=force, solution=out
             )
         self.past.appendleft(out)
+
+    def _similar_solution(self, step: FactorisedStep) -> Array | float:
+        """Return the columns (free, c) of the similar solution at a time step, zero for the others;
+        0 if there is none or no guess is needed.
+        """
+        if self._similar is None or not isinstance(step.factor, ReusedFactor):
+            return 0.0
+        similar = np.zeros(self._of_free)
+        sensitivities = self._similar[step.t].take(self.solver.free, axis=0)
+        similar[:, similar.shape[1] - sensitivities.shape[1] :] = sensitivities
+        return similar
+
+    def _guess(self, similar: Array | float) -> Array | None:
+        """Return a guess (free, c) of the solution of the next row: the similar one, (free, c) or 0,
+        with the extrapolated deviations of the last rows from theirs; None if there are neither.
+        """
+        weights = EXTRAPOLATION[len(self._deviations)]
+        terms = [
+            weight * deviation
+            for weight, deviation in zip(weights, self._deviations, strict=True)
+        ]
+        if isinstance(similar, float) and not terms:
+            return None
+        return np.asarray(sum(terms, start=similar))
 
     def _store_grasp_forces(
         self,

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 from scipy.linalg import get_lapack_funcs
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import SuperLU, splu
@@ -174,8 +175,8 @@ class _RefinedFactor:
         Relative size of the last correction.
     last_rates : dict of int to float
         Rate at which the corrections of the last matrix became smaller, with the key 0; shared by
-        the factors of one analysis and updated in place. Above `ACCURACY` it replaces a first
-        correction, whose only purpose would be to measure that rate.
+        the factors of one analysis, symmetric or not, and updated in place. Above `ACCURACY` it
+        replaces a first correction, whose only purpose would be to measure that rate.
     divergence_flags : list of bool
         Not empty after the refinement has failed once.
     """
@@ -199,7 +200,7 @@ class _RefinedFactor:
         solution = np.ascontiguousarray(
             self.approximate.solve(right), dtype=float
         )
-        size = last = np.abs(solution).max(axis=0, initial=TINY)
+        size = last = np.abs(solution).max(axis=0, initial=0.0)
         shrinks = 1.0
         if self.accuracy > ACCURACY:
             shrinks = self.last_rates.get(0, 1.0)
@@ -209,8 +210,8 @@ class _RefinedFactor:
             correction = np.asarray(
                 self.approximate.solve(right - matrix @ solution), dtype=float
             )
-            length = np.abs(correction).max(axis=0, initial=TINY)
-            shrinks = float((length / last).max(initial=0.0))
+            length = np.abs(correction).max(axis=0, initial=0.0)
+            shrinks = float((length / np.maximum(last, TINY)).max(initial=0.0))
             self.last_rates[0] = shrinks
             if not shrinks <= CONTRACTION:
                 self.divergence_flags.append(True)
@@ -225,9 +226,9 @@ class _CompleteRows(NamedTuple):
 
     Attributes
     ----------
-    row_starts : (k + 1,) array
+    row_starts : (k + 1,) array of int32
         Index of the first entry of each row, and the number of entries.
-    columns : (e,) array
+    columns : (e,) array of int32
         Column of each entry, ascending in each row.
     lower_positions : (e,) array
         Position of the value of each entry among those of the lower triangle.
@@ -235,8 +236,8 @@ class _CompleteRows(NamedTuple):
         Sign of the value of each entry of a skew matrix, relative to that of the lower triangle.
     """
 
-    row_starts: Index
-    columns: Index
+    row_starts: NDArray[np.int32]
+    columns: NDArray[np.int32]
     lower_positions: Index
     skew_signs: Array
 
@@ -288,6 +289,8 @@ class Factoriser:
     ----------
     half_bandwidth : int
         Number of subdiagonals of the reordered band.
+    size : int
+        Number of free degrees of freedom.
 
     Parameters
     ----------
@@ -316,16 +319,16 @@ class Factoriser:
         self._free_entries = np.flatnonzero((rows >= 0) & (columns >= 0))
         rows = rows[self._free_entries]
         columns = columns[self._free_entries]
-        self._size = len(free)
+        self.size = len(free)
         ones = np.ones(len(rows))
         graph = sp.csr_array(
-            (ones, (rows, columns)), shape=(self._size, self._size)
+            (ones, (rows, columns)), shape=(self.size, self.size)
         )
         self._order = reverse_cuthill_mckee(
             graph + graph.T, symmetric_mode=True
         ).astype(np.int64)
-        self._rank = rank = np.empty(self._size, dtype=np.int64)
-        rank[self._order] = np.arange(self._size)
+        self._rank = rank = np.empty(self.size, dtype=np.int64)
+        rank[self._order] = np.arange(self.size)
         low = np.minimum(rank[rows], rank[columns])
         high = np.maximum(rank[rows], rank[columns])
         self.half_bandwidth = int((high - low).max(initial=0))
@@ -344,7 +347,8 @@ class Factoriser:
         self._entries = pattern.entry_count
         # Memory of factors of double and of single precision that is not in use.
         self._pools: dict[bool, list[Pardiso]] = {False: [], True: []}
-        self._last_rates: dict[int, float] = {}
+        # Of symmetric matrices and of those with a skew part, which need more corrections.
+        self._last_rates: dict[bool, dict[int, float]] = {False: {}, True: {}}
         if choice == "supernodal":
             self._pools[False].append(self._pardiso(is_single=False))
 
@@ -383,7 +387,7 @@ class Factoriser:
     @property
     def _band_work(self) -> int:
         """Operations of a banded factorisation, up to a factor."""
-        return self._size * self.half_bandwidth**2
+        return self.size * self.half_bandwidth**2
 
     @property
     def factor_size(self) -> int:
@@ -396,7 +400,7 @@ class Factoriser:
                 if self.skyline
                 else self.half_bandwidth + 1
             )
-            return self._size * width
+            return self.size * width
         if self.is_supernodal:
             return self._supernodal_size
         return 3 * int(
@@ -424,7 +428,7 @@ class Factoriser:
         """
         if not self.is_banded or self.half_bandwidth > NARROW:
             return None
-        return make_skyline(self._size, *self._ranks, self._free_entries)
+        return make_skyline(self.size, *self._ranks, self._free_entries)
 
     @property
     def _sparse_work(self) -> float:
@@ -435,7 +439,7 @@ class Factoriser:
     def _column_counts(self) -> Index:
         """Number of entries of each column of SuperLU's L, from a matrix that needs no pivoting."""
         values = np.full(self._entries, -1.0)
-        degree = np.bincount(self._full_rows, minlength=self._size)
+        degree = np.bincount(self._full_rows, minlength=self.size)
         values[self._full_source[self._full_rows == self._full_columns]] = (
             degree
         )
@@ -487,12 +491,12 @@ class Factoriser:
             if rounded is not None:
                 return _RefinedFactor(
                     rounded,
-                    self._complete_matrix(values, skew),
+                    self.complete_matrix(values, skew),
                     factorise_complete=cache(
                         partial(self.factorise, values, skew)
                     ),
                     accuracy=accuracy,
-                    last_rates=self._last_rates,
+                    last_rates=self._last_rates[skew.size > 0],
                 )
         definite = (
             self._factorise_in_skyline(values, NONE, buffer=buffer)
@@ -518,11 +522,25 @@ class Factoriser:
 
         return _RefinedFactor(
             definite,
-            self._complete_matrix(values, skew),
+            self.complete_matrix(values, skew),
             factorise_complete=complete_factor,
             accuracy=accuracy,
-            last_rates=self._last_rates,
+            last_rates=self._last_rates[skew.size > 0],
         )
+
+    def factorise_rounded(self, values: Array) -> Factor | None:
+        """Return the factor in single precision of a symmetric matrix, lower triangle (m,) of the
+        complete matrix, or None if it is not positive definite or not finite. Solutions have the
+        precision of the factor. Only with `has_single_precision`.
+
+        Raises
+        ------
+        MemoryError
+            If there is no memory for a supernodal factor.
+        """
+        if not np.isfinite(values).all():
+            return None
+        return self._factorise_definite(values, is_single=True)
 
     def _factorise_definite(
         self, values: Array, is_single: bool = False
@@ -553,7 +571,7 @@ class Factoriser:
         if self.skyline:
             return None
         band = np.zeros(
-            (self.half_bandwidth + 1, self._size),
+            (self.half_bandwidth + 1, self.size),
             dtype=np.float32 if is_single else np.float64,
             order="F",
         )
@@ -585,16 +603,17 @@ class Factoriser:
         """Both triangles of the matrix on the free dofs, row by row."""
         order = np.lexsort((self._full_columns, self._full_rows))
         starts = np.searchsorted(
-            self._full_rows[order], np.arange(self._size + 1)
+            self._full_rows[order], np.arange(self.size + 1)
         )
+        # SciPy would convert longer integers with every matrix.
         return _CompleteRows(
-            starts,
-            self._full_columns[order],
+            starts.astype(np.int32),
+            self._full_columns[order].astype(np.int32),
             lower_positions=self._full_source[order],
             skew_signs=self._signs[order],
         )
 
-    def _complete_matrix(self, values: Array, skew: Array) -> sp.csr_array:
+    def complete_matrix(self, values: Array, skew: Array) -> sp.csr_array:
         """Return the matrix (k, k) of lower triangles `values` (m,) of the symmetric and `skew` (m,)
         or (0,) of the skew part.
         """
@@ -604,7 +623,7 @@ class Factoriser:
             entries += rows.skew_signs * skew[rows.lower_positions]
         return sp.csr_array(
             (entries, rows.columns, rows.row_starts),
-            shape=(self._size, self._size),
+            shape=(self.size, self.size),
         )
 
     @cached_property
@@ -614,7 +633,7 @@ class Factoriser:
         rows = self._full_rows[here]
         columns = self._full_columns[here]
         order = np.lexsort((columns, rows))
-        starts = np.searchsorted(rows[order], np.arange(self._size + 1))
+        starts = np.searchsorted(rows[order], np.arange(self.size + 1))
         return _UpperTriangle(
             starts,
             columns[order],
@@ -711,7 +730,7 @@ class Factoriser:
         then the strict upper one.
         """
         places = self._full_rows, self._full_columns
-        return sp.csc_array((entries, places), shape=(self._size, self._size))
+        return sp.csc_array((entries, places), shape=(self.size, self.size))
 
     def _superlu(
         self, values: Array, pivot_below: float, skew: Array = NONE
