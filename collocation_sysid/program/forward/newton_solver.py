@@ -672,7 +672,9 @@ class _CompleteIteration:
         solver = self.solver
         assert solver.last_factor is not None
         with solver.stopwatch.evaluating():
-            residual = self.equations.residual(x)
+            residual = self.equations.add_local_forces(
+                self.equations.residual_without_local(x), x
+            )
         return solver.step(solver.last_factor, residual)
 
 
