@@ -714,7 +714,9 @@ class _CompleteIteration:
         solver = self.solver
         assert solver.last_factor is not None
         with solver.stopwatch.evaluating():
-            residual = self.equations.residual(x)
+            residual = self.equations.add_local_forces(
+                self.equations.residual_without_local(x), x
+            )
         try:
             return solver.step(solver.last_factor, residual)
         except np.linalg.LinAlgError as error:  # a factor that is reused
