@@ -128,7 +128,7 @@ def _compared(
     row_s = _row_s(problem)
     median, late = 1e3 * np.percentile(took, [50, 99])
     print(
-        f"{name}: {len(frames)} frames of {live.model.substeps} rows, {np.mean(again):.1f} again"
+        f"{name}: {len(frames)} frames of {live.model.collocation.substeps} rows, {np.mean(again):.1f} again"
     )
     print(
         f"    median {median:.2f} ms, 99 % below {late:.2f} ms, first {1e3 * took[0]:.2f} ms"
@@ -216,7 +216,7 @@ def compare_long_recording(samples: int, options: LiveOptions) -> None:
         seed=0,
         samples=samples,
         integrator="midpoint",
-        substeps=short.model.substeps,
+        substeps=short.model.collocation.substeps,
     )
     live = LiveEstimator(problem, options, time.thread_time)
     frames = list(frames_of_recording(problem.experiments[0], live.model))
@@ -235,7 +235,7 @@ def compare_long_recording(samples: int, options: LiveOptions) -> None:
         f"{100 * np.mean(latencies_s < FRAME_S):.2f} % within {1e3 * FRAME_S:g} ms"
     )
     began_s = time.process_time()
-    whole = replace(problem, substeps=live.model.substeps)
+    whole = replace(problem, substeps=live.model.collocation.substeps)
     solution = solve(whole, ReducedSpace())
     print(
         f"    batch: {len(solution.history)} sweeps, {time.process_time() - began_s:.0f} s, "

@@ -114,14 +114,14 @@ def measured(
     spent = Stopwatch(clock)
     solver = Sweep(segment, stopwatch=spent, factorisation=choice)
     # The analysis of the pattern is made once for all sweeps.
-    numbers = solver.chunk_bytes
+    numbers = solver.estimate_chunk_bytes()
     began = clock()
     solver.forward(x, setting)
     sweep = Cost(clock() - began, spent)
     return (
         f"{len(body.nodes_m):6d} nodes {element:5s} {steps:4d} steps {threads} threads "
         f"{kind(solver):10s} march {march.told(steps)}  sweep {sweep.told(steps)}  "
-        f"at a time {solver.chunk_rows} steps, {numbers / 1e6:.0f} MB; "
+        f"at a time {solver.choose_chunk_rows()} steps, {numbers / 1e6:.0f} MB; "
         f"peak {peak_mb():.0f} MB, before {before_mb:.0f} MB"
     )
 

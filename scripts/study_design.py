@@ -206,9 +206,13 @@ def twin(found: Design, rng: np.random.Generator) -> dict[str, float] | None:
     """The answer for one recording of the designed motion; None where there is none."""
     problem = found.recording.problem
     experiment = found.experiment
-    options = problem.parameters, problem.scheme, problem.first_substeps
+    options = (
+        problem.parameters,
+        problem.scheme,
+        problem.choose_first_substeps(),
+    )
     (segment,) = Collocation([experiment], *options).transcriptions
-    phi = segment.guess_phi + rng.normal(size=segment.nuisance.size)
+    phi = segment.compute_guess_phi() + rng.normal(size=segment.nuisance.size)
     values = problem.parameters.guesses
     _, scheme, substeps = options
     actual = simulate(

@@ -338,7 +338,7 @@ def drawn(names: Sequence[str]) -> Callable[..., Pair]:
     def fault(experiment: Experiment, rng: Generator) -> Pair:
         off = {}
         for row in (row for row in ASSUMPTIONS if row.name in names):
-            for name in row.components:
+            for name in row.list_components():
                 size = (row.sigma or 0.0) * rng.standard_normal()
                 # No coefficient of the air is below zero.
                 off[name] = max(size, -0.99) if row.name in AIR else size

@@ -225,14 +225,14 @@ def told(twin: Twin, seeds: range) -> str:
             else np.nan
         )
         within = held[stiff].mean() if stiff.any() else np.nan
-        counts = field.identified_modes, took_s, within
+        counts = field.count_identified_modes(), took_s, within
         rows.append(
             (share, inside, held.mean(), error, width, ratio, step_mm, *counts)
         )
         if found.contrast95 is not None:
             lower, upper = found.contrast95
             said |= {f"contrast {lower:.3g} to {upper:.3g}"}
-        said |= {concern.code for concern in field.concerns}
+        said |= {concern.code for concern in field.list_concerns()}
         said |= (
             {f"length {field.modes.length_m:g}"}
             if isinstance(twin.length_m, tuple)
@@ -271,7 +271,8 @@ def cost() -> None:
         problem, _ = problem_of(twin, 1)
         if not modes:
             fixed = {
-                name: 0.0 for name in problem.bodies[0].field_coefficient_names
+                name: 0.0
+                for name in problem.bodies[0].list_field_coefficient_names()
             }
             problem = cs.Problem(
                 problem.experiments,

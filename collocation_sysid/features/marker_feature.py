@@ -48,7 +48,7 @@ def copied_times_s(
     experiment: Experiment, other: Experiment
 ) -> Iterable[tuple[Array, Array]]:
     """Return the times of both recordings if the experiment has a marker sample."""
-    if experiment.markers.sample_count:
+    if experiment.markers.count_samples():
         return ((experiment.t_s, other.t_s),)
     return ()
 

@@ -435,9 +435,8 @@ class Depth:
             images_m=images_m,
         )
 
-    @property
-    def first_sample_with_points(self) -> int:
-        """Index, from 0, of the first sample that has points."""
+    def find_first_sample_with_points(self) -> int:
+        """Return the index, from 0, of the first sample that has points."""
         return next(k for k, cloud in enumerate(self.clouds) if len(cloud))
 
 
@@ -481,7 +480,7 @@ def until_all_cameras_see(
     for depth in depths:
         last_s = depth.sample_times_s[
             min(
-                max(fewest - 1, depth.first_sample_with_points),
+                max(fewest - 1, depth.find_first_sample_with_points()),
                 len(depth.sample_times_s) - 1,
             )
         ]

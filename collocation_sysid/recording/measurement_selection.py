@@ -115,9 +115,9 @@ def moved_grasp(grasp: Grasp, poses: PoseSequence, t_s: Array) -> Grasp:
     components that it does not measure.
     """
     moved = replace(grasp, poses=poses)
-    if not grasp.has_sensor:
+    if not grasp.has_sensor():
         return moved
-    sample_times_s = grasp.load_times_s
+    sample_times_s = grasp.list_load_times_s()
     rate_hz = (len(sample_times_s) - 1) / max(np.ptp(sample_times_s), 1e-300)
     count = max(FEWEST_PLACEHOLDERS, 1 + int(np.ptp(t_s) * rate_hz + 1e-6))
     return moved.with_zero_loads_at(t_s[0] + np.arange(count) / rate_hz)
@@ -127,14 +127,14 @@ def measured_count(experiment: Experiment) -> int:
     """Return how many numbers the markers (coordinates) and force sensors (components) measure."""
     sensors = experiment.sensors_by_grasp.values()
     of_sensors = sum(int(each.is_measured.sum()) for each in sensors)
-    return 3 * experiment.markers.sample_count + of_sensors
+    return 3 * experiment.markers.count_samples() + of_sensors
 
 
 def main_measurement(experiments: Sequence[Experiment]) -> tuple[str, str]:
     """Return the kind of measurement that dominates, as plural text, and the key that states its
     noise: markers, else depth cameras, else force sensors, else custom sensors.
     """
-    if any(each.markers.sample_count for each in experiments):
+    if any(each.markers.count_samples() for each in experiments):
         return "markers", "sigma_m"
     if any(each.depths for each in experiments):
         return "points of depth cameras", "sigma_m of depth"
@@ -150,7 +150,7 @@ def is_load_only(experiment: Experiment) -> bool:
     return bool(
         experiment.is_static
         and experiment.sensors_by_grasp
-        and not experiment.markers.sample_count
+        and not experiment.markers.count_samples()
         and not experiment.depths
         and not experiment.readings
     )

@@ -238,7 +238,7 @@ class MotionRecord:
             np.asarray(experiment.is_prescribed(experiment.t_s).any(axis=2))[
                 :, : len(nodes_m)
             ],
-            experiment.upward_direction,
+            experiment.compute_upward_direction(),
             markers.names,
             declared_m if places_m is None else places_m,
             np.where(markers.located[:, None], declared_m, np.nan),
@@ -293,17 +293,15 @@ class MotionRecord:
                 )
         return np.concatenate(nearest)
 
-    @property
-    def force_series(self) -> list[SensorSeries]:
-        """Forces and torques of each force sensor over time."""
+    def list_force_series(self) -> list[SensorSeries]:
+        """Return the forces and torques of each force sensor over time."""
         return [
             SensorSeries("wrench", k, columns, COMPONENTS, units=UNITS)
             for k, columns in enumerate(self.wrenches, start=1)
         ]
 
-    @property
     def has_shapes(self) -> bool:
-        """Whether at least one sample has finite positions of all nodes."""
+        """Return whether at least one sample has finite positions of all nodes."""
         shapes_m = self.shapes_m
         return shapes_m is not None and bool(
             np.isfinite(shapes_m).all(axis=(1, 2)).any()
@@ -588,7 +586,7 @@ def run_headline(result: Result) -> str:
     """
     moduli = {
         symbol_of(n): each
-        for n, each in result.values.items()
+        for n, each in result.collect_estimates().items()
         if without_region(n) == "young_pa"
     }
     sentences = []

@@ -60,7 +60,9 @@ def test_a_variant_is_solved_from_every_start(small_problem):
     rows = run_variants(
         small_problem, variants, small_problem.parent, starts=2, spread=1.5
     )
-    (result,) = (study_methods.score(name, each) for name, each in rows.items())
+    (result,) = (
+        study_methods.compute_score()(name, each) for name, each in rows.items()
+    )
     assert (result.runs, result.hits, result.converged, result.misled) == (
         2,
         2,
@@ -96,7 +98,7 @@ def test_a_run_without_an_answer_counts_as_a_failure():
         **{f"error_{name}": None for name in TRUTH},
     )
     far = row(error_mu_pa=0.5)
-    result = study_methods.score("some", [row(), far, lost])
+    result = study_methods.compute_score()("some", [row(), far, lost])
     assert (result.hits, result.converged, result.misled) == (1, 2, 1)
     assert worst_error(lost) == np.inf
     low, high = result.interval

@@ -77,7 +77,7 @@ def write_rerun(
     result, replays = read_run(run)
     if experiment is not None:
         replays = [experiment_named(replays, experiment, run=run)]
-    replays = [replay for replay in replays if replay.has_shapes]
+    replays = [replay for replay in replays if replay.has_shapes()]
     if not replays:
         raise InputError(
             "no experiment of this run has a stored motion of a body; expected one with a mesh",
@@ -244,7 +244,7 @@ class _Recording:
         """Write each parameter of a result with its combined interval, if known, as constant curves
         between the two times `span_s` [s].
         """
-        for name, each in result.values.items():
+        for name, each in result.collect_estimates().items():
             curves = {"value": each.value}
             if each.combined95 is not None:
                 curves |= {
@@ -456,7 +456,7 @@ class _Recording:
         """Write each component of forces and torques as measured, fitted and simulated, as far as
         they are finite; grasps with a sensor are numbered from 1.
         """
-        for series in replay.force_series:
+        for series in replay.list_force_series():
             t_s = series.columns[:, 0]
             values = series.columns[:, 1:].reshape(
                 len(t_s), 3, len(series.names)

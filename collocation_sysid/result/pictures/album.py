@@ -54,7 +54,7 @@ def all_pictures(
     names = [
         n
         for n, item in result.parameters.items()
-        if not item.fixed and n in result.values
+        if not item.fixed and n in result.collect_estimates()
     ]
     pictures = (
         {"convergence": convergence(result.history, names, truth=truth)}
@@ -147,7 +147,7 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
                 t_s, measured, fitted_m=fitted, natural_hz=replay.natural_hz
             ),
         )
-    force_series = replay.force_series
+    force_series = replay.list_force_series()
     for series in force_series:
         which = "" if len(force_series) == 1 else f"_{series.number}"
         yield (
@@ -167,7 +167,7 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
         )
     for name, points in replay.visible_points.items():
         yield f"depth_{replay.name}_{name}", depth_picture(points)
-    if replay.has_shapes:
+    if replay.has_shapes():
         yield f"shapes_{replay.name}", shapes_picture(replay)
         for name, figure in obstacle_pictures(replay).items():
             yield f"{name}_{replay.name}", figure
