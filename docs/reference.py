@@ -44,9 +44,10 @@ def problem_file() -> str:
     schema = ProblemFile.model_json_schema()
     parts = [
         "# The problem file's keys",
-        "TOML, in SI units with the unit in the key; unknown keys are refused. A key without a "
-        "default and without “optional” has to be given. `collocation-sysid new NAME` writes a "
-        "commented file, `collocation-sysid schema` prints this as JSON schema for editors.",
+        "A problem file is in TOML. Values are in SI units; the names of the keys state the unit. "
+        "Unknown keys are refused. A key must be stated if its table has neither a default nor "
+        "“optional” for it. `collocation-sysid new NAME` writes a commented problem file; "
+        "`collocation-sysid schema` prints the keys as a JSON schema for editors.",
         *dict.fromkeys(
             "\n\n".join(t) for t in _tables("", schema, schema["$defs"])
         ),
@@ -149,11 +150,14 @@ def _toml(value: Any) -> str:
 def nuisances() -> str:
     """The table of what may be unknown of a recording, as the page on motion capture has it."""
     lines = [
-        "| key of `[experiment.nuisance]` | what | by default |",
+        "| key of `[experiment.nuisance]` | meaning | default prior |",
         "|---|---|---|",
     ]
     for key, rows in KEYS.items():
-        said = "; ".join(row.description for row in rows)
+        said = " ".join(
+            f"{row.description[0].upper()}{row.description[1:]}."
+            for row in rows
+        )
         priors = ", ".join(
             f"{row.prior_key()} = {row.sigma:.4g}" for row in rows if row.sigma
         )

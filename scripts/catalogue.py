@@ -248,8 +248,7 @@ def _section(entry: CatalogueEntry) -> str:
         f"- Stretch: 5 % quantile {stretch.low:.4g}, 95 % quantile {stretch.high:.4g}, smallest "
         f"value {stretch.minimum:.4g}, largest value {stretch.maximum:.4g}.",
         _rate_sentence(entry.strain_rate_1_s),
-        f"- Verdict: **{entry.verdict}**"
-        + (f", because {'; '.join(entry.reasons)}." if entry.reasons else "."),
+        _verdict_lines(entry),
         f"- Source: {entry.source}. Licence: {entry.licence}.\n",
     ]
     return "\n".join(lines)
@@ -298,6 +297,14 @@ def _readable_unit(constant: CatalogueConstant) -> tuple[float, str]:
 def _rate(rate: QuantileRange | None) -> str:
     """Return the 95 % quantile of a strain rate."""
     return "" if rate is None else f"{rate.high:.2g}"
+
+
+def _verdict_lines(entry: CatalogueEntry) -> str:
+    """Return the verdict and a list of its reasons."""
+    if not entry.reasons:
+        return f"- Verdict: **{entry.verdict}**."
+    reasons = [f"  - {reason}" for reason in entry.reasons]
+    return "\n".join([f"- Verdict: **{entry.verdict}**, because", *reasons])
 
 
 def _rate_sentence(rate: QuantileRange | None) -> str:

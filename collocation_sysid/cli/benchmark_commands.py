@@ -35,7 +35,8 @@ class BenchmarkCommand:
     write : --write
         Write the bodies into the folder, instead of scoring the predictions in it.
     body : NAME
-        Only this body; by default all in the folder, or all whose data are on this computer.
+        Only this body; by default all bodies in the folder are scored, or all bodies whose data are
+        on this computer are written.
     """
 
     folder: Annotated[Path | None, typer.Argument()] = None

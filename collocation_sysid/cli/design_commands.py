@@ -42,7 +42,8 @@ class DesignCommand(ProblemOptions, OutputOptions):
     for_ : A,B,…
         Parameters and moduli whose error bars are minimised; all by default.
     over : str
-        How draws from the prior are combined: mean or worst.
+        How the values of the criterion at the draws are combined: mean, their geometric mean, or
+        worst, the largest.
     add : bool
         Design a motion in addition to the problem's recordings, which are fitted first.
     film : bool
@@ -70,10 +71,10 @@ class DesignCommand(ProblemOptions, OutputOptions):
 def design(options: DesignCommand) -> None:
     """Find the motion of the grasp that makes the error bars smallest.
 
-    The motion begins and ends at rest in the first pose, keeps to the limits, and is optimised for
-    a prior of the parameters. The output folder contains poses.csv, the error bars before and
-    after, pictures, a film and a problem file that simulates the motion. Ctrl-C stops the search
-    and keeps the best motion so far; the exit code is then 130.
+    The motion begins and ends at rest in the first pose, respects the limits, and is optimised for
+    parameters drawn from their priors. The output folder contains poses.csv, the error bars before
+    and after, pictures, a film and a problem file that simulates the motion. Ctrl-C stops the
+    search and keeps the best motion so far; the exit code is then 130.
     """
     from ..extras.design.design_folder import (
         DESIGN_FILE,

@@ -34,7 +34,7 @@ def doctor(options: DoctorCommand) -> None:
     block.
 
     The exit code is 0 if all required packages are installed in suitable versions and the self test
-    passes, and 2 otherwise. Extras are optional and do not change it.
+    passes, and 2 otherwise. Extras are optional and do not change the exit code.
     """
     with error_console.status("checking the installation"):
         report = check_installation()
@@ -74,8 +74,9 @@ def completion(options: CompletionCommand) -> None:
 
     The script completes commands, options, their values and files.
 
-    Write it to the file of the example for your shell, from which new shells read it. For zsh, add
-    the folder ~/.zfunc to fpath before compinit. Print the script again after an upgrade.
+    Write the script to the file that the example for your shell names; new shells read it from
+    there. For zsh, add the folder ~/.zfunc to fpath before compinit. Print the script again after
+    an upgrade.
     """
     from typer.main import get_command
 

@@ -91,7 +91,7 @@ def solve(options: SolveCommand) -> None:
     """Identify the parameters and write a run folder, runs/NAME by default.
 
     Parameters need no guess: a scan over the stiffness finds initial values. --start begins with
-    the result of an earlier run instead, also one with another mesh or time step.
+    the result of an earlier run instead, which may have another mesh or time step.
 
     --scheduler distributes the experiments to the workers of a cluster.
 
@@ -213,9 +213,9 @@ def simulate(options: SimulateCommand) -> None:
     are the guesses or fixed values; set other values with --set. Tables of force sensors, custom
     sensors, test benches and specimens are written, too. The names of the files are printed.
 
-    Files of an earlier simulation are replaced. Other files in the folder are an error unless it is
-    the folder of the problem, whose data files are never replaced. If the body loses its stability,
-    instability.png shows how.
+    Files of an earlier simulation are replaced. If the folder contains other files, nothing is
+    written, unless it is the folder of the problem; data files of the problem are never replaced.
+    If the body loses its stability, instability.png shows how.
     """
     from ..result.solve_progress import SolveProgress
 
@@ -267,7 +267,7 @@ class CheckCommand(ProblemOptions, OutputOptions):
     Attributes
     ----------
     full : bool
-        Simulate the complete recordings, however long that takes.
+        Simulate the complete recordings and make all comparisons, however long this takes.
     out : DIR
         Folder for pictures of the depth cameras' images; runs/<problem>_check by default.
     """
@@ -286,12 +286,12 @@ class CheckCommand(ProblemOptions, OutputOptions):
 def check(options: CheckCommand) -> None:
     """Check a problem before solving it, and report probable mistakes.
 
-    Bodies, recordings and grasps are shown immediately. Derivatives, costs and a simulation at the
-    guess follow. If simulating the complete recordings takes more than ten seconds, only their
-    first samples are simulated.
+    The bodies, recordings and grasps are shown immediately. The check of the derivatives, the cost
+    of a solve and a simulation at the guess follow. If a simulation of the complete recordings
+    would take more than ten seconds, only their first samples are simulated.
 
     For each depth camera, a picture shows the first image and the undeformed body. The pictures are
-    written into runs/NAME_check by default, but not with --json.
+    written into runs/NAME_check by default; with --json no pictures are written.
 
     The exit code is 0, and 1 if derivatives disagree or the description is probably wrong, 2 for
     bad input.

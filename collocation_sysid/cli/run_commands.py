@@ -40,7 +40,8 @@ class RefineCommand(RunFolderOptions, OutputOptions):
     Attributes
     ----------
     levels : int
-        Number of grids: 2, or 3 to observe the orders of convergence, which takes much longer.
+        Number of time steps and meshes to compare: 2, or 3 to measure the orders of convergence,
+        which takes much longer.
     """
 
     levels: int = 2
@@ -49,7 +50,7 @@ class RefineCommand(RunFolderOptions, OutputOptions):
 
 @command(commands, "refine runs/swing", "refine runs/swing --levels 3")
 def refine(options: RefineCommand) -> None:
-    """Solve again with half the step and a finer mesh, to measure the discretisation error.
+    """Solve again with half the time step and on a finer mesh, to measure the discretisation error.
 
     Each solve starts from the result of the run. The errors are written to refinement.json in the
     run folder, and added to result.json with corrected values and combined intervals. After an
@@ -118,7 +119,8 @@ def export(options: ExportCommand) -> None:
     FORMAT in the run folder. A folder whose name is a format, such as out/mujoco, is a destination
     too.
 
-    The format rerun is a recording of the motion, of all experiments or one, for the Rerun viewer.
+    The format rerun is a recording for the Rerun viewer: the motion of all experiments, or of the
+    one that --experiment names.
     """
     from ..extras.export import MAIN_FILES, parse_destination
     from ..extras.export.rerun_recording import TARGET as RECORDING
@@ -234,7 +236,7 @@ class PlotCommand(RunFolderOptions):
 def plot(options: PlotCommand) -> None:
     """Draw the pictures of a run again, from its files.
 
-    They replace the pictures in the run folder, or are written into the folder of --out; their
+    The new pictures replace those in the run folder, or are written into the folder of --out; their
     names are printed. The picture of the Jacobian is not drawn again.
     """
     from ..result.pictures.album import redraw_pictures

@@ -44,7 +44,8 @@ class LiveEstimationOptions(Options):
     window_s : float
         Time span before the present frame in which earlier frames are recomputed [s].
     rerun : FILE
-        Record estimates, mesh and residuals as they arrive for the Rerun viewer, an .rrd.
+        File .rrd for the Rerun viewer, to which estimates, mesh and residuals are written as they
+        arrive.
     """
 
     budget_ms: Positive | None = None
@@ -132,11 +133,11 @@ class LiveCommand(LiveEstimationOptions):
 def live(options: LiveCommand) -> None:
     """Estimate the parameters while a recording is made.
 
-    The command reads frames and prints a line of JSON for each, and one at the end. A frame is a
-    line: {"t_s": 0.01, "pose": {"position_m": [x, y, z], "quaternion_xyzw": [x, y, z, w]},
-    "markers": {"tip": [x, y, z]}}, or a row of a table whose first line is t_s, x_m, y_m, z_m, qx,
-    qy, qz, qw, tip_x, tip_y, tip_z and so on. A line that is not a frame is reported and ignored,
-    and the exit code is then 2. An empty datagram ends the recording.
+    The command reads frames. It prints a line of JSON for each frame, and one with the final
+    result. A frame is a line: {"t_s": 0.01, "pose": {"position_m": [x, y, z], "quaternion_xyzw":
+    [x, y, z, w]}, "markers": {"tip": [x, y, z]}}, or a row of a table whose first line is t_s, x_m,
+    y_m, z_m, qx, qy, qz, qw, tip_x, tip_y, tip_z and so on. A line that is not a frame is reported
+    and ignored, and the exit code is then 2. An empty datagram ends the recording.
     """
     from ..extras.live.frames import FrameReader
     from ..extras.live.sources import (
@@ -199,7 +200,7 @@ class ReplayCommand(LiveEstimationOptions, OutputOptions):
     rate : HZ
         Frames per second; by default as recorded, 0 for as fast as possible.
     film : FILE
-        Write a film of the estimates, a .gif.
+        File .gif to which a film of the estimates is written.
     """
 
     recording: Annotated[Path, typer.Argument()]

@@ -78,7 +78,7 @@ class CompareMethodsCommand(StudyOptions):
     truth : FILE|NAME=VALUE
         True parameters: a TOML file, or values.
     within : float
-        Largest relative error of a successful run.
+        Largest relative error of the parameters with which a run counts as successful.
     """
 
     methods: str
@@ -95,10 +95,10 @@ class CompareMethodsCommand(StudyOptions):
 def compare_methods(options: CompareMethodsCommand) -> None:
     """Compare methods from several initial guesses by success, accuracy and time.
 
-    All methods solve the same problem from the same guesses. The materials, laws of damping or
-    branches of a body are compared by the command compare-models.
+    All methods solve the same problem from the same guesses. To compare the materials, damping laws
+    or branches of a body, use the command compare-models.
 
-    Finished runs are kept in the output folder: the same command resumes the study.
+    Finished runs are kept in the output folder: the same command resumes an interrupted study.
     """
     methods = parse_methods(options.methods)
     problem = options.read_problem()
@@ -129,16 +129,16 @@ class CompareModelsCommand(StudyOptions):
     Attributes
     ----------
     materials : A,B,…
-        Materials to compare, instead of the object's.
+        Materials to compare, instead of that of the object.
     damping : A,B,…
-        Laws of damping to compare, instead of the object's.
+        Damping laws to compare, instead of that of the object.
     prony : 0,1,…
         Numbers of viscoelastic branches to compare.
     region : NAME
-        The region that has these materials, laws of damping and branches; by default the whole
+        Region whose materials, damping laws and branches are compared; by default the complete
         body.
     with_ : FILE
-        Another problem file of the same recordings, as a model.
+        Another problem file with the same recordings, which is compared as a model.
     method : str
         The method that fits every model, instead of that in the problem file.
     """
@@ -158,14 +158,15 @@ class CompareModelsCommand(StudyOptions):
     "compare-models problem.toml --prony 0,1 --region tip",
 )
 def compare_models(options: CompareModelsCommand) -> None:
-    """Fit models of material and damping, and recommend one by held-out data.
+    """Fit models of material and damping, and recommend the one that best predicts held-out data.
 
-    Each model is fitted to all recordings, and then to all but one, which it predicts; of a single
-    recording, the last third is held out. A model applies to the whole body, or to the region named
-    by --region. --with adds other problem files as models, each combined with all stated materials,
-    laws of damping and numbers of branches.
+    Each model is fitted to all recordings. It is then fitted to all recordings except one, in turn,
+    and predicts the omitted recording; if there is only one recording, its last third is held out.
+    A model applies to the complete body, or to the region named by --region. --with adds other
+    problem files as models; each of them is combined with all stated materials, damping laws and
+    numbers of branches.
 
-    Finished runs are kept in the output folder: the same command resumes the study.
+    Finished runs are kept in the output folder: the same command resumes an interrupted study.
     """
     if not options.with_ and {
         options.materials,
@@ -229,7 +230,7 @@ class SweepCommand(StudyOptions):
 def sweep(options: SweepCommand) -> None:
     """Solve the problem for every combination of the values of some keys.
 
-    Finished runs are kept in the output folder: the same command resumes the study.
+    Finished runs are kept in the output folder: the same command resumes an interrupted study.
     """
     method = _single_method(options.method)
     over = parse_varied_keys(options.over)

@@ -228,7 +228,8 @@ class NewCommand:
     kind : str
         Add a simulated recording of this kind, so that the problem runs as it is.
     dataset : str
-        Copy the files of this dataset instead, for example kawabata_1981.
+        Copy the problem and the data of this dataset instead of the template, for example
+        kawabata_1981.
     """
 
     name: Annotated[str, typer.Argument()]

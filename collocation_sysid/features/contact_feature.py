@@ -22,14 +22,19 @@ from ..model.contact.contact_summary import (
 )
 from ..program.collocation import ExperimentIterate
 from ..recording.experiment import Experiment
-from ..statistics.concerns import Concern, concern_if
+from ..statistics.concerns import Concern, Topic, concern_if
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
 from ..statistics.misspecification.obstacle_misspecifications import (
+    MESSAGES,
     obstacle_hypotheses,
 )
 from ..statistics.misspecification.placement_causes import placement_mistakes
 from .feature import Feature
-from .measurement_results import FittedExperiment, InstrumentPrediction
+from .measurement_results import (
+    FittedExperiment,
+    InstrumentPrediction,
+    PictureKind,
+)
 
 # Number of faces below which the mesh determines the width of a contact.
 FEWEST_FACES = 4.0
@@ -37,6 +42,27 @@ FEWEST_FACES = 4.0
 # within.
 STEP_PER_WIDTH = 1e-3
 AT_THE_GUESS = ", at the guess"
+TOPICS = {
+    "contact": Topic(
+        "Contact",
+        "contact",
+        remedy="Check the position, the normal and the motion of the obstacle, and the mesh in the "
+        "contact area.",
+        messages={
+            "never": "in '{experiment}'{more} the body never touches {obstacle}{guess}; the "
+            "smallest gap is {mm:.3g} mm: its force and friction carry no information",
+            "coarse": "in '{experiment}'{more} only {faces:.2g} faces, {face_mm:.2g} mm large, "
+            "touch {obstacle} at a time{guess}: the mesh is too coarse for the contact area; "
+            "refine it there",
+            "pressed": "in '{experiment}'{more} the body touches {obstacle} already at the first "
+            "sample{guess}: the beginning of the contact is not recorded; start the "
+            "recording earlier",
+            "lost": "in '{experiment}'{more} the body leaves {obstacle} at t = {t_s:.4g} s{guess}: "
+            "if it remained in contact, check the motion of the obstacle and the guess, or "
+            "end window_s before",
+        },
+    ),
+}
 
 
 def hypotheses(experiment: Experiment) -> tuple[Hypothesis, ...]:
@@ -208,6 +234,18 @@ def fit_lines(
 
 CONTACT = Feature(
     "contact",
+    picture_kinds=[
+        PictureKind(
+            "pressure", "Pressure of obstacles on the body.", before="tracks"
+        ),
+        PictureKind(
+            "gap",
+            "Gap between the body's surface and obstacles.",
+            before="tracks",
+        ),
+    ],
+    topics=TOPICS,
+    messages=MESSAGES,
     hypotheses=hypotheses,
     fit_hypotheses=fit_hypotheses,
     guess_concerns=guess_concerns,

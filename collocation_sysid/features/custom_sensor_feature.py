@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,12 +17,15 @@ from ..program.reactions.reaction_resultant import ReactionGrid
 from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
 from ..recording.experiment import Experiment
+from ..recording.specimen import STRESS_UNIT
 from .feature import Feature, Units
 from .measurement_results import (
     FittedExperiment,
     InstrumentMisfit,
     InstrumentPrediction,
+    PictureKind,
     PredictionErrors,
+    PredictionResiduals,
     SensorSeries,
     comparison_columns,
     misfit,
@@ -200,6 +203,59 @@ def simulated_series(
         yield SensorSeries("reading", k, columns, names)
 
 
+def prediction_residuals(
+    experiment: Experiment, _: Trajectory, predicted: InstrumentPrediction
+) -> PredictionResiduals | None:
+    """Return the differences of all stresses [Pa] of a specimen without a mesh; None for other
+    experiments.
+    """
+    if experiment.specimen is None:
+        return None
+    return _stress_residuals(experiment, predicted.readings)
+
+
+def fit_rms(solution: Solution) -> dict[str, float | None]:
+    """Return the RMS residual of the stresses of all fitted specimens [Pa]; None without any."""
+    residuals_pa = [
+        _stress_residuals(
+            segment.experiment, solution.readings[segment.experiment.name]
+        ).values
+        for segment in solution.collocation.transcriptions
+        if segment.experiment.specimen is not None
+    ]
+    if not residuals_pa:
+        return {STRESS_UNIT: None}
+    squares = np.concatenate(residuals_pa) ** 2
+    return {STRESS_UNIT: float(np.sqrt(np.nanmean(squares)))}
+
+
+def _stress_residuals(
+    experiment: Experiment, predicted: Mapping[str, Array]
+) -> PredictionResiduals:
+    """Return the differences of the stresses of a specimen, the custom sensors with the unit Pa.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Test of a specimen, with at least one measured stress.
+    predicted : mapping of str to (S, 1) array
+        Prediction at the samples of each stress [Pa], by the name of the custom sensor.
+    """
+    stresses = [
+        gauge for gauge in experiment.readings if gauge.unit == STRESS_UNIT
+    ]
+    return PredictionResiduals.in_order_of_time(
+        np.concatenate([gauge.sample_times_s for gauge in stresses]),
+        np.concatenate(
+            [
+                predicted[gauge.name] - gauge.measured_values
+                for gauge in stresses
+            ]
+        ),
+        unit=STRESS_UNIT,
+    )
+
+
 def units_by_name(experiment: Experiment) -> dict[str, str] | None:
     """Return the units of the custom sensors that state one, by name; None if none does."""
     return {
@@ -251,6 +307,14 @@ def _unit_text(units: Units, reading: str) -> str:
 
 CUSTOM_SENSORS = Feature(
     "custom sensors",
+    picture_kinds=[
+        PictureKind(
+            "reading",
+            "Custom sensor: measured, fitted and simulated.",
+            before="error",
+            is_leading=True,
+        )
+    ],
     instruments=instruments,
     predict=predict,
     copied=copied,
@@ -261,6 +325,8 @@ CUSTOM_SENSORS = Feature(
     step_differences=step_differences,
     recorded=recorded,
     simulated_series=simulated_series,
+    prediction_residuals=prediction_residuals,
+    fit_rms=fit_rms,
     fit_fields=fit_fields,
     fit_lines=fit_lines,
     error_texts=error_texts,

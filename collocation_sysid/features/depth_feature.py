@@ -46,6 +46,7 @@ from .measurement_results import (
     FittedExperiment,
     InstrumentMisfit,
     InstrumentPrediction,
+    PictureKind,
     PredictionErrors,
 )
 
@@ -474,6 +475,16 @@ def _distance_text(error: DepthError) -> str:
 
 DEPTH = Feature(
     "depth",
+    picture_kinds=[
+        PictureKind(
+            "depth",
+            "Points of a depth camera with the outline of the fitted surface, at up to four "
+            "samples, and the distance of each point behind the surface; grey points are not "
+            "compared.",
+            before="shapes",
+            is_leading=True,
+        )
+    ],
     instruments=instruments,
     require_valid=require_depth_units,
     predict=predict,

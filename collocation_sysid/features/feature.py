@@ -8,8 +8,9 @@ Runs, checks and reports iterate over `features.registry.FEATURES` and call the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
+from pathlib import Path
 from typing import Any
 
 from ..common.array_types import Array
@@ -20,14 +21,17 @@ from ..program.collocation import Collocation, ExperimentIterate
 from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
 from ..recording.experiment import Experiment
-from ..statistics.concerns import Concern
+from ..statistics.concerns import Concern, Topic
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
 from .measurement_results import (
     FittedExperiment,
     InstrumentMisfit,
     InstrumentPrediction,
+    PictureKind,
     PredictionErrors,
+    PredictionResiduals,
     SensorSeries,
+    SeriesKind,
 )
 
 Fields = Mapping[str, Any]
@@ -52,6 +56,10 @@ def _no_reason(*_: Any) -> str:
 def _no_loss(_: ExperimentIterate) -> float:
     """Return zero."""
     return 0.0
+
+
+def _no_residuals(*_: Any) -> None:
+    """Return no differences."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +105,15 @@ class Feature:
     ----------
     name : str
         Name of the feature.
+    topics : mapping of str to Topic
+        Topics of concerns that only this feature has, with their messages, by key.
+    messages : mapping of str to str
+        Messages of its concerns of general topics, by code.
+    picture_kinds : sequence of PictureKind
+        Captions of its pictures; a kind stands before a general one or one of an earlier feature.
+    series_kind : SeriesKind, optional
+        Numbers of its sensors over time, if all of them measure the same; `recorded` then has them
+        as "sensor_columns" by the name of the kind.
     instruments : callable
         ``instruments(experiment)``: texts of what the feature measures in a recording.
     require_valid : callable
@@ -153,6 +170,20 @@ class Feature:
         ``live_limitations(experiment)``: parts of an experiment that live estimation does not
         support, each as its description, a value that is true if the experiment has it, and the
         supported alternative.
+    write_predicted : callable
+        ``write_predicted(experiment, trajectory, folder)`` writes predicted measurements of an
+        experiment as files of a problem.
+    read_predicted : callable
+        ``read_predicted(table)`` modifies the table of an experiment in a problem file, in place,
+        so that it reads these files beside the problem file; the table is unchanged without such
+        measurements.
+    prediction_residuals : callable
+        ``prediction_residuals(experiment, trajectory, predicted)``: differences by which a
+        prediction is judged in a comparison of models; None without such measurements. Of several
+        features the first counts.
+    fit_rms : callable
+        ``fit_rms(solution)``: RMS residual of all fitted experiments by its unit, that of
+        `prediction_residuals`; None where nothing is measured.
     notes : callable
         ``notes(part)``: notes on the fit of one experiment.
     excluded_loss : callable
@@ -171,6 +202,10 @@ class Feature:
     """
 
     name: str
+    topics: Mapping[str, Topic] = field(default_factory=dict)
+    messages: Mapping[str, str] = field(default_factory=dict)
+    picture_kinds: Sequence[PictureKind] = ()
+    series_kind: SeriesKind | None = None
     instruments: Callable[[Experiment], Iterable[str]] = _nothing
     require_valid: Callable[[Experiment], object] = _nothing
     predict: Callable[[Transcription, Trajectory, Array], Fields] = _no_fields
@@ -216,6 +251,13 @@ class Feature:
     live_limitations: Callable[
         [Experiment], Iterable[tuple[str, object, str]]
     ] = _nothing
+    write_predicted: Callable[[Experiment, Trajectory, Path], object] = _nothing
+    read_predicted: Callable[[dict[str, Any]], object] = _nothing
+    prediction_residuals: Callable[
+        [Experiment, Trajectory, InstrumentPrediction],
+        PredictionResiduals | None,
+    ] = _no_residuals
+    fit_rms: Callable[[Solution], Mapping[str, float | None]] = _no_fields
     notes: Callable[[ExperimentIterate], Iterable[str]] = _nothing
     excluded_loss: Callable[[ExperimentIterate], float] = _no_loss
     fit_fields: Callable[[ExperimentIterate, Solution], Fields] = _no_fields

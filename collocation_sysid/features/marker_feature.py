@@ -3,21 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..common.array_types import Array, root_mean
+from ..methods.solution import Solution
 from ..program.collocation import ExperimentIterate
 from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
+from ..recording import write_markers_csv
 from ..recording.experiment import Experiment
 from .feature import Feature, Units
 from .measurement_results import (
     InstrumentMisfit,
     InstrumentPrediction,
+    PictureKind,
     PredictionErrors,
+    PredictionResiduals,
     misfit,
+)
+
+# File of predicted tracks.
+PREDICTED_FILE = "predicted_markers.csv"
+# Keys of markers that describe their file.
+KEYS_OF_FILE = (
+    "names",
+    "labels",
+    "length_unit",
+    "rate_hz",
+    "template_m",
+    "template_window_s",
+    "max_template_residual_m",
 )
 
 
@@ -109,6 +127,46 @@ def step_differences(
     yield np.nan_to_num(way_m / segment.experiment.markers.sigma_m[:, None])
 
 
+def write_predicted(
+    experiment: Experiment, trajectory: Trajectory, folder: Path
+) -> None:
+    """Write the predicted tracks of the markers into a folder."""
+    write_markers_csv(
+        folder / PREDICTED_FILE,
+        experiment.markers.t_s,
+        names=experiment.markers.names,
+        positions_m=trajectory.markers_m,
+    )
+
+
+def read_predicted(table: dict[str, Any]) -> None:
+    """Let the table of an experiment read the predicted tracks, in place, if it has markers."""
+    if "markers" in table:
+        for key in KEYS_OF_FILE:
+            table["markers"].pop(key, None)
+        table["markers"]["file"] = PREDICTED_FILE
+
+
+def prediction_residuals(
+    experiment: Experiment, trajectory: Trajectory, _: InstrumentPrediction
+) -> PredictionResiduals | None:
+    """Return the differences of the markers [m]; None without a sample of any."""
+    markers = experiment.markers
+    if not markers.count_samples():
+        return None
+    return PredictionResiduals(
+        experiment.t_s,
+        trajectory.markers_m - markers.positions_m,
+        is_counted=markers.is_present,
+        unit="m",
+    )
+
+
+def fit_rms(solution: Solution) -> dict[str, float | None]:
+    """Return the RMS distance of the markers [m]; 0 without samples."""
+    return {"m": solution.rms_m}
+
+
 def error_texts(error: PredictionErrors, _: Units) -> Iterator[str]:
     """Yield RMS and largest distance in words; nothing without markers."""
     if error.rms_m:
@@ -120,6 +178,14 @@ def error_texts(error: PredictionErrors, _: Units) -> Iterator[str]:
 
 MARKERS = Feature(
     "markers",
+    picture_kinds=[
+        PictureKind(
+            "tracks",
+            "Measured, fitted and simulated markers, the residual below.",
+            before="error",
+            is_leading=True,
+        )
+    ],
     predict=predict,
     copied=copied,
     copied_times_s=copied_times_s,
@@ -127,5 +193,9 @@ MARKERS = Feature(
     errors=errors,
     misfits=misfits,
     step_differences=step_differences,
+    write_predicted=write_predicted,
+    read_predicted=read_predicted,
+    prediction_residuals=prediction_residuals,
+    fit_rms=fit_rms,
     error_texts=error_texts,
 )

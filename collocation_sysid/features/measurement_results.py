@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.array_types import Array, root_mean
 from ..common.serialisation import optional
@@ -276,6 +277,91 @@ class SensorSeries:
     columns: Array
     names: Sequence[str]
     units: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class SeriesKind:
+    """Numbers that all sensors of one kind measure over time.
+
+    Attributes
+    ----------
+    name : str
+        Name of the kind, with which names of pictures and stored arrays begin.
+    number_names : sequence of m str
+        Names of the numbers.
+    units : sequence of m str
+        Their units.
+    """
+
+    name: str
+    number_names: Sequence[str]
+    units: Sequence[str]
+
+    def series(self, number: int, columns: Array) -> SensorSeries:
+        """Return the series of one sensor; number and columns are those of `SensorSeries`."""
+        return SensorSeries(
+            self.name, number, columns, self.number_names, units=self.units
+        )
+
+
+@dataclass(frozen=True)
+class PictureKind:
+    """Pictures of one kind in the report of a run.
+
+    Attributes
+    ----------
+    name : str
+        Beginning of the names of their files.
+    caption : str
+        Caption.
+    before : str
+        Name of the kind before which they stand in a report.
+    is_leading : bool
+        Whether they show measurement and fit, so that one of them may lead the report.
+    """
+
+    name: str
+    caption: str
+    before: str
+    is_leading: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class PredictionResiduals:
+    """Differences by which a prediction of held-out measurements is judged, predicted less measured.
+
+    Attributes
+    ----------
+    t_s : (S,) array
+        Times [s], ascending.
+    values : (S, K, d) array
+        Differences of K vectors or numbers.
+    is_counted : (S, K) array of bool
+        Whether something was measured.
+    unit : str
+        Unit of the values.
+    """
+
+    t_s: Array
+    values: Array
+    is_counted: NDArray[np.bool_]
+    unit: str
+
+    @classmethod
+    def in_order_of_time(
+        cls, t_s: Array, values: Array, unit: str
+    ) -> PredictionResiduals:
+        """Return the differences (S, d) of several sensors together, at times (S,) in any order; a
+        sample counts if any of its numbers is finite.
+        """
+        order = np.argsort(t_s, kind="stable")
+        in_order = values[order, None]
+        return cls(
+            t_s[order],
+            in_order,
+            is_counted=np.asarray(np.isfinite(in_order).any(axis=2)),
+            unit=unit,
+        )
 
 
 def misfit(

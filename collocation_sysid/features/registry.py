@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+from ..program.simulation import Trajectory
+from ..recording.experiment import Experiment
+from ..statistics.concerns import declare_messages, declare_topics
 from .contact_feature import CONTACT
 from .custom_sensor_feature import CUSTOM_SENSORS
 from .depth_feature import DEPTH
 from .feature import Feature, Fields
 from .marker_feature import MARKERS
+from .measurement_results import InstrumentPrediction, PredictionResiduals
 from .wrench_feature import WRENCH
 
 # In the order of the residuals of an experiment, see `Transcription.residuals`.
@@ -20,6 +24,32 @@ FEATURES: tuple[Feature, ...] = (
     CONTACT,
     DEPTH,
 )
+for _feature in FEATURES:
+    declare_topics(_feature.topics)
+    declare_messages(_feature.messages)
+
+
+def prediction_residuals(
+    experiment: Experiment,
+    trajectory: Trajectory,
+    predicted: InstrumentPrediction,
+) -> PredictionResiduals:
+    """Return the differences by which a prediction of an experiment is judged: those of the first
+    feature that has some.
+
+    Raises
+    ------
+    ValueError
+        If nothing is measured by which it could be judged.
+    """
+    of_features = (
+        each.prediction_residuals(experiment, trajectory, predicted)
+        for each in FEATURES
+    )
+    for residuals in of_features:
+        if residuals is not None:
+            return residuals
+    raise ValueError(f"nothing is measured in '{experiment.name}'")
 
 
 def merged_fields(contributions: Iterable[Fields]) -> dict[str, Any]:

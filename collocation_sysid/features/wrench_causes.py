@@ -37,6 +37,30 @@ from ..statistics.misspecification.misspecification_hypothesis import (
     HypothesisTest,
 )
 
+# Messages of the hypotheses by the codes of their concerns.
+MESSAGES = {
+    "description/wrench-sign": "it fits with the opposite sign: it is the force of the body on the "
+    "grasp instead of that of the grasp on the body; set sign = -1 in the table of the "
+    "wrench",
+    "description/wrench-sign/part": "its {what} fit with the opposite sign, the other components do "
+    "not: change the sign of these columns",
+    "description/wrench-axes": "its axes are exchanged or reversed: it fits with ({axes}) in place "
+    "of (x, y, z), both forces and torques; reorder the columns, rotate the sensor's axes, or "
+    "for a log state sensor_frame in the table of the wrench",
+    "description/wrench-gain": "its {what} fit if multiplied by {factor:.3g}: check the calibration of "
+    "the sensor, and the density or mass of the body",
+    "description/wrench-point": "its torques refer to a point {by_mm:.3g} mm away from point_m: they "
+    "fit with point_m = {point}",
+    "description/wrench-frame": 'it is expressed in the frame of the {other}: set frame = "{other}"',
+    "description/wrench-unit": "its {what} seem to be in {unit}: multiply by {factor:g}",
+    "description/wrench-clock": "it was measured about {by_ms:.3g} ms {when} than its times t_s "
+    "state: its clock differs from that of the poses",
+    "description/wrench-tare": "the sensor was probably zeroed while it carried the body: zero it "
+    "before the grasp, or widen nuisance.tare",
+    "description/sign": "along {axis} the displacement of grasp {grasp} and its force on the body have "
+    "opposite signs (correlation {correlation:.2f}), as if the body produced energy: "
+    "one of the signs is wrong; set sign = -1 for the displacement or for the wrench",
+}
 # RMS residual in standard deviations that needs an explanation; a correct description must leave
 # less.
 MISFIT = 1.3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from ..methods.solution import Solution, pooled_wrench_rms, wrench_rms
 from ..program.collocation import ExperimentIterate
 from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
+from ..program.wrench_residual import predict_wrenches
+from ..recording import write_wrench_csv
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import COMPONENTS, UNITS
 from ..statistics.assessment import forward_simulation_concerns
@@ -27,20 +30,29 @@ from .measurement_results import (
     FittedExperiment,
     InstrumentMisfit,
     InstrumentPrediction,
+    PictureKind,
     PredictionErrors,
+    PredictionResiduals,
     SensorSeries,
+    SeriesKind,
     comparison_columns,
     misfit,
 )
-from .wrench_at_guess import wrench_deviations
+from .wrench_at_guess import MESSAGE_OF_OFFSET, wrench_deviations
 from .wrench_causes import (
     CHECKED_SAMPLES,
+    MESSAGES,
     wrench_causes,
     wrench_mistakes,
 )
 
 # Longest fit of the first samples to the markers that needs no request [s].
 LONGEST_FIT_S = 10.0
+# File of a predicted wrench.
+PREDICTED_FILE = "predicted_wrench.csv"
+# Keys of a wrench that describe its file.
+KEYS_OF_FILE = ("columns", "axis", "sign", "area_m2", "symmetry")
+SERIES_KIND = SeriesKind("wrench", COMPONENTS, units=UNITS)
 
 
 def instruments(experiment: Experiment) -> list[str]:
@@ -108,7 +120,9 @@ def step_differences(
     predicted.
     """
     sensors = part.segment.sensors
-    fitted = part.predict_wrenches() if sensors else []
+    fitted = (
+        predict_wrenches(sensors, part.reactions, part.phi) if sensors else []
+    )
     rows = zip(sensors, fitted, predicted.wrenches, strict=True)
     for sensor, of_fit, of_simulation in rows:
         way = share * np.nan_to_num(
@@ -178,7 +192,8 @@ def recorded(
     predicted: InstrumentPrediction | None,
     _: Array,
 ) -> dict[str, Any]:
-    """Return an array (S, 19) for each sensor: time, and the wrench measured, fitted and simulated.
+    """Return an array (S, 19) for each sensor: time [s], and the wrench measured, fitted and
+    simulated.
 
     The wrenches are those of the whole specimen also where symmetry reduces the model to a part of
     it. NaN where the experiment was not fitted or not simulated.
@@ -192,7 +207,7 @@ def recorded(
         columns = comparison_columns(sensor.t_s, sensor.values, *models)
         columns[:, 1:] *= sensor.symmetry
         series.append(columns)
-    return {"wrenches": series}
+    return {"sensor_columns": {SERIES_KIND.name: series}}
 
 
 def simulated_series(
@@ -203,7 +218,66 @@ def simulated_series(
     for k, (sensor, simulated) in enumerate(pairs, 1):
         columns = comparison_columns(sensor.t_s, sensor.values, None, simulated)
         columns[:, 1:] *= sensor.symmetry
-        yield SensorSeries("wrench", k, columns, COMPONENTS, units=UNITS)
+        yield SERIES_KIND.series(k, columns)
+
+
+def write_predicted(
+    experiment: Experiment, trajectory: Trajectory, folder: Path
+) -> None:
+    """Write the predicted wrench into a folder; the experiment has at most one sensor."""
+    for sensor, wrench in zip(
+        experiment.wrenches, trajectory.wrenches, strict=True
+    ):
+        write_wrench_csv(folder / PREDICTED_FILE, sensor.t_s, values=wrench)
+
+
+def read_predicted(table: dict[str, Any]) -> None:
+    """Let the table of an experiment read the predicted wrench, in place, if its first grasp has a
+    sensor: in newtons and for the modelled part of the body.
+
+    The keys of the original file (`KEYS_OF_FILE`), among them its columns and "symmetry", are left
+    out; `sigma_n` and `sigma_nm` are divided by "symmetry".
+    """
+    grasps = table["grasp"]
+    grasp = grasps[0] if isinstance(grasps, list) else grasps
+    if "wrench" not in grasp:
+        return
+    wrench = grasp["wrench"]
+    parts = wrench.get("symmetry", 1)
+    sigmas = {
+        key: wrench[key] / parts
+        for key in ("sigma_n", "sigma_nm")
+        if key in wrench
+    }
+    remaining = {
+        key: value for key, value in wrench.items() if key not in KEYS_OF_FILE
+    }
+    grasp["wrench"] = remaining | sigmas | {"file": PREDICTED_FILE}
+
+
+def prediction_residuals(
+    experiment: Experiment, _: Trajectory, predicted: InstrumentPrediction
+) -> PredictionResiduals | None:
+    """Return the differences of the forces [N] on the complete specimen; None without sensors."""
+    sensors = experiment.wrenches
+    if not sensors:
+        return None
+    pairs = zip(predicted.wrenches, sensors, strict=True)
+    return PredictionResiduals.in_order_of_time(
+        np.concatenate([sensor.t_s for sensor in sensors]),
+        np.concatenate(
+            [
+                sensor.symmetry * (read - sensor.values)[:, :3]
+                for read, sensor in pairs
+            ]
+        ),
+        unit="N",
+    )
+
+
+def fit_rms(solution: Solution) -> dict[str, float | None]:
+    """Return the RMS residual of the forces [N]; None if none is measured."""
+    return {"N": pooled_wrench_rms(solution)[0]}
 
 
 def validation_concerns(
@@ -278,6 +352,16 @@ def _forces_text(*sizes: float | None) -> str:
 
 WRENCH = Feature(
     "wrench",
+    messages={**MESSAGES, **MESSAGE_OF_OFFSET},
+    picture_kinds=[
+        PictureKind(
+            "wrench",
+            "Wrench of a grasp: measured, fitted and simulated.",
+            before="error",
+            is_leading=True,
+        )
+    ],
+    series_kind=SERIES_KIND,
     instruments=instruments,
     predict=predict,
     copied=copied,
@@ -291,6 +375,10 @@ WRENCH = Feature(
     validation_concerns=validation_concerns,
     recorded=recorded,
     simulated_series=simulated_series,
+    write_predicted=write_predicted,
+    read_predicted=read_predicted,
+    prediction_residuals=prediction_residuals,
+    fit_rms=fit_rms,
     fit_fields=fit_fields,
     pooled_fields=pooled_fields,
     fit_lines=fit_lines,

@@ -65,17 +65,19 @@ class Field:
         Constant that varies: one of the material or of its damping law, young_pa for all moduli of
         a material together, or density_kg_m3.
     length_m : float or list
-        Correlation length: places at this distance have the correlation 1/e. Of several lengths the
-        most likely one is used.
+        Correlation length: two points at this distance have the correlation 1/e. If several lengths
+        are given, the most likely one is used.
     modes : int
-        Number of shapes of the field; one more costs as much as one more right-hand side.
+        Number of shapes of the field. Each shape adds one right-hand side to the linear system of
+        every time step.
     amplitude : float, optional
-        Prior standard deviation of the logarithm, 0.5 by default; for a density that of the ratio
-        to its stated value, 0.3 by default. With prior = "two-phase", the prior standard deviation
-        of the logarithm of the contrast, 1 by default.
+        Prior standard deviation of the logarithm of the constant, 0.5 by default; for a density,
+        prior standard deviation of its ratio to the stated density, 0.3 by default. With prior =
+        "two-phase", the prior standard deviation of the logarithm of the contrast, 1 by default.
     prior : {"smooth", "two-phase"}
-        "smooth": the logarithm is a normal field. "two-phase": two materials with a boundary
-        between them; the parameter contrast is the ratio of inclusions to surroundings.
+        "smooth": the logarithm of the constant is a smooth normal field. "two-phase": the constant
+        has two values with a boundary between them; the parameter contrast is the ratio of the
+        value in inclusions to that in the surroundings.
     """
 
     length_m: float | tuple[float, ...] = key(Lengths)

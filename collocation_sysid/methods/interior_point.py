@@ -136,13 +136,14 @@ class InteriorPoint(Options):
         are large, so that the full Hessian is indefinite and its steps are too long. 0 uses the
         exact Hessian from the start.
     proximal : float
-        Number that is added to the Hessian's diagonal at the positions, most of which is zero
-        otherwise. It changes the steps slightly, but not the solution, and avoids factorisations
-        that fail because of rounding (wrong inertia).
+        Number that is added to the diagonal entries of the Hessian that belong to positions, most
+        of which would otherwise be zero. It changes the steps slightly, but not the solution, and
+        avoids factorisations that fail because of rounding (wrong inertia).
     contact : {"energy", "complementarity"}
-        Model of contact with obstacles: an energy that increases as the body comes near, or
-        pressures as further variables with 0 ≤ pressure ⟂ gap ≥ 0, whose product is decreased in a
-        few more solves. The latter does not support friction.
+        Model of contact with obstacles. "energy": an energy that increases as the body approaches
+        an obstacle. "complementarity": pressures are additional variables with 0 ≤ pressure ⟂ gap ≥
+        0, and the product of pressure and gap is decreased in a few more solves; friction is not
+        supported.
     linear_solver : str
         IPOPT's linear solver; the wheel contains "mumps" and "spral".
     tolerance : float

@@ -82,7 +82,7 @@ class SearchOptions(Options):
     Attributes
     ----------
     tolerance : float
-        Largest last step of a parameter's logarithm.
+        The search ends when a step changes the logarithm of no parameter by more than this value.
     max_iterations : int
         Largest number of sweeps, over all horizons; a rejected trial counts.
     trust : float
@@ -91,20 +91,21 @@ class SearchOptions(Options):
         Shares of the recording solved one after another, ending with 1. Not used if the solve
         starts from another run.
     rung_decrease : float
-        Each horizon but the last ends when a step promises to decrease the loss by less than this
-        share.
+        The search on each share of the recording except the last ends when the next step is
+        predicted to decrease the loss by less than this fraction.
     rung_prior : float
-        Standard deviation of a prior of each parameter's logarithm around its guess, for all
-        horizons but the last. A short horizon does not determine all parameters, and without this
-        prior they would move to their bounds.
+        Standard deviation of a prior of the logarithm of each parameter about its guess, for all
+        shares of the recording except the last. A short part of a recording does not determine all
+        parameters; without this prior, undetermined parameters would move to their bounds.
     hessian : {"gauss-newton", "exact"}
-        Once a step moves no parameter by more than 10 %, "gauss-newton" approximates what
-        Gauss–Newton neglects from the steps, and "exact" computes it from the Lagrangian, which
-        takes a second sweep per iteration and helps with large residuals. Before, both are
-        Gauss–Newton.
+        Second derivatives that Gauss–Newton neglects: "gauss-newton" approximates them from the
+        previous steps, and "exact" computes them from the Lagrangian, which takes a second sweep
+        per iteration and helps if residuals are large. Both options are plain Gauss–Newton until a
+        step changes no parameter by more than 10 %.
     factorisation : {"auto", "band", "sparse", "supernodal"}
-        Banded Cholesky, SuperLU, supernodal Cholesky (extra `large`), or whichever is estimated to
-        cost least.
+        Factorisation of the matrix of a time step: banded Cholesky ("band"), SuperLU ("sparse"),
+        supernodal Cholesky ("supernodal", extra `large`), or that with the lowest estimated cost
+        ("auto").
     """
 
     tolerance: Positive = 1e-8

@@ -21,6 +21,7 @@ from ..fem.kernels import map_experiments
 from ..program.collocation import Collocation, ExperimentIterate, Violation
 from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
+from ..program.wrench_residual import predict_wrenches
 from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE
 from .stiffness_scan import Scan
@@ -373,10 +374,12 @@ class Solution:
         Each experiment with wrench sensors has a list with one array per sensor: force [N] and
         torque [N m]. NaN means that the sensor was not predicted at that sample.
         """
-        parts = [part for part in self.parts if part.segment.sensors]
         return {
-            part.segment.experiment.name: part.predict_wrenches()
-            for part in parts
+            part.segment.experiment.name: predict_wrenches(
+                part.segment.sensors, part.reactions, part.phi
+            )
+            for part in self.parts
+            if part.segment.sensors
         }
 
     @cached_property

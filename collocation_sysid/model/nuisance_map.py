@@ -799,7 +799,7 @@ def _components(
             len(experiment.body_grasps),
         )
     if of == "camera":
-        return enumerate([camera.name for camera in experiment.depths])
+        return enumerate(experiment.camera_names)
     if of == "load":
         return enumerate(which for which, _ in _timed_loads(experiment))
     if of == "sensor":

@@ -48,12 +48,13 @@ class Unknown:
     guess : float, optional
         Value at which the search starts; found by a scan of the stiffness by default.
     lower, upper : float, optional
-        Bounds of the estimate; those of the constant by default.
+        Lower and upper bound of the estimate; by default the bounds of the constant.
     prior : (mean, deviation), optional
         Normal prior: on the logarithm, with a relative deviation; of a linear parameter, on the
         value, with an absolute deviation.
     scale : {"log", "linear"}, optional
-        Whether the logarithm of a positive parameter is estimated, or the value of any sign.
+        "log": the logarithm of a positive parameter is estimated. "linear": the value itself is
+        estimated, which may have any sign.
     typical : float, optional
         Typical change of a linear parameter in one step of the solver; by default that of its
         constant, or else the guess.

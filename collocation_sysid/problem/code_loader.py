@@ -11,35 +11,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
-from ..common.files import reason, require_regular
+from ..common.files import reason
 from ..errors import InputError, hint_at, located
 from ..fem.laws.materials import Energy, Material
 from ..fem.node_force import NodeForce
-from ..recording.formats.logs import stored_files
 from ..recording.node_selection import selection_from_section
 from ..recording.nuisance import NuisanceRow
+from .named_files import existing_file
 from .nuisance_schema import CustomNuisanceSection
 from .schema import CodeSection, NodeForceSection
-
-
-def existing_file(folder: Path, name: str, key: str) -> Path:
-    """Return the path of a file that a key of the problem file names, relative to `folder`; `name`
-    may also be a topic of a log, as "log#topic", or an absolute path.
-
-    Raises
-    ------
-    InputError
-        At `key`, if it does not exist, is a folder or no regular file.
-    """
-    file = folder / name
-    require_regular(file, key)
-    if not stored_files(file):
-        fault = "is a folder" if file.is_dir() else "does not exist"
-        hint = folder / "README.md"
-        see = f"; {hint} explains how to get it" if hint.is_file() else ""
-        message = f"{file} {fault}; expected a file, named from the problem file's folder{see}"
-        raise InputError(message, where=key)
-    return file
 
 
 @dataclass(frozen=True)

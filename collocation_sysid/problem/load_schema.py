@@ -23,11 +23,11 @@ class PointMassSection(Section):
         Nodes that carry the mass in equal parts, selected as in a grasp.
     mass_kg : float
     from_s : float, optional
-        Time at which the mass joins the body [s], with the uncertainty nuisance.joining; before the
-        recording by default.
+        Time at which the mass is attached to the body [s], with the uncertainty nuisance.joining;
+        by default it is attached before the recording.
     until_s : float, optional
-        Time at which the mass leaves the body [s], with the same uncertainty; after the recording
-        by default.
+        Time at which the mass is removed from the body [s], with the same uncertainty; by default
+        it is removed after the recording.
     """
 
     nodes: Nodes
@@ -48,10 +48,11 @@ class ForceSection(Section):
     file : str, optional
         CSV with the columns t_s, fx_n, fy_n, fz_n.
     from_s : float, optional
-        Time at which the force begins [s], with the uncertainty nuisance.joining; before the
-        recording by default.
+        Time at which the force begins [s], with the uncertainty nuisance.joining; by default it
+        begins before the recording.
     until_s : float, optional
-        Time at which the force ends [s], with the same uncertainty; after the recording by default.
+        Time at which the force ends [s], with the same uncertainty; by default it ends after the
+        recording.
     """
 
     nodes: Nodes
@@ -70,7 +71,7 @@ class ForceSection(Section):
 
 
 class TendonSection(Section):
-    """A thread through points of the body, straight between them, that pulls itself shorter.
+    """A cable under tension through points of the body, straight from each point to the next.
 
     Attributes
     ----------
@@ -79,7 +80,7 @@ class TendonSection(Section):
     tension_n : float, optional
         Constant tension.
     tension : str, optional
-        CSV with the columns t_s and tension_n, over all of the recording.
+        CSV with the columns t_s and tension_n, which covers the complete recording.
     name : str, optional
         Name; tendon_1, tendon_2 and so on by default.
     """
@@ -99,17 +100,18 @@ class TendonSection(Section):
 
 
 class PressureSection(Section):
-    """A pressure above the surroundings' on faces of the boundary, such as a cavity's wall.
+    """A pressure, relative to the surroundings, on faces of the boundary such as the wall of a
+    cavity.
 
     Attributes
     ----------
     faces : Nodes
-        Faces with all their corners in box_m, ball_m or indices; or the name of a physical group or
+        Faces whose corners are all in box_m, ball_m or indices; or the name of a physical group or
         cell array of triangles, or of a point array.
     pressure_pa : float, optional
         Constant pressure; negative for suction.
     pressure : str, optional
-        CSV with the columns t_s and pressure_pa, over all of the recording.
+        CSV with the columns t_s and pressure_pa, which covers the complete recording.
     name : str, optional
         Name; pressure_1, pressure_2 and so on by default.
     lag_s : float

@@ -39,9 +39,10 @@ from ..statistics.misspecification.plausibility import (
     SIZES_M,
     size_and_density_hypotheses,
 )
-from .code_loader import CodeLoader, existing_file
+from .code_loader import CodeLoader
 from .density_guesses import with_declared_densities, with_guessed_densities
 from .load_schema import LOADS
+from .named_files import existing_file
 from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 from .problem_reading import read_problem_file
 from .problem_size import Say, Size, announce_reading, require_feasible

@@ -30,9 +30,9 @@ class Scoped(Section):
     Attributes
     ----------
     scope : str
-        Which recordings have the same value: "recording" for a value of each recording, "shared"
-        for one value of all recordings that say "shared", or "shared" and a word for each of
-        several groups.
+        Which recordings have the same value. "recording": each recording has its own value.
+        "shared": all recordings with "shared" have one value. "shared" and a word: all recordings
+        with the same word have one value.
     """
 
     scope: Annotated[str, AfterValidator(_require_scope)] = "recording"
@@ -103,8 +103,8 @@ class CalibrationScalePrior(NuisancePriorSection):
 
 
 class CalibrationDistortionPrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: radial distortion of first order about the body's middle: a
-    factor 1 + k r².
+    """Prior of a nuisance parameter: coefficient k of a radial distortion by the cameras: distances
+    r from the middle of the body are multiplied by 1 + k r².
 
     Attributes
     ----------
@@ -116,8 +116,8 @@ class CalibrationDistortionPrior(NuisancePriorSection):
 
 
 class TimeShiftPrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: how much later than stated the markers were measured, on the
-    grasps' clock.
+    """Prior of a nuisance parameter: how much later than stated the markers were measured, by the
+    clock of the grasps.
 
     Attributes
     ----------
@@ -131,8 +131,8 @@ class TimeShiftPrior(NuisancePriorSection):
 
 
 class ClockRatePrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: how much slower than the grasps' clock that of the markers
-    runs.
+    """Prior of a nuisance parameter: how much slower the clock of the markers runs than the clock
+    of the grasps.
 
     Attributes
     ----------
@@ -203,7 +203,8 @@ class StrainZeroPrior(NuisancePriorSection):
 
 
 class DisplacementZeroPrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: a constant offset of each displacement along each of its axes.
+    """Prior of a nuisance parameter: a constant offset of each prescribed displacement along each
+    of its axes.
 
     Attributes
     ----------
@@ -218,7 +219,7 @@ class DisplacementZeroPrior(NuisancePriorSection):
 
 class ObstaclePrior(NuisancePriorSection):
     """Prior of a nuisance parameter: a constant offset of each obstacle along its normal, or along
-    the axis of its displacement, which changes when it touches the body.
+    the axis of its displacement; it changes the time at which the obstacle touches the body.
 
     Attributes
     ----------
@@ -275,7 +276,7 @@ class PressureFactorPrior(NuisancePriorSection):
 
 
 class PressureLostPrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: offset by which each pressure is lower than stated.
+    """Prior of a nuisance parameter: amount by which each pressure is lower than stated.
 
     Attributes
     ----------
@@ -287,8 +288,8 @@ class PressureLostPrior(NuisancePriorSection):
 
 
 class PressureLagPrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: lag of each pressure: the logarithm of its ratio to the stated
-    lag_s.
+    """Prior of a nuisance parameter: logarithm of the ratio of the true lag of each pressure to the
+    stated lag_s.
 
     Attributes
     ----------
@@ -300,8 +301,8 @@ class PressureLagPrior(NuisancePriorSection):
 
 
 class JoiningPrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: delay with which each point mass or force begins or ends, if
-    it does so within the recording.
+    """Prior of a nuisance parameter: delay of the time at which each point mass or force begins or
+    ends, if this time is within the recording.
 
     Attributes
     ----------
@@ -330,8 +331,8 @@ class TarePrior(NuisancePriorSection):
 
 
 class SensorTimePrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: delay of the force sensors; at most three standard
-    deviations.
+    """Prior of a nuisance parameter: delay of the force sensors, limited to three standard
+    deviations of its prior.
 
     Attributes
     ----------
@@ -345,8 +346,8 @@ class SensorTimePrior(NuisancePriorSection):
 
 
 class SensorLagPrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: time constant of a first-order low-pass in the sensor;
-    between zero and three standard deviations of its prior.
+    """Prior of a nuisance parameter: time constant of a first-order low-pass in the sensor, limited
+    to values between zero and three standard deviations of its prior.
 
     Attributes
     ----------
@@ -374,7 +375,7 @@ class ToolPrior(NuisancePriorSection):
 
 class DepthPosePrior(NuisancePriorSection):
     """Prior of a nuisance parameter: rotation of each depth camera about the middle of the body,
-    along the camera's axes.
+    stated along the axes of the camera.
 
     Attributes
     ----------
@@ -419,7 +420,8 @@ class DepthScalePrior(NuisancePriorSection):
 
 
 class DepthTimePrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: delay of a depth camera; at most three standard deviations.
+    """Prior of a nuisance parameter: delay of a depth camera, limited to three standard deviations
+    of its prior.
 
     Attributes
     ----------

@@ -55,7 +55,7 @@ class CustomNuisanceSection(Scoped):
     Attributes
     ----------
     file : str
-        Python file; it is run, which needs --allow-code.
+        Python file; it is executed, for which commands need the option --allow-code.
     row : str
         Name of the NuisanceRow in the file.
     """
@@ -83,12 +83,13 @@ class NuisanceSection(Section):
     calibration_scale : CalibrationScalePrior or "none", optional
         Scale error of all lengths that the cameras measure: the factor minus one: prior.
     calibration_distortion : CalibrationDistortionPrior or "none", optional
-        Radial distortion of first order about the body's middle: a factor 1 + k r²: prior_1_m2.
+        Coefficient k of a radial distortion by the cameras: distances r from the middle of the body
+        are multiplied by 1 + k r²: prior_1_m2.
     time_shift : TimeShiftPrior or "none", optional
-        How much later than stated the markers were measured, on the grasps' clock: prior_s, 5 ms by
-        default.
+        How much later than stated the markers were measured, by the clock of the grasps: prior_s, 5
+        ms by default.
     clock_rate : ClockRatePrior or "none", optional
-        How much slower than the grasps' clock that of the markers runs: prior.
+        How much slower the clock of the markers runs than the clock of the grasps: prior.
     pose : PosePrior or "none", optional
         A constant rotation of grasps and body in the cameras' frame, which rotates gravity in the
         body's frame: prior_rad. A constant translation of grasps and body in the cameras' frame:
@@ -97,17 +98,18 @@ class NuisanceSection(Section):
         A tilt of the direction of gravity: prior_rad, 1° by default.
     hand_eye : HandEyePrior or "none", optional
         A constant rotation of the body in its grasps: prior_rad, 0.5° by default. A constant
-        translation of the body in its grasps; both if the start is an equilibrium and markers
-        measure it: prior_m, 1 mm by default.
+        translation of the body in its grasps; rotation and translation are estimated if the start
+        is an equilibrium and there are markers: prior_m, 1 mm by default.
     strain_zero : StrainZeroPrior or "none", optional
         A constant offset of the strains of a specimen: prior.
     displacement_zero : DisplacementZeroPrior or "none", optional
-        A constant offset of each displacement along each of its axes: prior_m, 0.1 mm by default.
+        A constant offset of each prescribed displacement along each of its axes: prior_m, 0.1 mm by
+        default.
     obstacle : ObstaclePrior or "none", optional
-        A constant offset of each obstacle along its normal, or along the axis of its displacement,
-        which changes when it touches the body: prior_m, 0.1 mm by default. A constant tilt of
-        each obstacle that is a plane or a box, about its point or middle: prior_rad. Delay of each
-        obstacle's motion, to first order: prior_s.
+        A constant offset of each obstacle along its normal, or along the axis of its displacement;
+        it changes the time at which the obstacle touches the body: prior_m, 0.1 mm by default. A
+        constant tilt of each obstacle that is a plane or a box, about the point of the plane or the
+        middle of the box: prior_rad. Delay of each obstacle's motion, to first order: prior_s.
     tension_factor : TensionFactorPrior or "none", optional
         Scale error of the tension of each tendon: the factor minus one: prior.
     tension_lost : TensionLostPrior or "none", optional
@@ -115,33 +117,37 @@ class NuisanceSection(Section):
     pressure_factor : PressureFactorPrior or "none", optional
         Scale error of each pressure: the factor minus one: prior.
     pressure_lost : PressureLostPrior or "none", optional
-        Offset by which each pressure is lower than stated: prior_pa.
+        Amount by which each pressure is lower than stated: prior_pa.
     pressure_lag : PressureLagPrior or "none", optional
-        Lag of each pressure: the logarithm of its ratio to the stated lag_s: prior.
+        Logarithm of the ratio of the true lag of each pressure to the stated lag_s: prior.
     joining : JoiningPrior or "none", optional
-        Delay with which each point mass or force begins or ends, if it does so within the
-        recording: prior_s, 10 ms by default.
+        Delay of the time at which each point mass or force begins or ends, if this time is within
+        the recording: prior_s, 10 ms by default.
     tare : TarePrior or "none", optional
         A constant offset of each component of a force sensor, in multiples of its sigma: prior_sigmas, 10
         by default.
     sensor_time : SensorTimePrior or "none", optional
-        Delay of the force sensors; at most three standard deviations: prior_s, 5 ms by default.
+        Delay of the force sensors, limited to three standard deviations of its prior: prior_s, 5 ms
+        by default.
     sensor_lag : SensorLagPrior or "none", optional
-        Time constant of a first-order low-pass in the sensor; between zero and three
-        standard deviations of its prior: prior_s.
+        Time constant of a first-order low-pass in the sensor, limited to values between zero and
+        three standard deviations of its prior: prior_s.
     tool : ToolPrior or "none", optional
         Mass of the tool between a sensor and the body: prior_kg. Centre of the tool relative to the
-        sensor's point; in the world's frame, relative to that of the grasped nodes: prior_m.
+        point of the sensor; in the frame of the world, relative to the centre of the grasped nodes:
+        prior_m.
     depth_pose : DepthPosePrior or "none", optional
-        Rotation of each depth camera about the middle of the body, along the camera's axes:
-        prior_rad, 5° by default. Translation of each depth camera; if neither is given, the first
-        image is first aligned with the body: prior_m, 20 mm by default.
+        Rotation of each depth camera about the middle of the body, stated along the axes of the
+        camera: prior_rad, 5° by default. Translation of each depth camera; if neither prior is
+        stated, the search begins by aligning the first image with the body: prior_m, 20 mm by
+        default.
     depth_bias : DepthBiasPrior or "none", optional
         Offset that is added to each depth of an image: prior_m, 5 mm by default.
     depth_scale : DepthScalePrior or "none", optional
         Scale error of each depth of an image: the factor minus one: prior, 0.5 % by default.
     depth_time : DepthTimePrior or "none", optional
-        Delay of a depth camera; at most three standard deviations: prior_s, 5 ms by default.
+        Delay of a depth camera, limited to three standard deviations of its prior: prior_s, 5 ms by
+        default.
     depth_edge : DepthEdgePrior or "none", optional
         Distance by which silhouettes in the images of each depth camera end inside the outline of
         the body, in pixels: prior_px, 2 px by default.

@@ -48,7 +48,7 @@ class UncertaintyOptions(ErrorModel):
         Standard deviations of systematic effects, by name; "none" if all are exact, as for a
         simulated recording.
     surface_correlation : float
-        Correlation length of the error of the surface over the longest extent of the body.
+        Correlation length of the error of the surface, divided by the longest extent of the body.
     """
 
     profile: tuple[Text, ...] = ()

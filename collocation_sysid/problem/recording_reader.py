@@ -20,8 +20,6 @@ from ..fem.body import Body
 from ..methods.stiffness_scan import typical_constants
 from ..model.parameters import Parameters
 from ..recording import (
-    Depth,
-    DepthCamera,
     Experiment,
     Gauge,
     Grasp,
@@ -39,10 +37,7 @@ from ..recording import (
 )
 from ..recording.alignment import AlignedRecording
 from ..recording.checked_arrays import point_text
-from ..recording.depth_camera import points_from_image, samples_with_outlines
-from ..recording.formats.depth_files import DepthFileContent, read_depth
 from ..recording.formats.logs import stored_files
-from ..recording.formats.units import METRES_PER_UNIT
 from ..recording.gap_interpolation import interpolation_error
 from ..recording.poses import require_determined_motion
 from ..recording.sample_times import TIME_TOLERANCE_S
@@ -51,7 +46,7 @@ from ..statistics.misspecification.modal_misspecifications import (
     find_misspecifications_by_modes,
 )
 from .bench_files import strain_length_m
-from .code_loader import CodeLoader, existing_file
+from .code_loader import CodeLoader
 from .load_schema import LOADS
 from .marker_tracking import (
     gripper_markers,
@@ -59,10 +54,13 @@ from .marker_tracking import (
     read_marker_tracks,
     transform_to_body_frame,
 )
+from .measurement_section import RecordingFolder
+from .named_files import existing_file
 from .nuisance_schema import nuisance_from_section
 from .problem_size import MOST_SAMPLES, Say, Size, require_feasible
 from .recording_frames import RecordingFrames
 from .recording_schema import (
+    MEASUREMENT_TABLES,
     ExperimentSection,
     ForceSensorSection,
     GraspSection,
@@ -169,7 +167,7 @@ class RecordingReader:
                 self._custom_sensor(k, each, t_s=t_s)
                 for k, each in enumerate(section.reading)
             ],
-            depths=[self._depth(k, t_s) for k in range(len(section.depth))],
+            **self._measurements(t_s),
             markers=self._markers(t_s, aligned.table),
             nuisance=nuisance_from_section(
                 section.nuisance, self.code.nuisance_row
@@ -502,115 +500,24 @@ class RecordingReader:
             )
             return Gauge(t_s=at_s[is_used], values=values[is_used], **arguments)
 
-    def _depth_images(self, k: int) -> tuple[DepthFileContent, Array]:
-        """Return the content of the file or folder of the depth camera with index k, and the times
-        of its images or clouds [s].
-
-        Times are the stated ones, or those of the file; for equilibria, or a single image, without
-        times they are 0, 1, 2, …
-
-        Raises
-        ------
-        InputError
-            If several images of a motion have no times, or the number of times is wrong.
-        """
-        section = self.section.depth[k]
-        file = self.folder / section.file
-        if not file.is_dir():
-            file = existing_file(
-                self.folder, section.file, key=f"depth.{k}.file"
-            )
-        unit_m = METRES_PER_UNIT[section.length_unit]
-        declared_keys = section.camera.model_fields_set
-        depth_file = read_depth(
-            file,
-            section.count_m,
-            length_m=unit_m,
-            known_camera_fields=declared_keys,
+    @property
+    def _recording_folder(self) -> RecordingFolder:
+        """Folder of the files, for tables that read themselves."""
+        return RecordingFolder(
+            self.folder, is_static=self._is_static, add_note=self._add_notes
         )
-        count = len(depth_file.images_m) or len(depth_file.clouds_m)
-        t_s = section.t_s if section.t_s is not None else depth_file.t_s
-        if t_s is None and count > 1 and not self._is_static:
-            message = f"{section.file} does not contain times of its {count} images; expected them in t_s"
-            raise InputError(message, where=f"depth.{k}.t_s")
-        times = (
-            np.arange(float(count))
-            if t_s is None
-            else np.array(t_s, dtype=float).ravel()
-        )
-        if len(times) != count:
-            message = f"found {len(times)} times for {count} images or clouds; expected as many"
-            raise InputError(message, where=f"depth.{k}.t_s")
-        return depth_file, times
 
-    def _depth(self, k: int, t_s: Array) -> Depth:
-        """Return the measurements of the depth camera with index k within the times t_s of the
-        experiment [s], and note how many images are used.
-
-        Images are converted to clouds of points. What the section states about the camera replaces
-        what the file contains.
-
-        Raises
-        ------
-        InputError
-            See `_depth_images`; also if the camera is incomplete or no image is within the times.
+    def _measurements(self, t_s: Array) -> dict[str, list[Any]]:
+        """Return the measurements of all tables that read themselves within the times t_s (T,) of
+        the experiment [s], by the name of the field of `Experiment`.
         """
-        section = self.section.depth[k]
-        where = f"depth.{k}"
-        depth_file, at_s = self._depth_images(k)
-        names = ("matrix", "pose", "distortion")
-        camera_arguments: dict[str, Any] = {
-            name: getattr(depth_file, name) for name in names
+        return {
+            MEASUREMENT_TABLES[key]: [
+                table.read(self._recording_folder, f"{key}.{k}", t_s=t_s)
+                for k, table in enumerate(tables)
+            ]
+            for key, tables in self.section.measurement_tables.items()
         }
-        camera_arguments |= declared_in(
-            section.camera, DepthCamera, where=f"{where}.camera"
-        )
-        if section.camera.poses is not None:
-            file = existing_file(
-                self.folder, section.camera.poses, key=f"{where}.camera.poses"
-            )
-            camera_arguments["poses"] = read_poses(file)
-        with located(where=f"{where}.camera"):
-            camera = DepthCamera(
-                **{
-                    name: value
-                    for name, value in camera_arguments.items()
-                    if value is not None
-                }
-            )
-        with located(where=where):
-            is_used = is_within_experiment(
-                at_s, t_s, name=section.file, is_static=self._is_static
-            )
-            used = np.flatnonzero(is_used).tolist()
-            clouds = (
-                [depth_file.clouds_m[k] for k in used]
-                if depth_file.clouds_m
-                else []
-            )
-            images = []
-            outlined = samples_with_outlines(len(used))
-            for number, sample in enumerate(
-                used if len(depth_file.images_m) else ()
-            ):
-                image = depth_file.images_m[sample]
-                clouds.append(points_from_image(image, camera))
-                images.append(image if number in outlined else None)
-            arguments = {
-                "name": section.name,
-                **declared_in(section, Depth, where=where),
-            }
-            depth = Depth(
-                t_s=at_s[is_used],
-                clouds=clouds,
-                camera=camera,
-                images_m=images,
-                **arguments,
-            )
-        self._add_notes(
-            f"{section.file}: {len(clouds)} of {len(at_s)} images are used"
-        )
-        return depth
 
     def _from_table(self, kind: type, list_key: str, k: int) -> Any:
         """Return the object of a table in a list, such as a tendon or a pressure, on the body.
@@ -724,8 +631,8 @@ class RecordingReader:
         """Return the sample times [s] where no marker file gives them.
 
         They are those of the first existing wrench file if there are no markers, else for
-        equilibria without moving grasps those of all depth images, else those of the longest
-        sequence of poses.
+        equilibria without moving grasps those of all sensors that have times of their own, else
+        those of the longest sequence of poses.
 
         Raises
         ------
@@ -742,9 +649,12 @@ class RecordingReader:
             wrench_sections
             or section.has_markers
             or section.reading
-            or section.depth
+            or section.measurement_tables
         ):
-            message = "nothing is measured: expected markers, a wrench, a reading, or depth"
+            message = (
+                "nothing is measured: expected markers, a wrench, a reading, or "
+                f"{' or '.join(MEASUREMENT_TABLES)}"
+            )
             raise InputError(message, where="markers")
         existing_wrenches = [
             s
@@ -756,17 +666,15 @@ class RecordingReader:
             return self._read_wrench(sensor, self._grasp_key(k, "wrench"))[0]
         if (
             self._is_static
-            and section.depth
+            and section.measurement_tables
             and max(len(each.t_s) for each in poses) < 2
         ):
-            return np.unique(
-                np.concatenate(
-                    [
-                        self._depth_images(k)[1]
-                        for k in range(len(section.depth))
-                    ]
-                )
-            )
+            times_s = [
+                table.read_times_s(self._recording_folder, f"{key}.{k}")
+                for key, tables in section.measurement_tables.items()
+                for k, table in enumerate(tables)
+            ]
+            return np.unique(np.concatenate(times_s))
         times = max(
             (sequence.t_s for sequence in poses), key=len, default=np.zeros(0)
         )

@@ -19,7 +19,6 @@ from ..common.validated_types import (
     Positive,
     Text,
 )
-from ..recording.depth_camera import Background, PoseMatrix
 from ..recording.experiment import EARTH_M_S2, Kind, StartRule
 from ..recording.grasp import Axes
 from ..recording.markers import Places
@@ -27,13 +26,18 @@ from ..recording.node_selection import Nodes
 from ..recording.placement import AttachmentRule
 from ..recording.poses import Frame
 from ..recording.solid_sections import SolidSection
+from .depth_section import DepthSection
 from .load_schema import (
     ForceSection,
     PointMassSection,
     PressureSection,
     TendonSection,
 )
+from .measurement_section import MeasurementSection, NamedSection
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
+
+# Fields of `Experiment` by the key of the tables that read themselves.
+MEASUREMENT_TABLES = {"depth": "depths"}
 
 
 class TransformSection(Section):
@@ -70,14 +74,15 @@ class TableSection(Section):
     Attributes
     ----------
     file : str, optional
-        A table of columns with units; the experiment's file by default.
+        Table whose columns have units; by default the file of the experiment.
     columns : mapping of name to str
         Column of the file for each quantity whose column is not recognised by its name. A unit that
         the file does not state is added to the name, as in "Load (N)".
     axis : {"x", "y", "z"}
         Axis of the world along which a machine measures.
     sign : {1, -1}
-        1, or -1 if positive values in the file point against the axis, as those of a compression.
+        1; or -1 if positive values in the file point against the axis, such as those of a
+        compression from above.
     """
 
     file: Text | None = None
@@ -95,10 +100,10 @@ class TableSection(Section):
 
 
 class DisplacementSection(TableSection):
-    """Translations without rotations from the undeformed position, as of a test bench's crosshead.
+    """Translations without rotations from the undeformed position, such as those of a crosshead.
 
-    Columns t_s and any of x_m, y_m, z_m, in these or other units; or a machine's displacement, or
-    engineering strain with a length.
+    The file has the column t_s and any of x_m, y_m, z_m, in these or other units; or the
+    displacement of a testing machine; or an engineering strain, with length_m.
 
     Attributes
     ----------
@@ -106,9 +111,9 @@ class DisplacementSection(TableSection):
         Undeformed length by which an engineering strain is multiplied [m]; "body" is the length of
         the body along the axis.
     scale : float
-        Factor, above 0, on the displacements of the file: 0.5 for a model of half the height of the
-        specimen, with a plane of symmetry across the loading axis, of which each half takes half of
-        the displacement.
+        Positive factor by which the displacements of the file are multiplied: 0.5 if half the
+        height of the specimen is modelled, with a plane of symmetry across the loading axis,
+        because each half takes half of the displacement.
     """
 
     length_m: Annotated[Literal["body"] | Positive, ByForm(str)] | None = None
@@ -128,10 +133,10 @@ class DisplacementSection(TableSection):
 class ForceSensorSection(TableSection):
     """The measured force and torque that the grasp or the obstacle exerts on the body.
 
-    The table has the column t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, in these or
-    other units; its rate may differ from that of the poses and markers. Or it has the force of a
-    testing machine, or an engineering stress, with area_m2. Blank cells are missing. For a sensor
-    that reports the reaction, the wrench of the body on the grasp or obstacle, set sign = -1.
+    The table has the column t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, in these or other
+    units; its rate may differ from that of the poses and markers. Or it has the force of a testing
+    machine, or an engineering stress, with area_m2. Blank cells are missing values. If the sensor
+    reports the wrench that the body exerts on the grasp or obstacle, set sign = -1.
 
     Attributes
     ----------
@@ -140,21 +145,22 @@ class ForceSensorSection(TableSection):
     sigma_nm : float, optional
         Standard deviation of the noise of each torque [N m]; needed if torques are measured.
     frame : {"world", "grasp"}
-        Axes of the components: those of the poses' world, or "grasp" for those of the undeformed
-        body as the grasp carries it.
+        Axes of the components. "world": those of the world frame of the poses. "grasp": those of
+        the undeformed body, which move with the grasp.
     point_m : list
-        Point [x, y, z] of the torque: fixed in the world, or, in the frame "grasp", on the
-        undeformed body and carried by the grasp.
+        Point [x, y, z] about which the torque is measured. In the frame "world" it is fixed; in the
+        frame "grasp" it is stated on the undeformed body and moves with the grasp.
     sensor_frame : str, optional
-        Frame of the log in which the sensor measures, instead of frame and point_m: the log's
-        static transforms rotate the components to the body, or to the world, and give the point. By
-        default the frame of the messages, if frame and point_m are not stated either.
+        Frame of the log in which the sensor measures, instead of frame and point_m. The static
+        transforms of the log rotate the components to the axes of the body or of the world, and
+        give the point. If neither sensor_frame nor frame nor point_m is stated, the frame of the
+        messages is used.
     area_m2 : float, optional
         Undeformed area by which an engineering stress is multiplied [m²].
     symmetry : int
-        Number of equal parts of the measured specimen of which the mesh is one, such as 4 for a
-        quarter: forces and sigmas are divided by this number, and results are reported for the
-        whole specimen.
+        Number of equal parts into which symmetry divides the measured specimen, if the mesh is one
+        of these parts, such as 4 for a quarter. Forces and sigmas are divided by this number, and
+        results are reported for the complete specimen.
     """
 
     sigma_n: Positive
@@ -207,10 +213,11 @@ class MovedSection(Section):
     Attributes
     ----------
     poses : str, optional
-        File of poses (CSV or .npz). Without poses, displacement and markers there is no motion.
+        File of poses (CSV or .npz). If neither poses nor displacement nor markers are given, there
+        is no motion.
     displacement : Displacement, optional
-        Translations from the undeformed position, as of a crosshead, instead of poses: a file with
-        t_s and any of x_m, y_m, z_m, or a table of file, columns, axis and sign.
+        Translations from the undeformed position, such as those of a crosshead, instead of poses: a
+        file with t_s and any of x_m, y_m, z_m, or a table of file, columns, axis and sign.
     quaternion : {"xyzw", "wxyz"}, optional
         Order of the quaternion's components, if the columns of the poses do not name them.
     length_unit : {"m", "cm", "mm", "in"}, optional
@@ -219,14 +226,15 @@ class MovedSection(Section):
         Position [x, y, z] in the frame of the undeformed body of each marker on the gripper or
         obstacle, by name; the poses are fitted to the tracks of these markers.
     weights : mapping of name to float
-        Weight of each of these markers in the fit of the poses, by name; 1 by default.
+        Weight of each marker in `markers` in the fit of the poses, by name; 1 by default.
     max_residual_m : float, optional
         Residual of the fit of the poses above which a frame is reported [m].
     gripper_to_body : TransformSection, optional
         Pose G of the undeformed body in the frame whose poses U(t) were measured, x = U(t) G X:
         position_m, quaternion_xyzw.
     interpolation : {"smooth", "linear", "hold"}
-        Motion between the samples of poses.
+        Motion between the samples of poses: cubic splines ("smooth"), straight lines ("linear"), or
+        the latest pose ("hold").
     """
 
     poses: Text | None = None
@@ -289,13 +297,13 @@ class GraspSection(MovedSection):
         Last time [s] at which the grasp or obstacle acts; the end of the recording by default. If a
         grasp ends at the first sample, the body is released from its equilibrium in this grasp.
     sigma_m : float, optional
-        Standard deviation of the noise in each position of the poses [m]; estimated from their
-        roughness by default.
+        Standard deviation of the noise in each position of the poses [m]; by default it is
+        estimated from the roughness of the poses.
     sigma_rad : float, optional
-        Standard deviation of the noise in each rotation, about each axis [rad]; estimated from the
-        roughness of the poses by default.
+        Standard deviation of the noise in each rotation, about each axis [rad]; by default it is
+        estimated from the roughness of the poses.
     axes : {"x", "y", "z", "xy", "xz", "yz", "xyz"}
-        Axes of the world along which the nodes are prescribed; they slide along the others.
+        Axes of the world along which the nodes are held; along the other axes they slide freely.
     wrench : ForceSensorSection, optional
         Measured force and torque on the body: file, sigma_n, sigma_nm, …
     """
@@ -325,13 +333,13 @@ class ObstacleSection(MovedSection):
         Last time [s] at which the grasp or obstacle acts; the end of the recording by default. If a
         grasp ends at the first sample, the body is released from its equilibrium in this grasp.
     sigma_m : float, optional
-        Standard deviation of the noise in each position of the poses [m]; estimated from their
-        roughness by default.
+        Standard deviation of the noise in each position of the poses [m]; by default it is
+        estimated from the roughness of the poses.
     sigma_rad : float, optional
-        Standard deviation of the noise in each rotation, about each axis [rad]; estimated from the
-        roughness of the poses by default.
+        Standard deviation of the noise in each rotation, about each axis [rad]; by default it is
+        estimated from the roughness of the poses.
     axes : {"x", "y", "z", "xy", "xz", "yz", "xyz"}
-        Axes of the world along which the nodes are prescribed; they slide along the others.
+        Axes of the world along which the nodes are held; along the other axes they slide freely.
     shape : SolidSection
         Plane, Sphere, Cylinder, Capsule or Cuboid.
     name : str, optional
@@ -349,8 +357,8 @@ class ObstacleSection(MovedSection):
         Gap δ at which the pressure begins [m]; by default the mean edge of the face over 5000, or
         over 500 with friction.
     slip : float, optional
-        Sliding speed [m/s], or slip from sample to sample [m] of a static experiment, at which
-        friction is 0.7 of its limit.
+        Sliding speed [m/s] at which friction is 0.7 of its limit; in a static experiment, sliding
+        distance from sample to sample [m].
     force : ForceSensorSection, optional
         Measured force on the body: file, sigma_n, …
     """
@@ -386,7 +394,8 @@ class MarkersSection(Section):
     Attributes
     ----------
     places : {"free", "surface"}
-        Estimated positions on the undeformed body: anywhere in it, or on its surface.
+        Where the estimated positions of markers may be: anywhere in the undeformed body ("free"),
+        or on its surface ("surface").
     attach : {"auto", "vertex", "embedded"}
         Nodes that carry a marker. "vertex": the nearest node. "embedded": the nodes of the
         tetrahedron that contains the marker or is nearest to it. "auto": the nearest node if it
@@ -394,8 +403,7 @@ class MarkersSection(Section):
     max_distance_m : float, optional
         Largest distance of a marker from the body; the mean edge length by default.
     file : str, optional
-        Marker tracks: C3D, TRC, Qualisys TSV, Motive CSV or plain CSV; only `simulate` can do
-        without.
+        Marker tracks: C3D, TRC, Qualisys TSV, Motive CSV or plain CSV; not needed for `simulate`.
     sigma_m : Sigma
         Standard deviation of the noise of each coordinate [m], for all markers or by marker name.
     names : list of str, optional
@@ -403,7 +411,7 @@ class MarkersSection(Section):
     labels : mapping of name to str
         Marker name for each label in the file, by label.
     weights : mapping of name to float
-        Weight in the loss by marker name, 1 by default; 0 leaves the marker out.
+        Weight of each marker in the loss, by name, 1 by default; 0 excludes the marker.
     length_unit : {"m", "cm", "mm", "in"}, optional
         Unit of the coordinates, if the file does not state it.
     rate_hz : float, optional
@@ -412,15 +420,16 @@ class MarkersSection(Section):
         Position [x, y, z] in the body's frame of at least three markers, by name; all tracks are
         moved by the rigid motion that fits these markers to their positions.
     template_window_s : list, optional
-        First and last time [start, end] to average for the template.
+        First and last time [start, end] of the window in which the markers are at the positions in
+        template_m; their tracks are averaged over it.
     max_template_residual_m : float, optional
-        Largest allowed distance of a marker from its position in the template [m].
+        Largest allowed distance of a marker from its position in template_m after this motion [m].
     reference_m : mapping of name to (3,) array
-        Position [x, y, z] of each marker on the undeformed body, by name; those of other markers
-        are estimated.
+        Position [x, y, z] of each marker on the undeformed body, by name; the positions of other
+        markers are estimated.
     reference_sigma_m : ReferenceSigma, optional
-        Standard deviation of the positions in reference_m, for all or by marker name; 0 for exact
-        positions. That of nuisance.marker_offsets by default.
+        Standard deviation of the positions in reference_m, for all markers or by marker name; 0 for
+        exact positions. By default it is the prior of nuisance.marker_offsets.
     """
 
     places: Places = "free"
@@ -463,29 +472,7 @@ class MarkersSection(Section):
         return self
 
 
-def _require_file_name(name: str) -> str:
-    r"""Return a name unchanged if it can be part of a file name on every platform: printable, not
-    empty, no leading dot, and none of / \ : * ? " < > |; raise `ValueError` otherwise.
-    """
-    if (
-        not name.isprintable()
-        or name[:1] in ("", ".")
-        or any(mark in name for mark in '/\\:*?"<>|')
-    ):
-        raise ValueError(
-            f"found {name!r}; expected a valid file name: not empty, no leading dot, none of / \\ "
-            ': * ? " < > |'
-        )
-    return name
-
-
 Grasps = Annotated[list[GraspSection] | GraspSection, ByForm(list)]
-
-
-class NamedSection(Section):
-    """Table with a name that is also part of file names."""
-
-    name: Annotated[str, AfterValidator(_require_file_name)]
 
 
 class ReadingSection(NamedSection):
@@ -494,30 +481,33 @@ class ReadingSection(NamedSection):
     Attributes
     ----------
     name : str
-        Name in error bars, and of the file that `simulate` writes.
+        Name of the sensor in results, and of the file that `simulate` writes.
     sigma : float
-        Standard deviation of the noise of each number, in its unit.
+        Standard deviation of the noise of each measured number, in the unit of that number.
     points_m : list
-        Places [x, y, z] on the undeformed body whose motion the sensor measures.
+        Points [x, y, z] on the undeformed body whose motion the sensor measures.
     unknowns : mapping of name to float
-        Prior standard deviation of each unknown of the sensor, about zero, by the argument's name;
-        none by default. Write an unknown factor as ``1 + gain``. In a simulation unknowns are zero.
+        Prior standard deviation of each unknown of the sensor, by the name of the argument of the
+        function; no unknowns by default. The prior mean is zero: write an unknown factor as ``1 +
+        gain``. In a simulation all unknowns are zero.
     grasp : int, optional
         Instead of points: the number of the grasp, from 1, whose force and torque the sensor
         measures.
     frame : {"world", "grasp"}
-        Axes and origin of force and torque: those of the undeformed body as the grasp carries it,
-        or the poses' world.
+        Axes and origin of force and torque. "grasp": those of the undeformed body, which move with
+        the grasp. "world": those of the world frame of the poses.
     columns : list of str
-        Columns of the numbers in the file, in their order; all besides t_s by default.
+        Columns of the file with the measured numbers, in the order in which the function returns
+        them; by default all except t_s.
     unit : str
         Unit of the numbers, for the terminal, reports and figures.
     code : str
-        Python file; it is run, which needs --allow-code.
+        Python file; it is executed, for which commands need the option --allow-code.
     function : str
-        Name of the function in it.
+        Name of the function in the Python file.
     file : str, optional
-        Measured values: a column t_s, and one for each number; only `simulate` can do without.
+        Table of the measured values with a column t_s, and one column for each number; not needed
+        for `simulate`.
     """
 
     sigma: Positive
@@ -532,88 +522,6 @@ class ReadingSection(NamedSection):
     file: Text | None = None
 
 
-class DepthCameraSection(Section):
-    """A depth camera, or the frame of a scanner; keys that an .npz or a log contains may be left
-    out.
-
-    Attributes
-    ----------
-    matrix : list, optional
-        Pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs none; with it
-        a bias and a scale of the depth are estimated, and surfaces that face away are left out.
-    distortion : list
-        k1, k2, p1, p2, k3 of the model of Brown and Conrady.
-    pose : list, optional
-        From the camera's frame to the world, or, with `poses`, to the frame that these move
-        (hand–eye transform).
-    poses : str, optional
-        File of poses of the body that carries the camera; it is at rest by default.
-    """
-
-    matrix: tuple[Vector, Vector, Vector] | None = None
-    distortion: list[Finite] = Field([])
-    pose: PoseMatrix | None = None
-    poses: Text | None = None
-
-
-class DepthSection(NamedSection):
-    """Depth images or point clouds of the body from a camera or a scanner, without labels.
-
-    Attributes
-    ----------
-    name : str
-        Name in messages, error bars and pictures.
-    sigma_m : float
-        Standard deviation of the noise along the normal of the surface.
-    spacing_m : float
-        Points are thinned to about this distance, as the noise of neighbouring pixels is
-        correlated.
-    gate_m : float
-        Points farther than this from the surface are taken to belong to something else and are left
-        out.
-    faces : Nodes, optional
-        Faces that may be visible: those whose corners are all selected. All by default.
-    background : {"auto", "empty", "unknown"}
-        Meaning of a pixel without a depth. "empty": nothing is there, so that the body cannot be
-        there. "unknown": anything may be there, as where the sensor gets no echo from dark or steep
-        surfaces. "auto": "empty" in images where hardly any pixel shows something far behind the
-        body, otherwise "unknown". A measured depth well behind the body shows in either case that
-        the body is not there.
-    outline_sigma_px : float
-        Standard deviation [pixels] of the distance between the body's outline and the edge of its
-        silhouette in an image, at points of the outline that are `spacing_m` apart. Rounding to
-        pixels alone gives 0.3.
-    file : str
-        Depth images (.npz, .png of 16 bits, .exr) or clouds of points (.ply, .pcd, .npy, .xyz), or
-        a folder of these in the order of their names, with times.csv or t_s; or a topic of a log,
-        ``run.mcap#/camera/depth/image_rect_raw``.
-    camera : DepthCameraSection
-        Pose and projection of the camera.
-    t_s : list of float, optional
-        Times [s], if the file does not contain them; a single image is assigned to the first sample
-        by default.
-    count_m : float, optional
-        Depth of one count of an image, 0.001 by default.
-    length_unit : {"m", "cm", "mm", "in"}
-        Unit of clouds.
-    """
-
-    name: Annotated[str, AfterValidator(_require_file_name)] = "depth"
-    sigma_m: Positive
-    spacing_m: Positive = 0.004
-    gate_m: Positive = 0.01
-    faces: Nodes | None = None
-    background: Background = "auto"
-    outline_sigma_px: Positive = 0.5
-    file: Text
-    camera: DepthCameraSection = Field(
-        default_factory=lambda: DepthCameraSection.model_construct()
-    )
-    t_s: list[Finite] | None = None
-    count_m: Positive | None = None
-    length_unit: Unit = "m"
-
-
 class ExperimentSection(NamedSection):
     """One recording.
 
@@ -625,15 +533,17 @@ class ExperimentSection(NamedSection):
         Frame of the log in whose axes gravity_m_s2 is stated, such as "base_link"; it must be fixed
         in the frame of the poses by static transforms. The frame of the poses by default.
     kind : {"dynamic", "static"}
-        A motion ("dynamic"); or samples each of which is an equilibrium of its own ("static"), at
-        any times (with memory, quasi-static in time).
+        "dynamic": a motion. "static": each sample is an equilibrium, and a material with memory
+        relaxes between the samples.
     start : {"equilibrium", "undeformed"}
-        State at the first time: at rest under its loads; or undeformed and at rest.
+        State of the body at the first time. "equilibrium": at rest under its loads. "undeformed":
+        undeformed and at rest.
     start_rule : {"standard", "paper"}
-        Inertia of the first step: from the starting velocity, or zero acceleration.
+        Inertia in the first time step. "standard": from the initial velocity. "paper": zero
+        acceleration.
     loaded_since_s : float, optional
-        How long a body with memory has been in the shape of its equilibrium; by default it has
-        relaxed completely.
+        How long a body with memory has been in the shape of its initial equilibrium [s]; by default
+        the material is completely relaxed.
     validation : bool
         Whether the recording is only predicted, not fitted.
     mass : list of PointMassSection
@@ -645,19 +555,20 @@ class ExperimentSection(NamedSection):
     pressure : list of PressureSection
         [[experiment.pressure]] tables: pressures in cavities, or on patches whose rim is held.
     file : str, optional
-        Table of displacements and wrenches that name no file of their own: CSV as a test bench
-        writes it.
+        Table of the measurements of all displacements and wrenches that do not name a file of their
+        own: CSV as a test bench writes it.
     grasp : Grasps
         A table of nodes and poses, or a list of them.
     obstacle : list of ObstacleSection
         [[experiment.obstacle]] tables: rigid solids that the body may touch.
     markers : MarkersSection
-        Tracked points; none are needed where the wrench of a grasp is measured.
+        Tracked points; not needed if the wrench of a grasp is measured.
     window_s : list, optional
         First and last time to use [start, end].
     resample_hz : float, optional
-        Interpolate the markers linearly to this rate [Hz]. By default samples have the frame rate,
-        lost frames are missing samples, and the model is evaluated at the time of each frame.
+        Rate to which the markers are interpolated linearly [Hz]. By default the samples have the
+        frame rate, lost frames are missing samples, and the model is evaluated at the time of each
+        frame.
     every : int
         Use every n-th sample of the markers.
     reading : list of ReadingSection
@@ -665,7 +576,8 @@ class ExperimentSection(NamedSection):
     depth : list of DepthSection
         [[experiment.depth]] tables: depth cameras and scanners.
     nuisance : NuisanceOrNone
-        What is estimated of this recording alone, as a table; or "none".
+        Table of the nuisance parameters of this recording with their priors; or "none" to estimate
+        no nuisance parameters.
     """
 
     gravity_m_s2: Vector = EARTH_M_S2
@@ -706,12 +618,17 @@ class ExperimentSection(NamedSection):
         return table and (table.file or self.file)
 
     def list_measurement_files(self) -> list[str | None]:
-        """Return the files of markers, custom sensors, depth cameras, grasps and obstacles; None
-        for those that are not named.
+        """Return the files of markers, sensors, grasps and obstacles; None for those that are not
+        named.
         """
         names = [
             self.markers.file,
-            *(each.file for each in (*self.reading, *self.depth)),
+            *(each.file for each in self.reading),
+            *(
+                each.file
+                for key in MEASUREMENT_TABLES
+                for each in getattr(self, key)
+            ),
         ]
         for grasp in self.moved_sections:
             names += [
@@ -719,6 +636,12 @@ class ExperimentSection(NamedSection):
                 self.file_of(grasp.sensor),
             ]
         return names
+
+    @property
+    def measurement_tables(self) -> dict[str, list[MeasurementSection]]:
+        """Tables that read themselves by their key, of those keys that have any."""
+        tables = {key: getattr(self, key) for key in MEASUREMENT_TABLES}
+        return {key: listed for key, listed in tables.items() if listed}
 
     @property
     def grasp_list(self) -> list[GraspSection]:

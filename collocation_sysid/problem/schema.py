@@ -50,7 +50,7 @@ class CodeSection(Section):
     Attributes
     ----------
     file : str
-        Python file; it is run, which needs --allow-code.
+        Python file; it is executed, for which commands need the option --allow-code.
     function : str
         Name of the energy function in the file.
     """
@@ -72,8 +72,8 @@ class NodeForceSection(CodeSection):
         "nodes": the force acts on the selected nodes. "faces": it acts on the faces of the surface
         all of whose nodes are selected.
     carries : int
-        Number of internal variables of each node or face from step to step: the function gets them
-        after v, and returns the force and those for the next step.
+        Number of internal variables of each node or face. The function gets their previous values
+        as the argument after v, and returns the force and their new values.
     """
 
     nodes: Nodes | None = None
@@ -87,20 +87,22 @@ class FieldSection(Section):
     Attributes
     ----------
     length_m : float or list
-        Correlation length: places at this distance have the correlation 1/e. Of several lengths the
-        most likely one is used.
+        Correlation length: two points at this distance have the correlation 1/e. If several lengths
+        are given, the most likely one is used.
     parameter : str
         Constant that varies: one of the material or of its damping law, young_pa for all moduli of
         a material together, or density_kg_m3.
     modes : int
-        Number of shapes of the field; one more costs as much as one more right-hand side.
+        Number of shapes of the field. Each shape adds one right-hand side to the linear system of
+        every time step.
     amplitude : float, optional
-        Prior standard deviation of the logarithm, 0.5 by default; for a density that of the ratio
-        to its stated value, 0.3 by default. With prior = "two-phase", the prior standard deviation
-        of the logarithm of the contrast, 1 by default.
+        Prior standard deviation of the logarithm of the constant, 0.5 by default; for a density,
+        prior standard deviation of its ratio to the stated density, 0.3 by default. With prior =
+        "two-phase", the prior standard deviation of the logarithm of the contrast, 1 by default.
     prior : {"smooth", "two-phase"}
-        "smooth": the logarithm is a normal field. "two-phase": two materials with a boundary
-        between them; the parameter contrast is the ratio of inclusions to surroundings.
+        "smooth": the logarithm of the constant is a smooth normal field. "two-phase": the constant
+        has two values with a boundary between them; the parameter contrast is the ratio of the
+        value in inclusions to that in the surroundings.
     """
 
     length_m: Lengths
@@ -114,15 +116,15 @@ Material = Annotated[MaterialName | CodeSection, ByForm(str)]
 
 
 class RegionSection(Section):
-    """Cells with other properties; its parameters begin with its name.
+    """A part of the body with other properties. The names of its parameters begin with its name.
 
     Attributes
     ----------
     name : str
         Name, made of letters, digits, - and _.
     cells : ElementNodes
-        Selection of cells, by their centres: a table of box_m, ball_m or indices, or the name of a
-        cell array or of a physical group.
+        Elements of the region, selected by their centres: a table of box_m, ball_m or indices, or
+        the name of a cell array or of a physical group.
     field : FieldSection, optional
         A constant that varies in space within the region.
     """
@@ -136,7 +138,8 @@ class RegionSection(Section):
 
 
 class PronySection(Section):
-    """A branch of the material's memory; its parameters are prony_1.share and prony_1.tau_s.
+    """A branch of the material's memory. The parameters of a branch with the name prony_1 are
+    prony_1.share and prony_1.tau_s.
 
     Attributes
     ----------
@@ -151,12 +154,12 @@ class PronySection(Section):
 
 
 class CylinderSection(Section):
-    """An upright cylinder, its base on z = 0 about the origin.
+    """An upright cylinder, whose base is in the plane z = 0 with its centre at the origin.
 
     Attributes
     ----------
     quarter : bool
-        Only its part x, y ≥ 0, between planes of symmetry.
+        Whether to mesh only the quarter x ≥ 0, y ≥ 0 between planes of symmetry.
     """
 
     diameter_m: Positive
@@ -172,7 +175,8 @@ class ScanSection(Section):
     nodes : ElementNodes
         Selection of the nodes that were held: those in a clamp or on a table.
     gravity_m_s2 : list
-        Gravity in the axes of the mesh; its direction is the pose of the scan.
+        Gravity during the scan, along the axes of the mesh; its direction states the orientation in
+        which the object was scanned.
     """
 
     nodes: Nodes
@@ -201,16 +205,16 @@ class ObjectSection(Section):
     length_unit : {"m", "cm", "mm", "in"}
         Unit of the coordinates in the file.
     mass_kg : float, optional
-        Weighed mass of the whole object [kg]. Left out if density_kg_m3 is stated here or is a
+        Weighed mass of the complete object [kg]. Omit it if density_kg_m3 is stated here or is a
         parameter.
     density_kg_m3 : float, optional
         Uniform density [kg/m³], instead of the mass.
     material : Material
-        A material's name, or a table of file and function.
+        Name of a built-in material, or a table with the file and the function of a custom one.
     damping : DampingName
-        Law of the damping γ_r. "kelvin-voigt": a viscous stress in the current shape. "material": a
-        viscous stress by the rate of the Green strain, as in MuJoCo. "rayleigh": the law of the
-        paper, which also damps rigid rotation.
+        Damping law, whose constant is γ_r. "kelvin-voigt": viscous stress proportional to the rate
+        of deformation. "material": viscous stress proportional to the rate of the Green strain, as
+        in MuJoCo. "rayleigh": the law of the paper, which also damps rigid rotation.
     region : list of RegionSection
         [[object.region]] tables: parts of the body with other properties.
     prony : list of PronySection
@@ -220,9 +224,10 @@ class ObjectSection(Section):
     field : FieldSection, optional
         A constant that varies in space: parameter, length_m, modes, amplitude.
     rest_shape : {"stress_free", "under_gravity"}, optional
-        Whether the mesh is free of stress, or the shape in which the object hung or stood under its
-        own weight while it was scanned; not known by default, which widens the intervals of a mesh
-        from a file.
+        "stress_free": the mesh has the shape without stress. "under_gravity": the mesh has the
+        shape in which the object hung or stood under its own weight while it was scanned. By
+        default the mesh counts as stress-free, but the intervals for a mesh from a file include the
+        possibility that it is not.
     scan : ScanSection, optional
         Gravity and held nodes during the scan: gravity_m_s2, nodes.
     evaluator : {"auto", "simd", "casadi"}
@@ -326,18 +331,19 @@ class ParameterSection(Section):
     guess : float, optional
         Value at which the search starts; found by a scan of the stiffness by default.
     lower, upper : float, optional
-        Bounds of the estimate; those of the constant by default.
+        Lower and upper bound of the estimate; by default the bounds of the constant.
     scale : {"log", "linear"}, optional
-        Whether the logarithm of a positive parameter is estimated, or the value of any sign.
+        "log": the logarithm of a positive parameter is estimated. "linear": the value itself is
+        estimated, which may have any sign.
     typical : float, optional
         Typical change of a linear parameter in one step of the solver; by default that of its
         constant, or else the guess.
     fixed : float, optional
         Value that is not estimated.
     tied_to : str, optional
-        Parameter that this one is a multiple of.
+        Name of the parameter of which this one is a multiple.
     ratio : float, optional
-        Ratio of this parameter to that of `tied_to`, 1 by default.
+        Ratio of this parameter to the parameter in `tied_to`, 1 by default.
     """
 
     guess: Finite | None = None
@@ -430,7 +436,8 @@ class TranscriptionSection(Section):
         Number of time steps between samples. "auto": one, or more (up to 8) if one step would
         change a parameter by more than half a standard error.
     explicit_grasps : bool
-        Grasped nodes as constraint rows (the paper's c^g) instead of bounds.
+        Whether the positions of grasped nodes are constraints of the program (c^g in the paper)
+        instead of bounds.
     """
 
     scheme: SchemeName = "midpoint"
@@ -460,7 +467,7 @@ class RolloutSection(Section, RolloutOptions):  # pyright: ignore[reportGeneralT
 
 
 class AssumptionsSection(Section, Assumptions):  # pyright: ignore[reportGeneralTypeIssues]
-    """Standard deviations of systematic effects; "none" for what is exact."""
+    """Standard deviations of systematic effects; "none" for an effect that is exactly zero."""
 
 
 class UncertaintySection(Section, UncertaintyOptions):  # pyright: ignore[reportGeneralTypeIssues]

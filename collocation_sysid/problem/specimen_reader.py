@@ -24,7 +24,7 @@ from ..recording.specimen_files import (
     read_specimen,
 )
 from ..recording.specimen_hysteresis import loading_rows
-from .code_loader import existing_file
+from .named_files import existing_file
 from .specimen_schema import SpecimenSection, deviation
 
 # Strain of the first sample, over the largest, above which a memory's unknown past matters.

@@ -17,7 +17,7 @@ from ..common.validated_types import (
 )
 from ..recording.homogeneous_deformation import TESTS
 from ..recording.specimen import AREA_ERROR, LATERAL_SIGMA, STRAIN_ZERO
-from .recording_schema import NamedSection
+from .measurement_section import NamedSection
 
 Prior = Annotated[Literal["none"] | Positive, ByForm(str)]
 
@@ -37,23 +37,26 @@ class SpecimenSection(NamedSection):
     file : str
         Table with a row for each sample, in the order of time.
     columns : mapping of name to str
-        Column of the file by quantity (stretch, strain, displacement, stress, force, pressure,
-        lateral_stretch, …, t), where its name is not recognised; with a unit behind, "Load (N)",
-        that the file does not state.
+        Column of the file for each quantity (stretch, strain, displacement, stress, force,
+        pressure, lateral_stretch, …, t) whose column is not recognised by its name. A unit that the
+        file does not state is added to the name, as in "Load (N)".
     strain_sign : {1, -1}
-        -1 where strains or displacements are positive in compression.
+        -1 if the strains or displacements in the file are positive in compression.
     stress_sign : {1, -1}
-        -1 where stresses or forces are positive in compression.
+        -1 if the stresses or forces in the file are positive in compression.
     stress : {"engineering", "true"}
-        Area by which the force was divided: that of the undeformed or of the deformed specimen.
+        "engineering": the stress is the force over the undeformed area. "true": it is the force
+        over the deformed area.
     length_m : float, optional
-        Undeformed length that divides a displacement; of a shear test the gap.
+        Undeformed length by which a displacement is divided; in a shear test, the height of the
+        gap.
     area_m2 : float, optional
-        Undeformed area that divides a force.
+        Undeformed area by which a force is divided.
     sigma_pa : float, optional
         Standard deviation of the noise of the stress.
     sigma_n : float, optional
-        In its place that of the force, which area_m2 divides.
+        Standard deviation of the noise of the force, which is divided by area_m2; instead of
+        sigma_pa.
     lateral_sigma : float
         Standard deviation of the noise of the lateral stretch.
     strain_zero : float or "none"
@@ -63,10 +66,12 @@ class SpecimenSection(NamedSection):
     stress_zero_pa : float or "none"
         Standard deviation of a constant offset of the stress, which is estimated.
     skip_cycles : int
-        Number of first loading cycles to leave out, in which rubber softens (Mullins).
+        Number of loading cycles at the beginning that are excluded, because rubber softens in them
+        (Mullins effect).
     branch : {"both", "loading"}
-        Part of the cycles: all samples, or only those of the last cycle in which the strain
-        increases in magnitude, without the unloading, which is softer (hysteresis).
+        "both": all samples are used. "loading": only those samples of the last cycle are used in
+        which the magnitude of the strain increases, because the stress during unloading is smaller
+        (hysteresis).
     window_s : list, optional
         First and last time to use [start, end].
     every : int

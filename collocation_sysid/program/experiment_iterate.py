@@ -214,15 +214,6 @@ class ExperimentIterate:
             )
         return linearised
 
-    def predict_wrenches(self) -> list[Array]:
-        """Return the prediction (S, 6) for each force–torque sensor [N, N m]; NaN at samples for
-        which the rows of x do not suffice.
-        """
-        return [
-            sensor.predict_reactions(self.reactions, self.phi)
-            for sensor in self.segment.sensors
-        ]
-
     @cached_property
     def forces(self) -> Linearisation:
         """Forces at the evaluations with their derivatives; stored in the segment's

@@ -8,7 +8,6 @@ implementation is in the package `depth`, their interface in `correspondences`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -103,7 +102,7 @@ def residuals_of_points(
         assert isinstance(each, SurfaceCorrespondences)
         points.append(
             DepthResidual.from_correspondences(
-                replace(each, camera=camera),
+                each.with_camera(camera),
                 at_s,
                 nuisance=nuisance,
                 huber=huber,

@@ -10,6 +10,7 @@ motion.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -266,6 +267,15 @@ def wrench_residuals(
             )
         )
     return tuple(models)
+
+
+def predict_wrenches(
+    sensors: Sequence[WrenchResidual], reactions: ReactionForces, phi: Array
+) -> list[Array]:
+    """Return the predictions (S, 6) of sensors [N, N m] from the reaction forces of a motion at φ
+    (k,); NaN at samples for which the times of the reactions do not suffice.
+    """
+    return [sensor.predict_reactions(reactions, phi) for sensor in sensors]
 
 
 def without_grasp_sensors(experiment: Experiment) -> Experiment:

@@ -5,7 +5,7 @@ force.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, cast
 
 import casadi as ca
@@ -21,6 +21,7 @@ from ..errors import InputError
 from .checked_arrays import read_only_floats
 from .poses import Frame
 from .sample_times import first_unordered_time
+from .separate_sensor import SeparateSensor
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ GRASP_INPUTS = ("force_n", "torque_nm")
 
 
 @declaration
-class Gauge:
+class Gauge(SeparateSensor):
     """A custom sensor: its reading is an expression of a few points of the body, or of a grasp.
 
     Parameters
@@ -68,20 +69,22 @@ class Gauge:
         Measured values; NaN where missing. None before they are measured or simulated: such a
         sensor can be simulated, but a problem that contains it cannot be solved.
     sigma : float
-        Standard deviation of the noise of each number, in its unit.
+        Standard deviation of the noise of each measured number, in the unit of that number.
     points_m : (P, 3) array, optional
-        Places [x, y, z] on the undeformed body whose motion the sensor measures.
+        Points [x, y, z] on the undeformed body whose motion the sensor measures.
     unknowns : mapping of name to float
-        Prior standard deviation of each unknown of the sensor, about zero, by the argument's name;
-        none by default. Write an unknown factor as ``1 + gain``. In a simulation unknowns are zero.
+        Prior standard deviation of each unknown of the sensor, by the name of the argument of the
+        function; no unknowns by default. The prior mean is zero: write an unknown factor as ``1 +
+        gain``. In a simulation all unknowns are zero.
     grasp : int, optional
         In place of points: the number of the grasp, counted from 1, whose force and torque the
         sensor measures; obstacles count after the grasps.
     frame : {"grasp", "world"}
-        Axes and origin of force and torque: those of the undeformed body as the grasp carries it,
-        or the poses' world.
+        Axes and origin of force and torque. "grasp": those of the undeformed body, which move with
+        the grasp. "world": those of the world frame of the poses.
     columns : sequence of str, optional
-        Columns of the numbers in the file, in their order; all besides t_s by default.
+        Columns of the file with the measured numbers, in the order in which the function returns
+        them; by default all except t_s.
     unit : str
         Unit of the numbers, for the terminal, reports and figures.
 
@@ -93,6 +96,8 @@ class Gauge:
     """
 
     description_name: ClassVar[str] = "reading"
+    measurement_text: ClassVar[str] = "readings"
+    noise_key: ClassVar[str] = "sigma of the readings"
 
     name: str
     expression: Callable[..., Any]
@@ -209,6 +214,17 @@ class Gauge:
     def is_measured(self) -> NDArray[np.bool_]:
         """(S, m) whether each value is measured."""
         return np.isfinite(self.measured_values)
+
+    def without_later_values(self, end_s: float) -> Gauge:
+        """Return a copy with measurements after `end_s` [s] replaced by NaN; self if none would
+        remain.
+        """
+        values = np.where(
+            (self.sample_times_s > end_s)[:, None], np.nan, self.measured_values
+        )
+        return (
+            replace(self, values=values) if np.isfinite(values).any() else self
+        )
 
     # The expression ---------------------------------------------------------------------------
 

@@ -22,7 +22,8 @@ from ..fem.meshes.selection import Selection
 from .checked_arrays import read_only_floats
 from .node_selection import Nodes, selection_from_section
 from .poses import PoseSequence
-from .sample_times import TIME_TOLERANCE_S, first_unordered_time
+from .sample_times import first_unordered_time
+from .separate_sensor import SeparateSensor
 
 MatrixRow = tuple[Finite, Finite, Finite, Finite]
 PoseMatrix = tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
@@ -33,6 +34,8 @@ UNDISTORTION_ITERATIONS = 12
 # Largest number of images of a recording whose outlines are compared: they are stored in memory,
 # and one of 640 x 480 pixels takes 1.2 MB.
 MOST_OUTLINE_IMAGES = 40
+# Factor by which the distance of thinned points grows until there are few enough.
+SPACING_FACTOR = 1.2
 
 Background = Literal["auto", "empty", "unknown"]
 
@@ -53,13 +56,14 @@ class DepthCamera:
     Parameters
     ----------
     matrix : (3, 3) array, optional
-        Pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs none; with it
-        a bias and a scale of the depth are estimated, and surfaces that face away are left out.
+        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs
+        no matrix; if it has one, an offset and a scale error of the depth are estimated, and
+        surfaces that face away from the camera are not used.
     distortion : sequence of up to five numbers
         k1, k2, p1, p2, k3 of the model of Brown and Conrady.
     pose : (4, 4) array
-        From the camera's frame to the world, or, with `poses`, to the frame that these move
-        (hand–eye transform).
+        Transform from the frame of the camera to the world or, with `poses`, to the frame whose
+        poses these are (hand–eye transform).
     poses : PoseSequence, optional
         Motion of the frame that carries the camera; at rest by default.
 
@@ -199,7 +203,7 @@ def _require_selection(faces: Any) -> Selection:
 
 
 @declaration
-class Depth:
+class Depth(SeparateSensor):
     """Depth images, or clouds of points of a body, of one camera, one for each sample time.
 
     Parameters
@@ -214,11 +218,11 @@ class Depth:
         Standard deviation of the noise along the normal of the surface.
     camera : DepthCamera
     spacing_m : float
-        Points are thinned to about this distance, as the noise of neighbouring pixels is
-        correlated.
+        Approximate distance to which the points are thinned, because the noise of neighbouring
+        pixels is correlated.
     gate_m : float
-        Points farther than this from the surface are taken to belong to something else and are left
-        out.
+        Distance from the surface beyond which points are assumed to belong to other objects and are
+        not used.
     faces : Selection, optional
         Faces that may be visible: those whose corners are all selected. All by default.
     background : {"auto", "empty", "unknown"}
@@ -243,6 +247,10 @@ class Depth:
     """
 
     description_name: ClassVar[str] = "depth camera"
+    measurement_text: ClassVar[str] = "points of depth cameras"
+    noise_key: ClassVar[str] = "sigma_m of depth"
+    points_name: ClassVar[str] = "depth points"
+    measures_shape: ClassVar[bool] = True
 
     name: str
     t_s: Any
@@ -435,6 +443,33 @@ class Depth:
             images_m=images_m,
         )
 
+    def needed_until_s(self, fewest: int) -> float:
+        """Return the time [s] by which a sample has points, and of as many samples as there are up
+        to the number `fewest`.
+        """
+        last = max(fewest - 1, self.find_first_sample_with_points())
+        return float(
+            self.sample_times_s[min(last, len(self.sample_times_s) - 1)]
+        )
+
+    @property
+    def point_counts(self) -> list[int]:
+        """Numbers of points of each sample."""
+        return [*map(len, self.clouds)]
+
+    def thinned(self, most: int) -> Depth:
+        """Return a copy whose clouds have at most `most` points each, at least one.
+
+        Points are selected as on construction, at a larger distance, which also applies to the
+        points of outlines; measured values are not averaged.
+        """
+        spacing_m = self.spacing_m * np.sqrt(max(self.point_counts) / most)
+        thinned = replace(self, spacing_m=spacing_m)
+        while max(thinned.point_counts) > most:
+            spacing_m *= SPACING_FACTOR
+            thinned = replace(self, spacing_m=spacing_m)
+        return thinned
+
     def find_first_sample_with_points(self) -> int:
         """Return the index, from 0, of the first sample that has points."""
         return next(k for k, cloud in enumerate(self.clouds) if len(cloud))
@@ -451,45 +486,6 @@ def samples_with_outlines(count: int) -> set[int]:
             )
         ).tolist()
     )
-
-
-def until_all_cameras_see(
-    depths: Sequence[Depth], t_s: Array, count: int, fewest: int
-) -> tuple[int, list[Depth]]:
-    """Return how many first samples of an experiment include points of every depth camera, and the
-    images until then.
-
-    Parameters
-    ----------
-    depths : sequence of Depth
-    t_s : (T,) array
-        Times of the experiment.
-    count : int
-        Least number of samples of the experiment; returned unchanged without cameras.
-    fewest : int
-        Least number of images of each camera, as far as it has so many.
-
-    Returns
-    -------
-    count : int
-        Number of first samples of the experiment; the last of them is not before any of the
-        required images.
-    depths : list of Depth
-        Images until then, of the cameras that have points by then.
-    """
-    for depth in depths:
-        last_s = depth.sample_times_s[
-            min(
-                max(fewest - 1, depth.find_first_sample_with_points()),
-                len(depth.sample_times_s) - 1,
-            )
-        ]
-        count = max(
-            count, int(np.searchsorted(t_s, last_s - TIME_TOLERANCE_S)) + 1
-        )
-    end_s = t_s[:count][-1] + TIME_TOLERANCE_S
-    shorter = (depth.until_time(end_s) for depth in depths)
-    return count, [depth for depth in shorter if depth is not None]
 
 
 def points_from_image(image_m: Array, camera: DepthCamera) -> Array:

@@ -34,6 +34,7 @@ from .sample_times import (
     first_unordered_time,
     sample_interval_s,
 )
+from .separate_sensor import SENSORS, SeparateSensor, sensor_fields
 from .tendon import Tendon
 from .time_tables import is_within_experiment
 
@@ -79,17 +80,18 @@ class Experiment:
     name : str
         For messages and reports; experiments of one problem have different names.
     kind : {"dynamic", "static"}
-        A motion ("dynamic"); or samples each of which is an equilibrium of its own ("static"), at
-        any times (with memory, quasi-static in time).
+        "dynamic": a motion. "static": each sample is an equilibrium, and a material with memory
+        relaxes between the samples.
     start : {"equilibrium", "undeformed", "given"}
         State at the first time: at rest under its loads; undeformed and at rest; or as given.
     start_rule : {"standard", "paper"}
-        Inertia of the first step: from the starting velocity, or zero acceleration.
+        Inertia in the first time step. "standard": from the initial velocity. "paper": zero
+        acceleration.
     start_positions_m, start_velocities_m_s : (n, 3) arrays, optional
         The state for "given"; at rest if the velocities are left out.
     loaded_since_s : float
-        How long a body with memory has been in the shape of its equilibrium; by default it has
-        relaxed completely.
+        How long a body with memory has been in the shape of its initial equilibrium [s]; by default
+        the material is completely relaxed.
     validation : bool
         Whether the recording is only predicted, not fitted.
     frames_fault : str
@@ -150,8 +152,12 @@ class Experiment:
     forces: tuple[Force, ...] = key(converter=tuple, default=())
     tendons: tuple[Tendon, ...] = key(converter=tuple, default=())
     pressures: tuple[Pressure, ...] = key(converter=tuple, default=())
-    readings: tuple[Gauge, ...] = key(converter=tuple[Gauge, ...], default=())
-    depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=())
+    readings: tuple[Gauge, ...] = key(
+        converter=tuple[Gauge, ...], default=(), metadata=SENSORS
+    )
+    depths: tuple[Depth, ...] = key(
+        converter=tuple[Depth, ...], default=(), metadata=SENSORS
+    )
     nuisance: Nuisance = DEFAULT_NUISANCE
     air_density_kg_m3: float = key(
         converter=air_density, default_factory=usual_air_density
@@ -228,6 +234,20 @@ class Experiment:
         `grasps`.
         """
         return tuple(self.sensors_by_grasp.values())
+
+    @property
+    def separate_sensors(self) -> list[SeparateSensor]:
+        """Sensors with times of their own, besides markers and those of grasps."""
+        return [
+            each
+            for name in sensor_fields(Experiment)
+            for each in getattr(self, name)
+        ]
+
+    @property
+    def camera_names(self) -> list[str]:
+        """Names of the depth cameras, in their order."""
+        return [camera.name for camera in self.depths]
 
     @property
     def sensors_by_grasp(self) -> dict[int, Wrench]:
@@ -692,10 +712,10 @@ class Experiment:
                 )
 
     def _require_measurements(self) -> None:
-        """Raise an `InputError` if, besides markers, nothing is measured either: no custom sensor,
-        depth camera or wrench.
+        """Raise an `InputError` if, besides markers, nothing is measured either: by no sensor of its
+        own times and no wrench.
         """
-        if self.readings or self.depths or self.find_instrumented_grasps():
+        if self.separate_sensors or self.find_instrumented_grasps():
             return
         if not self.markers.names:
             message = "nothing is measured: there are no markers, no wrench and no reading"

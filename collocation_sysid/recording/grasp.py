@@ -56,16 +56,16 @@ class Grasp:
         Last time [s] at which the grasp or obstacle acts; the end of the recording by default. If a
         grasp ends at the first sample, the body is released from its equilibrium in this grasp.
     sigma_m : float, optional
-        Standard deviation of the noise in each position of the poses [m]; estimated from their
-        roughness by default.
+        Standard deviation of the noise in each position of the poses [m]; by default it is
+        estimated from the roughness of the poses.
     sigma_rad : float, optional
-        Standard deviation of the noise in each rotation, about each axis [rad]; estimated from the
-        roughness of the poses by default.
+        Standard deviation of the noise in each rotation, about each axis [rad]; by default it is
+        estimated from the roughness of the poses.
     selection : Selection, optional
         The selection that the nodes come from; None for node indices. On a finer mesh it is
         evaluated again.
     axes : str
-        Axes of the world along which the nodes are prescribed; they slide along the others.
+        Axes of the world along which the nodes are held; along the other axes they slide freely.
     zero : str
         Axes along which the zero of the poses is uncertain, as that of a test bench's crosshead,
         with the standard deviation in the experiment's `nuisance`; none by default.

@@ -176,11 +176,11 @@ class PointMass(Load):
         Nodes that carry the mass in equal parts, selected as in a grasp.
     mass_kg : float
     from_s : float
-        Time at which the mass joins the body [s], with the uncertainty nuisance.joining; before the
-        recording by default.
+        Time at which the mass is attached to the body [s], with the uncertainty nuisance.joining;
+        by default it is attached before the recording.
     until_s : float
-        Time at which the mass leaves the body [s], with the same uncertainty; after the recording
-        by default.
+        Time at which the mass is removed from the body [s], with the same uncertainty; by default
+        it is removed after the recording.
     selection : Selection, optional
         The selection that the nodes come from; None for node indices. On a finer mesh it is
         evaluated again.
@@ -228,10 +228,11 @@ class Force(Load):
         The selection that the nodes come from; None for node indices. On a finer mesh it is
         evaluated again.
     from_s : float
-        Time at which the force begins [s], with the uncertainty nuisance.joining; before the
-        recording by default.
+        Time at which the force begins [s], with the uncertainty nuisance.joining; by default it
+        begins before the recording.
     until_s : float
-        Time at which the force ends [s], with the same uncertainty; after the recording by default.
+        Time at which the force ends [s], with the same uncertainty; by default it ends after the
+        recording.
     """
 
     nodes: Index = key(

@@ -56,11 +56,11 @@ class Wrench:
     sigma_nm : float, optional
         Standard deviation of the noise of each torque [N m]; needed if torques are measured.
     frame : {"world", "grasp"}
-        Axes of the components: those of the poses' world, or "grasp" for those of the undeformed
-        body as the grasp carries it.
+        Axes of the components. "world": those of the world frame of the poses. "grasp": those of
+        the undeformed body, which move with the grasp.
     point_m : (3,) array
-        Point [x, y, z] of the torque: fixed in the world, or, in the frame "grasp", on the
-        undeformed body and carried by the grasp.
+        Point [x, y, z] about which the torque is measured. In the frame "world" it is fixed; in the
+        frame "grasp" it is stated on the undeformed body and moves with the grasp.
     symmetry : int
         Number of equal parts of the specimen that share the load, 4 where a quarter is modelled.
         Values and sigmas are those of the modelled part; results are reported for the specimen.

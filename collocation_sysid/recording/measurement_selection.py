@@ -6,7 +6,7 @@ not depend on the kinds of sensors.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -15,16 +15,16 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..common.time_dependence import at_times
-from .custom_sensor import Gauge
-from .depth_camera import until_all_cameras_see
 from .experiment import Experiment
 from .grasp import Grasp
 from .poses import PoseSequence
+from .sample_times import TIME_TOLERANCE_S
+from .separate_sensor import SeparateSensor, sensor_fields
 from .time_tables import FEWEST_SHARED_SAMPLES
 
 # Fields of an experiment whose measurements are all of sensors besides markers and grasps.
 NO_SENSORS: MappingProxyType[str, Any] = MappingProxyType(
-    {"readings": (), "depths": ()}
+    dict.fromkeys(sensor_fields(Experiment), ())
 )
 # Fewest samples of a placeholder, which resampling and a low-pass need.
 FEWEST_PLACEHOLDERS = 3
@@ -33,26 +33,28 @@ FEWEST_PLACEHOLDERS = 3
 def shortened_experiment(
     experiment: Experiment, count: int, *, shortens_sensors: bool = False
 ) -> Experiment:
-    """Return the experiment with its first samples; depth cameras without a point in them are left
-    out.
+    """Return the experiment with its first samples; sensors without a measurement in them are left
+    out, if they cannot ignore later ones.
 
     Parameters
     ----------
     experiment : Experiment
         Experiment to shorten; not modified.
     count : int
-        Least number of samples. It is increased until every depth camera has points and three
-        images (one if the experiment is static), but not beyond the recording.
+        Least number of samples. It is increased until every sensor has what it needs, such as a
+        camera points and three images (one if the experiment is static), but not beyond the
+        recording.
     shortens_sensors : bool
         Whether later samples of force sensors are removed, and those sensors with fewer than three
         samples (one if static) or no measured component; and zeros are put in the place of markers of which
         no sample remains. By default force sensors keep their samples after the end, which are ignored.
     """
     fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
-    count, depths = until_all_cameras_see(
-        experiment.depths, experiment.t_s, count=count, fewest=fewest
-    )
+    for sensor in experiment.separate_sensors:
+        needed_s = sensor.needed_until_s(fewest) - TIME_TOLERANCE_S
+        count = max(count, int(np.searchsorted(experiment.t_s, needed_s)) + 1)
     t_s = experiment.t_s[:count]
+    end_s = t_s[-1] + TIME_TOLERANCE_S
     markers = experiment.markers
     grasps = experiment.grasps
     if shortens_sensors:
@@ -69,8 +71,25 @@ def shortened_experiment(
         t_s=t_s,
         markers=at_times(markers, slice(count)),
         grasps=grasps,
-        depths=depths,
+        **_replaced_sensors(experiment, lambda each: each.until_time(end_s)),
     )
+
+
+def _replaced_sensors(
+    experiment: Experiment,
+    change: Callable[[SeparateSensor], SeparateSensor | None],
+) -> dict[str, Any]:
+    """Return the separate sensors of an experiment by the name of the field, each replaced by what
+    `change` returns for it; None leaves the sensor out.
+    """
+    return {
+        name: [
+            changed
+            for each in getattr(experiment, name)
+            if (changed := change(each)) is not None
+        ]
+        for name in sensor_fields(Experiment)
+    }
 
 
 def without_later_measurements(
@@ -78,34 +97,45 @@ def without_later_measurements(
 ) -> Experiment:
     """Return the experiment without the measurements after `end_s` [s]; its times stay.
 
-    Markers and measured forces become NaN, depth images are left out, and custom sensors become NaN unless
-    nothing would remain of them. The experiment itself is not modified.
+    Markers and measured forces become NaN, and other sensors do as they declare, see
+    `SeparateSensor.without_later_values`. The experiment itself is not modified.
     """
     markers = experiment.markers
     is_later = (experiment.t_s > end_s)[:, None, None]
     positions_m = np.where(is_later, np.nan, markers.positions_m)
-    depths = (depth.until_time(end_s) for depth in experiment.depths)
     return replace(
         experiment,
         markers=replace(markers, positions_m=positions_m),
         grasps=tuple(
             grasp.without_loads_after(end_s) for grasp in experiment.grasps
         ),
-        depths=[depth for depth in depths if depth is not None],
-        readings=[
-            _without_later_values(gauge, end_s) for gauge in experiment.readings
-        ],
+        **_replaced_sensors(
+            experiment, lambda each: each.without_later_values(end_s)
+        ),
     )
 
 
-def _without_later_values(gauge: Gauge, end_s: float) -> Gauge:
-    """Return the custom sensor `gauge` with measurements after `end_s` [s] replaced by NaN; itself
-    if none would remain.
+def thinned_experiment(
+    experiment: Experiment, *, many: int, most: int
+) -> Experiment:
+    """Return the experiment with at most `most` unlabelled points in each sample of those sensors
+    that have more than `many` in one; itself if there is no such sensor.
     """
-    values = np.where(
-        (gauge.sample_times_s > end_s)[:, None], np.nan, gauge.measured_values
-    )
-    return replace(gauge, values=values) if np.isfinite(values).any() else gauge
+
+    def change(sensor: SeparateSensor) -> SeparateSensor:
+        has_many = max(sensor.point_counts, default=0) > many
+        return sensor.thinned(most) if has_many else sensor
+
+    sensors = _replaced_sensors(experiment, change)
+    if all(
+        new is old
+        for name in sensors
+        for new, old in zip(
+            sensors[name], getattr(experiment, name), strict=True
+        )
+    ):
+        return experiment
+    return replace(experiment, **sensors)
 
 
 def moved_grasp(grasp: Grasp, poses: PoseSequence, t_s: Array) -> Grasp:
@@ -132,15 +162,20 @@ def measured_count(experiment: Experiment) -> int:
 
 def main_measurement(experiments: Sequence[Experiment]) -> tuple[str, str]:
     """Return the kind of measurement that dominates, as plural text, and the key that states its
-    noise: markers, else depth cameras, else force sensors, else custom sensors.
+    noise: markers, else a sensor that measures the shape of the body, else force sensors, else any
+    other sensor.
     """
     if any(each.markers.count_samples() for each in experiments):
         return "markers", "sigma_m"
-    if any(each.depths for each in experiments):
-        return "points of depth cameras", "sigma_m of depth"
+    sensors = [
+        sensor for each in experiments for sensor in each.separate_sensors
+    ]
+    for sensor in sensors:
+        if sensor.measures_shape:
+            return sensor.measurement_text, sensor.noise_key
     if any(each.sensors_by_grasp for each in experiments):
         return "measured forces", "sigma_n"
-    return "readings", "sigma of the readings"
+    return sensors[0].measurement_text, sensors[0].noise_key
 
 
 def is_load_only(experiment: Experiment) -> bool:
@@ -151,6 +186,5 @@ def is_load_only(experiment: Experiment) -> bool:
         experiment.is_static
         and experiment.sensors_by_grasp
         and not experiment.markers.count_samples()
-        and not experiment.depths
-        and not experiment.readings
+        and not experiment.separate_sensors
     )

@@ -40,11 +40,11 @@ class NodesSection(Section):
     indices : list of int, optional
         List of node indices as in the mesh file, counted from 0.
     face : str, optional
-        top or bottom: nodes with the highest or lowest z of the body; side_x or side_y: nodes with
-        its lowest x or y that are on neither.
+        "top", "bottom": nodes with the highest or lowest z of the body. "side_x", "side_y": nodes
+        with the lowest x or y of the body, without those at the top and at the bottom.
     name : str, optional
-        A point array of the mesh, 1 where selected, or a physical group of elements of any
-        dimension.
+        Name of a point array of the mesh that is 1 at the selected nodes, or of a physical group of
+        elements of any dimension.
     """
 
     box_m: tuple[Corner, Corner] | None = None

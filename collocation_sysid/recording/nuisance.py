@@ -339,7 +339,8 @@ CALIBRATION_DISTORTION = NuisanceRow(
     applies=_has_markers,
     label="distortion of the cameras",
     sentence="distortion of the cameras: {signed}",
-    description="radial distortion of first order about the body's middle: a factor 1 + k r²",
+    description="coefficient k of a radial distortion by the cameras: distances r from the "
+    "middle of the body are multiplied by 1 + k r²",
     reading=_distort_position,
 )
 TIME = NuisanceRow(
@@ -351,7 +352,7 @@ TIME = NuisanceRow(
     applies=_is_motion,
     label="time shift",
     sentence="markers measured {size} {way} than stated{limit}",
-    description="how much later than stated the markers were measured, on the grasps' clock",
+    description="how much later than stated the markers were measured, by the clock of the grasps",
     same=lambda e: {"time between samples": round(e.timestep_s, 12)},
     clock=lambda values, t_s, data: values,
 )
@@ -367,7 +368,7 @@ CLOCK_RATE = NuisanceRow(
     ),
     label="rate of the markers' clock",
     sentence="the markers' clock is slow by {signed}",
-    description="how much slower than the grasps' clock that of the markers runs",
+    description="how much slower the clock of the markers runs than the clock of the grasps",
     clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]),
 )
 POSE_TURN = NuisanceRow(
@@ -436,8 +437,9 @@ GRASP_SHIFT = NuisanceRow(
     by="length",
     label="shift in the grasp, {axis}",
     sentence="translation of the body in the gripper: {size}",
-    description="a constant translation of the body in its grasps; both if the start is an "
-    "equilibrium and markers measure it",
+    description="a constant translation of the body in its grasps; rotation and "
+    "translation are estimated if the start is an equilibrium and there are "
+    "markers",
     same=_hand_eye_sharing_key,
 )
 STRAIN_ZERO = NuisanceRow(
@@ -462,7 +464,7 @@ ZERO = NuisanceRow(
     by="worst",
     label="zero of grasp {which}, {axis}",
     sentence="zero error of a displacement: up to {size}",
-    description="a constant offset of each displacement along each of its axes",
+    description="a constant offset of each prescribed displacement along each of its axes",
 )
 OBSTACLE_OFFSET = NuisanceRow(
     "obstacle_offset_m",
@@ -475,8 +477,9 @@ OBSTACLE_OFFSET = NuisanceRow(
     applies=lambda experiment: bool(experiment.obstacles),
     label="place of {which}",
     sentence="position error of an obstacle: up to {size}",
-    description="a constant offset of each obstacle along its normal, or along the axis of its "
-    "displacement, which changes when it touches the body",
+    description="a constant offset of each obstacle along its normal, or along the axis of "
+    "its displacement; it changes the time at which the obstacle touches the "
+    "body",
 )
 OBSTACLE_TILT = NuisanceRow(
     "obstacle_tilt_rad",
@@ -496,8 +499,8 @@ OBSTACLE_TILT = NuisanceRow(
     ),
     label="tilt of {which}, {axis}",
     sentence="tilt of an obstacle: {size}",
-    description="a constant tilt of each obstacle that is a plane or a box, about its point or "
-    "middle",
+    description="a constant tilt of each obstacle that is a plane or a box, about the "
+    "point of the plane or the middle of the box",
 )
 OBSTACLE_TIME = NuisanceRow(
     "obstacle_time_s",
@@ -560,7 +563,7 @@ PRESSURE_OFFSET = NuisanceRow(
     changes=("drives",),
     label="{which}, lost",
     sentence="{which} {signed}",
-    description="offset by which each pressure is lower than stated",
+    description="amount by which each pressure is lower than stated",
 )
 PRESSURE_LAG = NuisanceRow(
     "pressure_lag",
@@ -572,7 +575,8 @@ PRESSURE_LAG = NuisanceRow(
     applies=lambda experiment: any(each.lag_s for each in experiment.pressures),
     label="{which}, log of lag over stated lag",
     sentence="{which}: log of lag over stated lag {signed}",
-    description="lag of each pressure: the logarithm of its ratio to the stated lag_s",
+    description="logarithm of the ratio of the true lag of each pressure to the stated "
+    "lag_s",
 )
 JOINING = NuisanceRow(
     "joining_s",
@@ -584,8 +588,8 @@ JOINING = NuisanceRow(
     step=lambda experiment: SAMPLES_A_STEP * experiment.timestep_s,
     label="{which}",
     sentence="{which} {number}{error}{unit} {way} than {stated}",
-    description="delay with which each point mass or force begins or ends, if it does so within "
-    "the recording",
+    description="delay of the time at which each point mass or force begins or ends, if "
+    "this time is within the recording",
 )
 TARE = NuisanceRow(
     "tare",
@@ -613,7 +617,7 @@ SENSOR_TIME = NuisanceRow(
     by="worst",
     label="time shift of the sensor{which}",
     sentence="delay of the sensor: {size}",
-    description="delay of the force sensors; at most three standard deviations",
+    description="delay of the force sensors, limited to three standard deviations of its prior",
 )
 SENSOR_LAG = NuisanceRow(
     "sensor_lag_s",
@@ -628,8 +632,8 @@ SENSOR_LAG = NuisanceRow(
     by="worst",
     label="lag of the sensor{which}",
     sentence="time constant of the sensor: {size}",
-    description="time constant of a first-order low-pass in the sensor; between zero and "
-    "three standard deviations of its prior",
+    description="time constant of a first-order low-pass in the sensor, limited to values "
+    "between zero and three standard deviations of its prior",
 )
 TOOL_MASS = NuisanceRow(
     "tool_kg",
@@ -657,8 +661,8 @@ TOOL_CENTRE = NuisanceRow(
     reference=0.05,
     label="centre of the tool{which}, {axis}",
     sentence="offset of the tool's centre: up to {size}",
-    description="centre of the tool relative to the sensor's point; in the world's frame, "
-    "relative to that of the grasped nodes",
+    description="centre of the tool relative to the point of the sensor; in the frame of "
+    "the world, relative to the centre of the grasped nodes",
 )
 DEPTH_TURN = NuisanceRow(
     "depth_turn_rad",
@@ -674,8 +678,8 @@ DEPTH_TURN = NuisanceRow(
     by="length",
     label="turn of {which}, {axis}",
     sentence="rotation of a depth camera: {size}",
-    description="rotation of each depth camera about the middle of the body, along the camera's "
-    "axes",
+    description="rotation of each depth camera about the middle of the body, stated along "
+    "the axes of the camera",
     same=_camera_sharing_key,
 )
 DEPTH_SHIFT = NuisanceRow(
@@ -694,8 +698,8 @@ DEPTH_SHIFT = NuisanceRow(
     by="length",
     label="shift of {which}, {axis}",
     sentence="translation of a depth camera: {size}",
-    description="translation of each depth camera; if neither is given, the first image is first "
-    "aligned with the body",
+    description="translation of each depth camera; if neither prior is stated, the search "
+    "begins by aligning the first image with the body",
     same=_camera_sharing_key,
 )
 DEPTH_BIAS = NuisanceRow(
@@ -748,7 +752,7 @@ DEPTH_TIME = NuisanceRow(
     by="worst",
     label="time shift of {which}",
     sentence="delay of a depth camera: {size}",
-    description="delay of a depth camera; at most three standard deviations",
+    description="delay of a depth camera, limited to three standard deviations of its prior",
 )
 DEPTH_EDGE = NuisanceRow(
     "depth_edge_px",
@@ -792,11 +796,12 @@ class Nuisance:
     calibration_scale : float or None
         Scale error of all lengths that the cameras measure: the factor minus one.
     calibration_distortion_1_m2 : float or None
-        Radial distortion of first order about the body's middle: a factor 1 + k r².
+        Coefficient k of a radial distortion by the cameras: distances r from the middle of the body
+        are multiplied by 1 + k r².
     time_shift_s : float or None
-        How much later than stated the markers were measured, on the grasps' clock.
+        How much later than stated the markers were measured, by the clock of the grasps.
     clock_rate : float or None
-        How much slower than the grasps' clock that of the markers runs.
+        How much slower the clock of the markers runs than the clock of the grasps.
     pose_turn_rad : float or None
         A constant rotation of grasps and body in the cameras' frame, which rotates gravity in the
         body's frame.
@@ -807,17 +812,18 @@ class Nuisance:
     hand_eye_rad : float or None
         A constant rotation of the body in its grasps.
     hand_eye_m : float or None
-        A constant translation of the body in its grasps; both if the start is an equilibrium and
-        markers measure it.
+        A constant translation of the body in its grasps; rotation and translation are estimated if
+        the start is an equilibrium and there are markers.
     strain_zero : float or None
         A constant offset of the strains of a specimen.
     displacement_zero_m : float or None
-        A constant offset of each displacement along each of its axes.
+        A constant offset of each prescribed displacement along each of its axes.
     obstacle_offset_m : float or None
-        A constant offset of each obstacle along its normal, or along the axis of its displacement,
-        which changes when it touches the body.
+        A constant offset of each obstacle along its normal, or along the axis of its displacement;
+        it changes the time at which the obstacle touches the body.
     obstacle_tilt_rad : float or None
-        A constant tilt of each obstacle that is a plane or a box, about its point or middle.
+        A constant tilt of each obstacle that is a plane or a box, about the point of the plane or
+        the middle of the box.
     obstacle_time_s : float or None
         Delay of each obstacle's motion, to first order.
     tension_factor : float or None
@@ -827,35 +833,36 @@ class Nuisance:
     pressure_factor : float or None
         Scale error of each pressure: the factor minus one.
     pressure_lost_pa : float or None
-        Offset by which each pressure is lower than stated.
+        Amount by which each pressure is lower than stated.
     pressure_lag : float or None
-        Lag of each pressure: the logarithm of its ratio to the stated lag_s.
+        Logarithm of the ratio of the true lag of each pressure to the stated lag_s.
     joining_s : float or None
-        Delay with which each point mass or force begins or ends, if it does so within the
-        recording.
+        Delay of the time at which each point mass or force begins or ends, if this time is within
+        the recording.
     tare : float or None
         A constant offset of each component of a force sensor, in multiples of its sigma.
     sensor_time_s : float or None
-        Delay of the force sensors; at most three standard deviations.
+        Delay of the force sensors, limited to three standard deviations of its prior.
     sensor_lag_s : float or None
-        Time constant of a first-order low-pass in the sensor; between zero and three
-        standard deviations of its prior.
+        Time constant of a first-order low-pass in the sensor, limited to values between zero and
+        three standard deviations of its prior.
     tool_kg : float or None
         Mass of the tool between a sensor and the body.
     tool_m : float or None
-        Centre of the tool relative to the sensor's point; in the world's frame, relative to that of
-        the grasped nodes.
+        Centre of the tool relative to the point of the sensor; in the frame of the world, relative
+        to the centre of the grasped nodes.
     depth_turn_rad : float or None
-        Rotation of each depth camera about the middle of the body, along the camera's axes.
+        Rotation of each depth camera about the middle of the body, stated along the axes of the
+        camera.
     depth_shift_m : float or None
-        Translation of each depth camera; if neither is given, the first image is first aligned with
-        the body.
+        Translation of each depth camera; if neither prior is stated, the search begins by aligning
+        the first image with the body.
     depth_bias_m : float or None
         Offset that is added to each depth of an image.
     depth_scale : float or None
         Scale error of each depth of an image: the factor minus one.
     depth_time_s : float or None
-        Delay of a depth camera; at most three standard deviations.
+        Delay of a depth camera, limited to three standard deviations of its prior.
     depth_edge_px : float or None
         Distance by which silhouettes in the images of each depth camera end inside the outline of
         the body, in pixels.

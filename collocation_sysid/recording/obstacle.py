@@ -107,8 +107,8 @@ class Obstacle(Grasp):
         Gap δ at which the pressure begins [m]; by default the mean edge of the face over 5000, or
         over 500 with friction.
     slip : float, optional
-        Sliding speed [m/s], or slip from sample to sample [m] of a static experiment, at which
-        friction is 0.7 of its limit.
+        Sliding speed [m/s] at which friction is 0.7 of its limit; in a static experiment, sliding
+        distance from sample to sample [m].
     wrench : Wrench, optional
         Measured force and torque that it exerts on the body.
     relaxed : float, optional

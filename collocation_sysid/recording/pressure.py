@@ -50,7 +50,8 @@ _TABLE = Key(
 
 @declaration
 class Pressure(Actuator[EnclosedVolume]):
-    """A pressure above the surroundings' on faces of the boundary, such as a cavity's wall.
+    """A pressure, relative to the surroundings, on faces of the boundary such as the wall of a
+    cavity.
 
     Its force follows the faces as they move. It derives from an energy, and has a symmetric
     stiffness, if the faces are closed, as a cavity's wall is, or if their rim is held.
@@ -58,7 +59,7 @@ class Pressure(Actuator[EnclosedVolume]):
     Parameters
     ----------
     faces : Selection or (F, 3) array
-        Faces with all their corners in box_m, ball_m or indices; or the name of a physical group or
+        Faces whose corners are all in box_m, ball_m or indices; or the name of a physical group or
         cell array of triangles, or of a point array.
     pressure_pa : float or (m,) array
         Constant pressure; negative for suction.

@@ -71,7 +71,7 @@ class SpecimenLayout:
     length_m : float or None
         Undeformed length that divides a displacement.
     area_m2 : float or None
-        Undeformed area that divides a force.
+        Undeformed area by which a force is divided.
     requires_times : bool
         Whether the table must have times.
     """

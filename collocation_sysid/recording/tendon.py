@@ -32,7 +32,7 @@ _TABLE = Key("tension", Text | None, read=read_tension, constant="tension_n")
 
 @declaration
 class Tendon(Actuator[PolylineLength]):
-    """A thread through points of the body, straight between them, that pulls itself shorter.
+    """A cable under tension through points of the body, straight from each point to the next.
 
     It slides through its points without friction. A sheath needs as many points as it takes to
     follow the body; for guide rings, use the places of the rings.

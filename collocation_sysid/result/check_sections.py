@@ -314,16 +314,7 @@ def _solve_section(findings: CheckResult) -> Table:
         "program": f"{findings.variables:,} variables, {findings.constraints:,} constraints, "
         f"{findings.jacobian_nonzeros + findings.hessian_nonzeros:,} nonzeros"
     }
-    if findings.overstresses:
-        rows["memory"] = (
-            f"{findings.overstresses:,} additional variables and constraints of the method "
-            "interior-point for the viscoelastic stresses, included in the nonzeros"
-        )
-    if findings.wrenches:
-        rows["wrenches"] = (
-            f"{findings.wrenches:,} additional variables and constraints of the method "
-            "interior-point for the measured wrenches, included in the nonzeros"
-        )
+    rows |= findings.lifted_texts
     for cost in findings.costs:
         chosen = ", chosen" if cost.method == findings.method else ""
         memory = (

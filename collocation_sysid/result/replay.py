@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import MISSING, dataclass, field, fields
-from itertools import count, takewhile
+from itertools import takewhile
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -21,17 +21,21 @@ from ..common.array_types import Array
 from ..common.files import RESULT_FILE, damage_refused, require_own
 from ..errors import InputError
 from ..features.measurement_results import SensorSeries
+from ..features.registry import FEATURES
 from ..fem.elements import EDGES
 from ..fem.laws.constants import symbol_of, without_region
 from ..recording.experiment import Experiment
-from ..recording.measured_wrench import COMPONENTS, UNITS
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.specimen_files import specimen_strains
 from ..runs.result_content import Result
 
 ARRAYS_FILE = "trajectory.npz"
-# Prefix of a wrench array, before its number from 1.
-WRENCH_PREFIX = "wrench_"
+# Kinds of sensors whose arrays are named after the kind and the number of the sensor, from 1.
+SERIES_KINDS = {
+    each.series_kind.name: each.series_kind
+    for each in FEATURES
+    if each.series_kind is not None
+}
 # Prefixes of arrays of the attributes that are mappings, before the name.
 GROUP_PREFIXES = {
     "readings": "reading_",
@@ -129,9 +133,9 @@ class MotionRecord:
         Nodes and markers of the forward simulation; None if it failed.
     natural_hz : (k,), or None
         Natural frequencies at the estimate, ascending; None if they are unknown.
-    wrenches : sequence of (S, 19)
-        For each force sensor: time [s], and six components as measured, fitted and simulated; NaN
-        where one of these is missing.
+    sensor_columns : mapping of name to sequence of (S, 1 + 3m)
+        For each kind in `SERIES_KINDS` and each of its sensors: time [s], and m numbers as
+        measured, fitted and simulated; NaN where one of these is missing.
     static : bool
         Whether every sample is an equilibrium of its own.
     tendons_m : (p, 3), or None
@@ -175,7 +179,7 @@ class MotionRecord:
     rolled_out_positions_m: Array | None = None
     rolled_out_m: Array | None = None
     natural_hz: Array | None = None
-    wrenches: Sequence[Array] = ()
+    sensor_columns: Mapping[str, Sequence[Array]] = field(default_factory=dict)
     static: bool = False
     tendons_m: Array | None = None
     readings: Mapping[str, Array] = field(default_factory=dict)
@@ -293,11 +297,13 @@ class MotionRecord:
                 )
         return np.concatenate(nearest)
 
-    def list_force_series(self) -> list[SensorSeries]:
-        """Return the forces and torques of each force sensor over time."""
+    @property
+    def sensor_series(self) -> list[SensorSeries]:
+        """Numbers over time of each sensor of the kinds in `SERIES_KINDS`."""
         return [
-            SensorSeries("wrench", k, columns, COMPONENTS, units=UNITS)
-            for k, columns in enumerate(self.wrenches, start=1)
+            SERIES_KINDS[kind].series(k, columns)
+            for kind, of_sensors in self.sensor_columns.items()
+            for k, columns in enumerate(of_sensors, start=1)
         ]
 
     def has_shapes(self) -> bool:
@@ -335,8 +341,8 @@ class MotionRecord:
             None if self.markers_m is None else self.markers_m - self.measured_m
         )
         stored |= {
-            f"{WRENCH_PREFIX}{k}": values
-            for k, values in enumerate(self.wrenches, start=1)
+            f"{each.kind}_{each.number}": each.columns
+            for each in self.sensor_series
         }
         for group, front in GROUP_PREFIXES.items():
             stored |= {
@@ -382,10 +388,12 @@ class MotionRecord:
             key: arrays[at] if key in needed else arrays.get(at)
             for key, at in own.items()
         }
-        keys = (f"{prefix}{WRENCH_PREFIX}{k}" for k in count(1))
-        stored["wrenches"] = [
-            arrays[key] for key in takewhile(arrays.__contains__, keys)
-        ]
+        stored["sensor_columns"] = {}
+        for kind in SERIES_KINDS:
+            keys = [f"{prefix}{kind}_{k}" for k in range(1, len(arrays) + 1)]
+            stored["sensor_columns"][kind] = [
+                arrays[key] for key in takewhile(arrays.__contains__, keys)
+            ]
         for group, front in GROUP_PREFIXES.items():
             group_prefix = f"{prefix}{front}"
             stored[group] = {

@@ -324,7 +324,7 @@ def _visible_points(
     experiment : Experiment
         One of its experiments, fitted or for validation.
     """
-    if not experiment.depths:
+    if not experiment.camera_names:
         return {}
     from .camera_overlays import visible_points  # which needs matplotlib
 

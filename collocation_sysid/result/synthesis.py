@@ -74,7 +74,7 @@ class Recipe(Options):
         Standard deviation of the noise of each coordinate of a marker [m].
     noise_n : float
         Standard deviation of the noise of measured forces [N]. If a quarter of the specimen is
-        modelled (``symmetry = 4``), that of the force on the whole specimen.
+        modelled (``symmetry = 4``), the noise is that of the force on the complete specimen.
     noise_nm : float
         Standard deviation of the noise of measured torques [N m]; with ``symmetry``, of the torque
         on the whole specimen.

@@ -15,7 +15,6 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..features.registry import FEATURES
-from ..methods.initial_trajectories import associated_at_guess
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Iteration, Method, Solution, Status, Watch
 from ..methods.stiffness_scan import Scan
@@ -176,9 +175,8 @@ def follow_starts(
     method: Method = solver if is_own else ReducedSpace()
     candidates: list[tuple[float, int, Solution]] = []
     for number in (scan.best, *scan.others):
-        started = associated_at_guess(
-            collocation.with_parameters(scan.starts[number])
-        )
+        # The search associates cameras with its first shape itself.
+        started = collocation.with_parameters(scan.starts[number])
         try:
             solution = solve(
                 _until_known(method, [each for *_, each in candidates]), started

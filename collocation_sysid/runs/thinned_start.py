@@ -1,5 +1,5 @@
-"""Start of a search with many points of depth cameras: the same problem is solved with thinned
-clouds first.
+"""Start of a search with many unlabelled points: the same problem is solved with thinned clouds
+first.
 
 Every search of correspondences and every residual costs time for each point, but a few points per
 face determine the shape almost as well as all. So the scan of the stiffness, the alignment of the
@@ -11,8 +11,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from ..fem.laws.constants import symbol_of
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
@@ -20,8 +18,7 @@ from ..methods.solve_recorder import Recorder
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..program.unlabelled_points import declared_points
-from ..recording.depth_camera import Depth
-from ..recording.experiment import Experiment
+from ..recording.measurement_selection import thinned_experiment
 from .coarse_start import undetermined_names
 
 # Largest number of points of a thinned cloud: then other parts of a search take as long as the
@@ -30,54 +27,27 @@ THINNED_POINTS = 1500
 # Number of points of a cloud above which a thinned start saves time: the search with all points
 # takes a few sweeps more.
 MANY_POINTS = 4000
-# Factor by which the distance of points grows until there are few enough.
-SPACING_FACTOR = 1.2
 
 
 class NoThinnedStartError(Exception):
     """Reason why a problem is not started from thinned clouds, as a part of a sentence."""
 
 
-def thinned_depth(depth: Depth) -> Depth:
-    """Return a depth camera whose clouds have at most `THINNED_POINTS` points each; the camera
-    itself if no cloud has more than `MANY_POINTS`.
-
-    Points are selected as in `Depth`, at a larger distance, which also applies to the points of
-    outlines; measured values are not averaged.
-    """
-    most = max(map(len, depth.clouds))
-    if most <= MANY_POINTS:
-        return depth
-    spacing_m = depth.spacing_m * np.sqrt(most / THINNED_POINTS)
-    thinned = replace(depth, spacing_m=spacing_m)
-    while max(map(len, thinned.clouds)) > THINNED_POINTS:
-        spacing_m *= SPACING_FACTOR
-        thinned = replace(depth, spacing_m=spacing_m)
-    return thinned
-
-
 def thinned_problem(problem: Problem) -> Problem | None:
-    """Return the problem with thinned clouds of its depth cameras, without notes; None if none of
-    the fitted experiments has more than `MANY_POINTS` points in an image. The problem is not
-    modified.
+    """Return the problem with at most `THINNED_POINTS` unlabelled points in each sample of its
+    sensors, without notes; None if none of the fitted experiments has more than `MANY_POINTS` in
+    one. The problem is not modified.
     """
     experiments = [
-        each if each.validation else _thinned_experiment(each)
+        each
+        if each.validation
+        else thinned_experiment(each, many=MANY_POINTS, most=THINNED_POINTS)
         for each in problem.experiments
     ]
     pairs = zip(experiments, problem.experiments, strict=True)
     if all(thinned is given for thinned, given in pairs):
         return None
     return replace(problem, experiments=experiments, notes=())
-
-
-def _thinned_experiment(experiment: Experiment) -> Experiment:
-    """Return an experiment with thinned clouds; itself if no camera has many points."""
-    depths = [thinned_depth(each) for each in experiment.depths]
-    pairs = zip(depths, experiment.depths, strict=True)
-    if all(thinned is given for thinned, given in pairs):
-        return experiment
-    return replace(experiment, depths=depths)
 
 
 def require_determined(thinned: Solution) -> None:
@@ -167,14 +137,16 @@ def interrupted_with_all_points(
 
 
 def point_counts(collocation: Collocation) -> str:
-    """Return the number of points of all fitted depth cameras, in words."""
-    count = sum(
-        len(cloud)
+    """Return the number of unlabelled points of all fitted experiments, in words."""
+    sensors = [
+        sensor
         for segment in collocation.transcriptions
-        for depth in segment.experiment.depths
-        for cloud in depth.clouds
-    )
-    return f"{count:,} depth points"
+        for sensor in segment.experiment.separate_sensors
+        if sensor.point_counts
+    ]
+    count = sum(sum(sensor.point_counts) for sensor in sensors)
+    names = dict.fromkeys(sensor.points_name for sensor in sensors)
+    return f"{count:,} {' and '.join(names)}"
 
 
 def thinned_start_note(thinned: Solution, solution: Solution) -> str:

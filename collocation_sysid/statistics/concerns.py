@@ -1,13 +1,14 @@
 """Warnings: message by code, remedy by topic.
 
 A concern has a code, a grade and data. The first part of the code is the topic: "noise/larger" is
-about the noise. Codes stay the same when messages are reworded.
+about the noise. Codes stay the same when messages are reworded. `TOPICS` contains the messages
+about bodies, fits and statistics; features add theirs (`features.feature.Feature`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from ..errors import listed
@@ -46,7 +47,7 @@ SAMPLE = (
 NO_DAMPING = "no information on damping"
 FIX_DAMPING = "fix {damping}, or add a recording of a motion"
 
-TOPICS: Mapping[str, Topic] = {
+TOPICS: dict[str, Topic] = {
     "scale": Topic(
         "The scale",
         "forces",
@@ -55,7 +56,7 @@ TOPICS: Mapping[str, Topic] = {
         messages={
             "unknown": "only the ratios of {names} are identifiable (E/ρ), because no known "
             "force or mass sets their scale; fix a density, state a known mass, or measure a "
-            "wrench",
+            "force",
         },
     ),
     "description": Topic(
@@ -139,25 +140,6 @@ TOPICS: Mapping[str, Topic] = {
             "normal, which points out of the solid towards the body",
             "obstacle-place": "obstacle '{obstacle}' contains {percent:.0f} % of the undeformed "
             "body at the first sample: check its position, size, unit and the sign of its motion",
-            "obstacle-pull": "its force pulls at the body with {pull_n:.3g} N, in {samples} of "
-            "{of_samples} samples, which contact without adhesion cannot do: its sign is wrong, or "
-            "it was zeroed during the contact; set sign = -1, or zero the load before the contact",
-            "obstacle-friction": "its force is up to {ratio:.2g} times as large along the plane as "
-            "along the normal, and its friction is stated as {stated:.2g}: correct friction, or "
-            "estimate it as a parameter",
-            "obstacle-fixed": "its load changes by {change_n:.3g} N, although neither it nor a "
-            "grasp moves: check its poses or displacement",
-            "obstacle-stroke": "it moves by {stroke_m:.3g} m, the body is {size_m:.3g} m large: "
-            "check the unit of its displacement or poses, which are in metres",
-            "obstacle-load/far": "it has a load although it is up to {by_mm:.3g} mm away from the "
-            "undeformed body: check its place, its size, and the axis, sign and unit of its motion",
-            "obstacle-load/deep": "it has no load although it is up to {by_mm:.3g} mm inside the "
-            "undeformed body: check its place, its size, and the axis, sign and unit of its motion",
-            "obstacle-load/never": "it has a load although it never presses on the undeformed body, "
-            "along which it moves by {by_mm:.3g} mm: check the axis of its motion, and its place",
-            "sign": "along {axis} the displacement of grasp {grasp} and its force on the body have "
-            "opposite signs (correlation {correlation:.2f}), as if the body produced energy: "
-            "one of the signs is wrong; set sign = -1 for the displacement or for the wrench",
             "specimen-true-stress": "its stresses fit as true stresses (force over deformed "
             'area): set stress = "true", or divide the forces by the undeformed area',
             "specimen-compression": "its strains and stresses fit as those of a compression test: "
@@ -166,27 +148,6 @@ TOPICS: Mapping[str, Topic] = {
             '"strain (%)"',
             "specimen-unit": "its stresses fit if multiplied by {factor:g}: the unit of the column "
             "is probably {unit}",
-            "wrench-sign": "it fits with the opposite sign: it is the force of the body on the "
-            "grasp instead of that of the grasp on the body; set sign = -1 in the table of the "
-            "wrench",
-            "wrench-sign/part": "its {what} fit with the opposite sign, the other components do "
-            "not: change the sign of these columns",
-            "wrench-axes": "its axes are exchanged or reversed: it fits with ({axes}) in place "
-            "of (x, y, z), both forces and torques; reorder the columns, rotate the sensor's axes, or "
-            "for a log state sensor_frame in the table of the wrench",
-            "wrench-gain": "its {what} fit if multiplied by {factor:.3g}: check the calibration of "
-            "the sensor, and the density or mass of the body",
-            "wrench-point": "its torques refer to a point {by_mm:.3g} mm away from point_m: they "
-            "fit with point_m = {point}",
-            "wrench-frame": 'it is expressed in the frame of the {other}: set frame = "{other}"',
-            "wrench-unit": "its {what} seem to be in {unit}: multiply by {factor:g}",
-            "wrench-clock": "it was measured about {by_ms:.3g} ms {when} than its times t_s "
-            "state: its clock differs from that of the poses",
-            "wrench-offset": "most of its deviation from the simulation at the guess{after} is an "
-            "offset, in {component} {offset} ({deviations:.3g} standard deviations of its noise): zero the "
-            "sensor before the grasp or subtract a reading without the body; or state "
-            "nuisance.tare = {{ prior_sigmas = {prior} }}, and nuisance.tool if a gripper hangs "
-            "between sensor and body",
             "camera": "only {percent:.0f} % of the body's visible surface have measured points "
             "within {within_mm:.3g} mm: check camera.pose (camera frame: x to the right, y down, "
             "z forward) and the unit of the depth; check draws a picture of both",
@@ -211,8 +172,6 @@ TOPICS: Mapping[str, Topic] = {
             "camera-order": "its images fit in reverse order: sort their files by time",
             "camera-constant": "all its images show the same moment, although the body moves by "
             "{by_mm:.3g} mm: check that the images are those of this recording",
-            "wrench-tare": "the sensor was probably zeroed while it carried the body: zero it "
-            "before the grasp, or widen nuisance.tare",
         },
     ),
     "noise": Topic(
@@ -380,25 +339,6 @@ TOPICS: Mapping[str, Topic] = {
             "positive. In Ogden's law the shear modulus is half the sum of mu_p alpha_p",
         },
     ),
-    "contact": Topic(
-        "Contact",
-        "contact",
-        remedy="Check the position, the normal and the motion of the obstacle, and the mesh in the "
-        "contact area.",
-        messages={
-            "never": "in '{experiment}'{more} the body never touches {obstacle}{guess}; the "
-            "smallest gap is {mm:.3g} mm: its force and friction carry no information",
-            "coarse": "in '{experiment}'{more} only {faces:.2g} faces, {face_mm:.2g} mm large, "
-            "touch {obstacle} at a time{guess}: the mesh is too coarse for the contact area; "
-            "refine it there",
-            "pressed": "in '{experiment}'{more} the body touches {obstacle} already at the first "
-            "sample{guess}: the beginning of the contact is not recorded; start the "
-            "recording earlier",
-            "lost": "in '{experiment}'{more} the body leaves {obstacle} at t = {t_s:.4g} s{guess}: "
-            "if it remained in contact, check the motion of the obstacle and the guess, or "
-            "end window_s before",
-        },
-    ),
     "mesh": Topic(
         "The mesh",
         "mesh",
@@ -508,6 +448,38 @@ TOPICS: Mapping[str, Topic] = {
         },
     ),
 }
+
+
+def declare_topics(topics: Mapping[str, Topic]) -> None:
+    """Add topics to `TOPICS`, by their keys, with all their messages.
+
+    Raises
+    ------
+    ValueError
+        If there is such a topic already.
+    """
+    for key, topic in topics.items():
+        if key in TOPICS:
+            raise ValueError(f"the topic {key!r} is declared twice")
+        TOPICS[key] = topic
+
+
+def declare_messages(messages: Mapping[str, str]) -> None:
+    """Add messages to known topics in `TOPICS`, by complete codes such as "noise/larger".
+
+    Raises
+    ------
+    KeyError
+        If the topic of a code is unknown.
+    ValueError
+        If there is a message for a code already.
+    """
+    for code, message in messages.items():
+        key, _, rest = code.partition("/")
+        topic = TOPICS[key]
+        if rest in topic.messages:
+            raise ValueError(f"the message of {code!r} is declared twice")
+        TOPICS[key] = replace(topic, messages={**topic.messages, rest: message})
 
 
 def message_of(code: str, data: Mapping[str, Any]) -> str:

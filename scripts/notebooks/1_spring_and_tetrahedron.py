@@ -80,9 +80,9 @@ def ipopt_options(max_iterations=3000):
 # %% [markdown]
 # ## 1.1 A spring
 #
-# A mass $m$ is attached to a spring. It is displaced by 50 mm, released at rest, and its position
-# is measured for one second at 100 Hz. The mass $m$ is known; the stiffness $k$ and the damping
-# coefficient $c$ are to be estimated.
+# A mass $m$ is attached to a spring. The mass is displaced by 50 mm and released at rest, and its
+# position is measured for one second at 100 Hz. The mass $m$ is known; the stiffness $k$ and the
+# damping coefficient $c$ are to be estimated.
 #
 # ### Elastic energy and force
 #
@@ -96,7 +96,8 @@ force = -ca.gradient(spring_energy, x) - c * v
 print(force)
 
 # %% [markdown]
-# For a spring the gradient is trivial. The same line is used for the tetrahedron below.
+# For a spring the gradient is trivial. In section 1.4 the same line of code computes the force of
+# a tetrahedron.
 #
 # The equation of motion $m\ddot x = f(x, \dot x)$ of a linear spring has a closed-form solution.
 # The synthetic measurements are this solution with normally distributed noise of 1 mm.
@@ -157,14 +158,13 @@ print(
 # displacement (50 mm), because solvers converge best if the unknowns are of order one.
 #
 # Textbooks on trajectory optimisation usually present direct collocation with the **trapezoidal
-# rule**, with positions and velocities as unknowns,
-# $m(v_t - v_{t-1}) = \tfrac{\Delta t}2(f_t + f_{t-1})$ and
-# $x_t - x_{t-1} = \tfrac{\Delta t}2(v_t + v_{t-1})$,
-# or with **Hermite–Simpson**, a cubic polynomial in each interval with the equations of motion
-# also at its midpoint (fourth order, twice the number of unknowns). If the velocities are
-# eliminated from the trapezoidal rule and the force is linear in $x$ and $v$, the equations $c_t$
-# above result. For nonlinear forces, the midpoint rule uses the force at the mean state instead
-# of the mean of the forces. It has no velocities as unknowns and adds no numerical damping.
+# rule**, with positions and velocities as unknowns, $m(v_t - v_{t-1}) = \tfrac{\Delta t}2(f_t +
+# f_{t-1})$ and $x_t - x_{t-1} = \tfrac{\Delta t}2(v_t + v_{t-1})$, or with **Hermite–Simpson**, a
+# cubic polynomial in each interval with the equations of motion also at its midpoint (fourth
+# order, twice the number of unknowns). If the velocities are eliminated from the trapezoidal rule
+# and the force is linear in $x$ and $v$, the equations $c_t$ above result. For nonlinear forces,
+# the midpoint rule uses the force at the mean state instead of the mean of the forces. The
+# midpoint rule has no velocities as unknowns and adds no numerical damping.
 
 # %%
 spring_force = ca.Function("f", [x, v, k, c], [force])
@@ -197,9 +197,9 @@ solver = ca.nlpsol("spring", "ipopt", program, ipopt_options())
 
 # %% [markdown]
 # The initial guess of the parameters is poor: a quarter of the true stiffness and twelve times
-# the true damping. The initial guess of the positions is the measurements themselves. This is an
-# advantage of collocation: because the trajectory is an unknown, measurements of it can initialise
-# it.
+# the true damping. The initial guess of the positions is the measured positions themselves. This
+# possibility is an advantage of collocation: because the trajectory is an unknown, measurements
+# of the trajectory can serve as its initial guess.
 
 
 # %%
@@ -252,10 +252,11 @@ plt.show()
 #
 # ### Shooting methods and local minima
 #
-# A *shooting* method simulates the motion with trial parameters and minimises the difference to
-# the measurements. As a function of $k$ (with the true $c$), its loss has local minima: at a wrong
-# frequency the simulated and the measured oscillation lose their phase relation. A descent method
-# started outside the basin of the global minimum converges to a local one.
+# A *shooting* method simulates the motion with trial parameters and minimises the difference
+# between simulation and measurements. As a function of $k$ (with the true $c$), the loss of
+# shooting has local minima: at a wrong frequency the simulated and the measured oscillation lose
+# their phase relation. If a descent method starts outside the basin of the global minimum, it
+# converges to a local minimum.
 
 # %%
 trials = np.geomspace(4, 400, 600)
@@ -302,12 +303,14 @@ plt.show()
 
 # %% [markdown]
 # Collocation has the same global minimum, but its iterates need not satisfy the equations of
-# motion. Started at the measured trajectory, its first steps approximately solve a regression of
-# accelerations on positions and velocities, which is linear in $k$ and $c$.
+# motion. If collocation starts at the measured trajectory, its first steps approximately solve a
+# regression of accelerations on positions and velocities. This regression is linear in $k$ and
+# $c$.
 #
-# This advantage is not general. Local minima occur for an oscillation over many periods. For soft
-# bodies that swing once or twice, as in part 2, shooting with Gauss–Newton steps converged from as
-# many guesses within a factor of ten as collocation: 40 of 40 (`docs/studies.md`).
+# Collocation does not have this advantage in every problem, because the local minima of shooting
+# occur only for an oscillation over many periods. For soft bodies that swing once or twice, as in
+# part 2, shooting with Gauss–Newton steps converged from 40 of 40 guesses that were wrong by up
+# to a factor of ten, as many as with collocation (`docs/studies.md`).
 #
 # ### Sparsity
 #
@@ -339,9 +342,9 @@ plt.show()
 #
 # The derivatives at the solution also give the covariance of the estimates. To first order, the
 # unknowns can change only along directions $N$ that preserve the equations of motion: the null
-# space of the constraint Jacobian. It has three dimensions here, because $k$, $c$ and $x_0$
-# determine the trajectory. Restricted to these directions, the loss is that of linear least
-# squares, hence
+# space of the constraint Jacobian. For the spring, this null space has three dimensions, because
+# $k$, $c$ and $x_0$ determine the trajectory. Restricted to these directions, the loss is that of
+# linear least squares, hence
 #
 # $$\operatorname{cov}(z) = N\,\big(N^T H^T H N / \sigma^2\big)^{-1} N^T,$$
 #
@@ -435,14 +438,14 @@ plt.show()
 # ## 1.2 Penalty or constraint?
 #
 # The paper on which this toolbox is based did not impose the equations of motion as constraints.
-# It added their squared residuals to the loss,
+# Instead, it added the squared residuals of these equations to the loss,
 #
 # $$\min_{\theta,\,x}\ \sum_t \Big(\frac{x_t - y_t}{\sigma}\Big)^2 + \frac\rho2 \sum_t c_t^2,$$
 #
-# and minimised by nonlinear conjugate gradients (CG). This needs neither constraints nor linear
-# systems, but a value of the penalty weight $\rho$. The next cells compare seven values and two
-# minimisers: Newton's method run to convergence, and 1000 iterations of CG, a realistic budget for
-# a large mesh.
+# and minimised the sum by nonlinear conjugate gradients (CG). This penalty method needs neither
+# constraints nor the solution of linear systems, but it needs a value of the penalty weight
+# $\rho$. The next cells compare seven values of $\rho$ and two minimisers: Newton's method until
+# it converges, and 1000 iterations of CG, which is a realistic number for a large mesh.
 
 # %%
 rho = ca.SX.sym("rho")
@@ -528,11 +531,12 @@ plt.show()
 # - **Large ρ:** the minimum approaches the constrained solution, but the condition number grows in
 #   proportion to ρ. CG does not converge within its budget: the residuals of the equations of
 #   motion are smaller, but the parameters are wrong.
-# - **Between them** both errors are present, and the data give no criterion for the choice of ρ.
+# - **Intermediate ρ:** both errors are present, and the data give no criterion for the choice of
+#   ρ.
 #
-# Constraints need no such weight. They require the solution of a linear system in each iteration,
-# which is inexpensive because the system is sparse. In Table I of the paper, the penalty method
-# gave λ = 734 Pa and μ = 183 Pa for true values of 200 and 300 Pa.
+# With constraints, no such weight is needed. Each iteration requires the solution of a linear
+# system, which is inexpensive because the system is sparse. In Table I of the paper, the penalty
+# method gave λ = 734 Pa and μ = 183 Pa for true values of 200 and 300 Pa.
 
 # %%
 best_deviation, best_violation = min(outcomes["CG, 1000 iterations"])
@@ -552,9 +556,10 @@ assert best_deviation > 3
 # $$c_t = f\Big(x_t, \frac{x_t - x_{t-1}}{\Delta t}\Big)
 # - m\,\frac{x_t - 2x_{t-1} + x_{t-2}}{\Delta t^2} = 0.$$
 #
-# This scheme has numerical damping: an oscillation of angular frequency $\omega$ decays as if its
-# damping ratio were larger by about $\omega\Delta t/2$. At a step of 10 ms this is 0.1, five times
-# the damping ratio of the spring, 0.02. A fit compensates by an estimate of $c$ that is too small.
+# Backward Euler has numerical damping: an oscillation of angular frequency $\omega$ decays as if
+# its damping ratio were larger by about $\omega\Delta t/2$. At a step of 10 ms this numerical
+# damping ratio is 0.1, five times the damping ratio of the spring, which is 0.02. A fit
+# compensates the numerical damping by an estimate of $c$ that is too small.
 
 
 # %%
@@ -631,13 +636,13 @@ plt.show()
 
 # %% [markdown]
 # If the numerical damping exceeds the damping of the spring, the estimate of $c$ is at its lower
-# bound, zero. At larger steps the stiffness is also biased, by 5 % at the largest step. The solver
-# converges without a warning. The **midpoint rule** has no numerical damping; it lowers the
-# frequency, and this error decreases with $\Delta t^2$.
+# bound, zero. For large steps the stiffness is biased too, by 5 % for the largest step. The
+# solver converges without a warning. The **midpoint rule** has no numerical damping; it lowers
+# the frequency, and this error decreases with $\Delta t^2$.
 #
-# For every scheme, **substeps** reduce the error: a time grid finer than the sampling times. To
-# check the number of substeps, double it. If an estimate changes by more than its standard error,
-# the smaller number was insufficient.
+# For every scheme, the error becomes smaller with **substeps**, that is, with several time steps
+# between two sampling times. To check whether the number of substeps is sufficient, double it. If
+# an estimate changes by more than its standard error, the smaller number was insufficient.
 
 # %%
 euler = by_scheme["backward Euler"]
@@ -918,10 +923,11 @@ measured = reference + CORNER_SIGMA * np.random.default_rng(4).normal(
 # %% [markdown]
 # ### Nonlinear program
 #
-# The program has the structure of the spring's, with three force components. Only the free corner
-# is unknown; the positions of the held corners are prescribed. One more equation states the
-# initial static equilibrium, $f(x_0, 0) = 0$. The parameters are represented by their logarithms
-# $q$, so that steps of the solver are relative changes for moduli and damping alike.
+# The program has the same structure as that of the spring, with three force components instead of
+# one. Only the free corner is unknown; the positions of the held corners are prescribed. One more
+# equation states the initial static equilibrium, $f(x_0, 0) = 0$. The parameters are represented
+# by their logarithms $q$, so that steps of the solver are relative changes for moduli and damping
+# alike.
 
 
 # %%
@@ -975,8 +981,9 @@ print(
 )
 
 # %% [markdown]
-# The standard errors follow from the null space as before. It has three dimensions, one for each
-# parameter, because the initial equilibrium determines the initial position.
+# As for the spring, the standard errors follow from the null space of the constraint Jacobian.
+# Here the null space has three dimensions, one for each parameter, because the initial
+# equilibrium determines the initial position.
 
 # %%
 sponge_rows = ca.jacobian(sponge["g"], sponge["x"])
@@ -1047,8 +1054,8 @@ plt.show()
 # 3. **Hardening spring.** Add $\tfrac14 k_3 x^4$ to the energy, simulate data with
 #    $k_3 = 4000\ \mathrm{N/m^3}$, and estimate $k$, $c$ and $k_3$. Compare the standard errors of
 #    $k_3$ for initial displacements of 50 mm and 10 mm.
-# 4. **Rigid rotation.** Rotate the tetrahedron by 30° without deformation. What is its energy with
-#    the material `neo-hookean`, and with `linear`? When is the latter applicable?
+# 4. **Rigid rotation.** Rotate the tetrahedron by 30° without deformation. What is its energy
+#    with the material `neo-hookean`, and with `linear`? When is the material `linear` applicable?
 #
 # Next part: [2 · Cylinder](2_cylinder.ipynb)
 #
@@ -1070,8 +1077,9 @@ for h in (0.05, 0.2, 1.0):
 
 # %% [markdown]
 # **2.** Without every second sample, both standard errors increase by a factor of $\sqrt2$. The
-# second half contains more information, because the effects of an error of the frequency and of
-# the damping grow with time. Without it, the standard error of $k$ increases most.
+# second half of the recording contains more information than the first half, because the effects
+# of an error of the frequency and of the damping grow with time. Without the second half, the
+# standard error of $k$ increases most.
 
 # %% jupyter={"source_hidden": true}
 N = null_space_at((k_estimate, c_estimate), trajectory)
@@ -1154,9 +1162,9 @@ assert k3_errors[1] > 10 * k3_errors[0]
 
 # %% [markdown]
 # **4.** The energy is zero for `neo-hookean`, because $F^TF$ is invariant under rotation. The
-# material `linear` uses the strain $\operatorname{sym}F - I$, which is not zero for a rotation. It
-# is applicable only if no part of the body rotates by more than a few degrees, hence not to
-# swung bodies.
+# material `linear` uses the strain $\operatorname{sym}F - I$, which is not zero for a rotation.
+# The material `linear` is applicable only if no part of the body rotates by more than a few
+# degrees, hence not to swung bodies.
 
 # %% jupyter={"source_hidden": true}
 rotated = Rotation.from_rotvec([0, np.pi / 6, 0]).apply(corners)

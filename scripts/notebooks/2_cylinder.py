@@ -19,7 +19,8 @@
 # [3 · Trust](3_trust.ipynb)
 #
 # This part estimates the material parameters of a foam cylinder from a recording in which a robot
-# swings it. The method is that of part 1, applied by the toolbox to a mesh of 198 tetrahedra.
+# swings the cylinder. The method is that of part 1; the toolbox applies it to a mesh of 198
+# tetrahedra.
 #
 # **You will learn** how
 #
@@ -91,7 +92,7 @@ print((CYLINDER / "problem.toml").read_text())
 
 # %% [markdown]
 # `cs.run` solves the problem, verifies the solution by a forward simulation, and computes the
-# uncertainties. `run.solution` holds the solution of the nonlinear program.
+# uncertainties. `run.solution` is the solution of the nonlinear program.
 
 # %%
 problem = cs.Problem.read(CYLINDER / "problem.toml")
@@ -203,8 +204,8 @@ plt.show()
 # %% [markdown]
 # ## 2.2 Interior-point and reduced-space methods
 #
-# The method `interior-point` passes the complete nonlinear program to IPOPT, as in part 1. Here
-# this takes about 20 s, most of it for the factorisation of linear systems.
+# The method `interior-point` passes the complete nonlinear program to IPOPT, as in part 1. For
+# this cylinder, IPOPT takes about 20 s, most of it for the factorisation of linear systems.
 #
 # The method `reduced-space` eliminates the trajectory: for given parameters $\theta$ the equations
 # of motion determine the positions $X$. The linearised equations of motion are
@@ -214,8 +215,8 @@ plt.show()
 # \mathrm d\theta.$$
 #
 # The matrix $c_X$ is block lower triangular in time. Hence $p$ and $Z$ require one sparse
-# factorisation for each time step, and the remaining least-squares problem has only four unknowns.
-# Its optimum is that of the nonlinear program.
+# factorisation for each time step, and the remaining least-squares problem has only four
+# unknowns. The optimum of the reduced-space method is that of the nonlinear program.
 #
 # The Jacobian has the structure found for the tetrahedron: four dense columns and a band of blocks
 # with the sparsity of the mesh.
@@ -320,10 +321,11 @@ assert solutions["backward-euler", 4].rms_m < 1.05e-3 * noise_mm
 assert abs(solutions["midpoint", 2].parameters["gamma_m_1_s"] / 1.5 - 1) < 0.1
 
 # %% [markdown]
-# With one step of 10 ms per sample, the numerical damping of backward Euler exceeds the damping of
-# the material: both damping parameters are at their lower bounds, and $E$ and $\nu$ are biased.
-# The RMS distance of about twice the noise indicates the error. With four substeps the moduli are
-# nearly correct, but $\gamma_r$ is still too small, and the RMS distance no longer indicates it.
+# With one step of 10 ms per sample, the numerical damping of backward Euler exceeds the damping
+# of the material: both damping parameters are at their lower bounds, and $E$ and $\nu$ are
+# biased. The RMS distance of about twice the noise indicates the error. With four substeps the
+# moduli are nearly correct. The estimate of $\gamma_r$ is still too small, and the RMS distance
+# no longer indicates this error.
 #
 # ## 2.5 Bring your own data
 #
@@ -341,7 +343,7 @@ assert abs(solutions["midpoint", 2].parameters["gamma_m_1_s"] / 1.5 - 1) < 0.1
 #     collocation-sysid check my_object/problem.toml      # finds mistakes before a solve
 #     collocation-sysid solve my_object/problem.toml      # writes a run folder
 #
-# The following cells use copies of the cylinder's files in place of your own.
+# In the following cells, copies of the files of the cylinder take the place of your own files.
 
 # %%
 MY_PROBLEM = """
@@ -397,8 +399,8 @@ for name, source in (
 # %% [markdown]
 # ### Error messages
 #
-# An invalid problem file raises `cs.InputError`. Its message states file, key, the value found and
-# the values expected:
+# An invalid problem file raises `cs.InputError`. The error message states the file, the key, the
+# value found and the values expected:
 
 # %%
 misspelt = MY_PROBLEM.replace("mass_kg = 0.012", "mass_g = 12")
@@ -415,9 +417,9 @@ else:
 #
 # `collocation-sysid check` reports the size of the problem, the distance of the markers from the
 # body, whether the time grid resolves the vibrations of the body, and probable mistakes. In a
-# terminal the command is `collocation-sysid check problem.toml`; the cell runs the same command
-# from Python. (A finer mesh, which the advice may recommend, is not needed here, because the data
-# were simulated with this mesh.)
+# terminal the command is `collocation-sysid check problem.toml`; the next cell runs the same
+# command from Python. (A finer mesh, which the advice may recommend, is not needed here, because
+# the data were simulated with this mesh.)
 
 # %%
 (folder / "problem.toml").write_text(MY_PROBLEM)
@@ -459,11 +461,11 @@ print(my_run)
 # %% [markdown]
 # Before you use an estimate, answer these questions in this order:
 #
-# 1. Does the RMS distance agree with the noise of the measurements? If it is larger, the model
-#    lacks an effect.
+# 1. Does the RMS distance agree with the noise of the measurements? If the RMS distance is
+#    larger, the model lacks an effect.
 # 2. Do the estimates remain the same with twice the number of substeps, and with a finer mesh or
 #    `tet10` elements? (Linear tetrahedra are too stiff in bending, and near ν = 0.5 they lock.)
-#    `collocation-sysid refine` measures both errors.
+#    The command `collocation-sysid refine` measures the errors of time step and mesh.
 # 3. Are the residuals uncorrelated? Is a recording that was not fitted (`validation = true`)
 #    predicted equally well?
 # 4. How large are the combined intervals, and which effects contribute most? See part 3.
@@ -483,11 +485,11 @@ print(my_run)
 # ## Solutions
 #
 # **1.** The cell prints the changes of the logarithms of the parameters in units of their
-# statistical standard errors. From 1 to 2 substeps, μ changes by about three standard errors, from
-# 2 to 4 by 0.8. The error decreases with $\Delta t^2$, so that the remaining change beyond 4
-# substeps is about a third of the last one. With 2 substeps the error of μ is therefore about one
-# standard error, with 4 substeps a quarter. The values in `run.estimates` are corrected for the
-# estimated error of the time step.
+# statistical standard errors. From 1 to 2 substeps, μ changes by about three standard errors;
+# from 2 to 4 substeps, it changes by 0.8 standard errors. The error decreases with $\Delta t^2$,
+# so that the remaining error with 4 substeps is about a third of the change from 2 to 4 substeps.
+# With 2 substeps the error of μ is therefore about one standard error, with 4 substeps a quarter.
+# The values in `run.estimates` are corrected for the estimated error of the time step.
 
 # %% jupyter={"source_hidden": true}
 uncertainty = run.uncertainty
@@ -513,8 +515,8 @@ assert np.max(np.abs(changes[2])) < 1.5
 #
 # The fit determines the positions to some tenths of a millimetre. Positions measured to 1 mm
 # (`reference_sigma_m = 0.001`) therefore add nothing, whereas positions measured to 0.1 mm
-# (`reference_sigma_m = 0.0001`) reduce the standard errors. Compared with exactly known positions,
-# a stated standard deviation also limits the bias due to a wrong position.
+# (`reference_sigma_m = 0.0001`) reduce the standard errors. Stating a standard deviation instead
+# of exact positions also limits the bias that a wrong position causes.
 
 # %% jupyter={"source_hidden": true}
 first = MY_PROBLEM.index("[experiment.markers.reference_m]")

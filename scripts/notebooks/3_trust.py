@@ -73,8 +73,9 @@ PROBLEMS = next(
 # %% [markdown]
 # ## 3.1 Correlation of the estimates
 #
-# The run of part 2. The data are synthetic; the true values are listed for comparison. The printed
-# standard errors are statistical: they describe the effect of the noise only.
+# The next cell repeats the run of part 2. The data are synthetic, so that the true values can be
+# listed for comparison. The printed standard errors are statistical: they describe the effect of
+# the noise only.
 
 # %%
 TRUE_VALUES = {
@@ -188,14 +189,16 @@ plt.show()
 #
 # ## 3.2 Profile likelihood
 #
-# A standard error assumes that the loss is a quadratic function of the logarithm of the parameter.
-# The **profile likelihood** does not: for each value of one parameter, all others are fitted, and
-# the increase of the minimum loss is computed. The 95 % interval ends where the increase is 3.84,
-# the 95 % quantile of the χ² distribution with one degree of freedom.
+# A standard error assumes that the loss is a quadratic function of the logarithm of the
+# parameter. The **profile likelihood** makes no such assumption: for each value of one parameter,
+# all other parameters are fitted, and the increase of the minimum loss is computed. The 95 %
+# interval ends where this increase is 3.84, the 95 % quantile of the χ² distribution with one
+# degree of freedom.
 #
-# The difference is visible in a poor experiment: only one marker at half length, and a noise of
-# 3 mm instead of 0.5 mm. The parameters are now $E$ and ν instead of λ and μ. One step per sample
-# is sufficient, because the noise exceeds the error of the time step.
+# The difference between both is visible in a poor experiment, with only one marker, at half the
+# length of the cylinder, and noise of 3 mm instead of 0.5 mm. The parameters are now $E$ and ν
+# instead of λ and μ. One step per sample is sufficient, because the noise exceeds the error of
+# the time step.
 
 # %%
 is_kept = np.array(markers.names) == "middle_1"
@@ -263,10 +266,10 @@ assert low < TRUE_VALUES["poisson"] < high
 assert high - low > 0.3
 
 # %% [markdown]
-# The profile deviates strongly from the quadratic function. Small values of ν are hardly excluded;
-# the upper end of the interval is where the foam becomes nearly incompressible. The relative
-# standard error of $E$ is 7 %, but ν is practically not identified. No numerical
-# method can change this, because the measurements do not contain the information. Possible
+# The profile deviates strongly from the quadratic function. Small values of ν are hardly
+# excluded; the upper end of the interval is where the foam becomes nearly incompressible. The
+# relative standard error of $E$ is 7 %, but ν is practically not identified. No numerical method
+# can identify ν better, because the measurements do not contain the information. Possible
 # remedies are more markers, a motion with more twist and shear, or a value of ν from another
 # source, as a prior or as a fixed value.
 #
@@ -469,12 +472,13 @@ assert young_errors["auto"] > 1.5 * young_errors["independent"]
 # ## 3.5 Choice of the motion
 #
 # The standard errors depend on the motion. `collocation-sysid design` computes a motion that
-# minimises them within the limits of a robot, for all parameters or for some of them
-# (`--for poisson`). For this cylinder, two seconds and limited acceleration, the motion for
-# $\nu$ gives standard errors of 0.34 % for ν and 0.30 and 0.46 % for the damping parameters; the
-# motion for the damping parameters gives 0.65 %, 0.17 and 0.21 % (`docs/howto/design.md`). The
-# first is a translation at 3 Hz with hardly any rotation, the second is slower, larger and
-# contains a rotation.
+# minimises them within the limits of a robot, for all parameters or for some of them (`--for
+# poisson`). For this cylinder, two motions of two seconds with limited acceleration were computed
+# (`docs/howto/design.md`). The motion for ν gives standard errors of 0.34 % for ν, and of 0.30
+# and 0.46 % for the damping parameters. The motion for the damping parameters gives 0.65 % for ν,
+# and 0.17 and 0.21 % for the damping parameters. The motion for ν is a translation at 3 Hz with
+# hardly any rotation; the motion for the damping parameters is slower and larger, and contains a
+# rotation.
 #
 # ## 3.6 Combined interval and verdict
 #
@@ -491,9 +495,9 @@ print(run.table())
 
 # %% [markdown]
 # The columns `± stat` and `± syst` are the statistical and the systematic part. Although the data
-# are synthetic, the toolbox includes the effects that a real recording would have; the problem file
-# excludes only one of them (`damping_law = "none"`). For purely synthetic data,
-# `cs.Assumptions.exact()` excludes all.
+# are synthetic, the toolbox includes the effects that a real recording would have; the problem
+# file excludes only one of them (`damping_law = "none"`). For purely synthetic data,
+# `cs.Assumptions.exact()` excludes all of these effects.
 
 # %%
 names = [
@@ -574,9 +578,9 @@ for name in names:
 #
 # The **verdict** summarises the checks of a run: `good` (no reason for doubt was found), `check`
 # (usable after checking the listed reasons) or `doubtful` (something is wrong with the data, the
-# model or the solution). It considers convergence, the size and the pattern of the residuals,
-# parameters at a bound, the forward simulation, the discretisation error, and the width of the
-# combined intervals ([verdict](../../docs/howto/verdict.md)).
+# model or the solution). The verdict considers convergence, the size and the pattern of the
+# residuals, parameters at a bound, the forward simulation, the discretisation error, and the
+# width of the combined intervals ([verdict](../../docs/howto/verdict.md)).
 
 # %%
 print("verdict:", run.trust.verdict)
@@ -603,8 +607,8 @@ assert run.trust.verdict == "check"
 #
 # ## Solutions
 #
-# **1.** A run for each marker. The markers at the tip give smaller standard errors than those at
-# half length, because their displacement is larger.
+# **1.** The cell makes a run for each marker. The markers at the tip give smaller standard errors
+# than those at half the length of the cylinder, because the displacement of the tip is larger.
 
 # %% jupyter={"source_hidden": true}
 single = {}

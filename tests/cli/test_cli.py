@@ -883,7 +883,13 @@ def test_the_template_names_only_what_there_is(tmp_path, monkeypatch):
     ]
     # A surface takes the place of a mesh, a gripper's markers that of its poses or displacement; a
     # motion that of equilibria.
-    left_out = ("mesh =", "poses =", "displacement =", "kind =")
+    left_out = (
+        "mesh =",
+        "poses =",
+        "displacement =",
+        "gripper_to_body =",
+        "kind =",
+    )
     text = "\n".join(line for line in whole if not line.startswith(left_out))
     (tmp_path / "all.toml").write_text(text)
     file, _ = read_problem_file(tmp_path / "all.toml")

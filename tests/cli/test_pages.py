@@ -38,8 +38,8 @@ def test_a_page_is_shown_with_its_links_as_topics():
     shown = run_command("explain", "trust").out
     assert shown.startswith("# When the answer can't be trusted\n")
     assert (
-        "The verdict (`explain verdict`) says which of these is the case."
-        in shown
+        "The verdict (`explain verdict`) of a run names the problems of its result."
+        in " ".join(shown.split())
     )
     for topic in page_files():
         assert ".md)" not in page_text(topic), topic

@@ -15,7 +15,7 @@ from kit.problem_files import EXPERIMENT, PROBLEM, run_command, write_problem
 from kit.problems import TRUTH, as_theta, box, hung_cube, smooth_poses, times
 from kit.region_files import TWO_REGIONS
 from kit.static import block
-from kit.wrenches import fitted
+from kit.wrenches import fitted, predicted_wrenches
 
 from collocation_sysid import Unknown
 from collocation_sysid.errors import InputError
@@ -174,7 +174,7 @@ def load_n(experiment: Experiment) -> np.ndarray:
         collocation.transcriptions[0].dynamics.with_theta(as_theta(TRUTH)),
     )
     (part,) = collocation.iterates_at(np.zeros(0), [x])
-    return part.predict_wrenches()[0][:, 2]
+    return predicted_wrenches(part)[0][:, 2]
 
 
 @pytest.mark.long

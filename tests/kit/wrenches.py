@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from collocation_sysid.model.parameters import Parameters
-from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.collocation import Collocation, ExperimentIterate
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
+from collocation_sysid.program.wrench_residual import predict_wrenches
 from collocation_sysid.recording import Experiment, Nuisance, Wrench
 from kit.problems import TRUTH, as_theta, hung_cube, measured_with
 
@@ -93,7 +94,12 @@ def sensed(
         experiment, segment.dynamics.with_theta(as_theta(truth))
     )
     (part,) = collocation.iterates_at(np.zeros(collocation.nphi), [x])
-    return with_wrenches(made, part.predict_wrenches())
+    return with_wrenches(made, predicted_wrenches(part))
+
+
+def predicted_wrenches(part: ExperimentIterate) -> list[np.ndarray]:
+    """What each sensor of an experiment reads by the model."""
+    return predict_wrenches(part.segment.sensors, part.reactions, part.phi)
 
 
 def wristed_cube(

@@ -13,7 +13,12 @@ from collocation_sysid.common.declarations import documented, keys_of
 from collocation_sysid.common.schema_tables import Section
 from collocation_sysid.fem.spatial_field import Field
 from collocation_sysid.model.parameters import PARAMETER_KEYS, Unknown
-from collocation_sysid.problem import load_schema, recording_schema, schema
+from collocation_sysid.problem import (
+    depth_section,
+    load_schema,
+    recording_schema,
+    schema,
+)
 from collocation_sysid.problem.problem_options import (
     RolloutOptions,
     UncertaintyOptions,
@@ -46,8 +51,8 @@ SECTIONS: dict[type, type[Section]] = {
     Obstacle: recording_schema.ObstacleSection,
     Markers: recording_schema.MarkersSection,
     Gauge: recording_schema.ReadingSection,
-    Depth: recording_schema.DepthSection,
-    DepthCamera: recording_schema.DepthCameraSection,
+    Depth: depth_section.DepthSection,
+    DepthCamera: depth_section.DepthCameraSection,
     Experiment: recording_schema.ExperimentSection,
     **{
         kind: getattr(load_schema, f"{kind.__name__}Section")

@@ -166,7 +166,7 @@ def test_an_option_is_told_with_its_default_and_what_it_can_be():
         in told
     )
     assert (
-        "hessian gauss-newton gauss-newton, exact; Once a step moves no parameter"
+        "hessian gauss-newton gauss-newton, exact; Second derivatives that Gauss–Newton neglects"
         in told
     )
     assert "by more than 10 %" in told

@@ -69,7 +69,7 @@ def test_starts_do_not_influence_each_other():
     normals = rng.normal(size=(60, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     moved = Rotation.from_rotvec([0.05, -0.02, 0.03]).apply(places) + 0.02
-    tree = camera_alignment.KDTree(moved)
+    cloud = camera_alignment.ExactCloud(moved)
     starts = [
         camera_alignment.AlignedPose(Rotation.from_rotvec(turn), np.zeros(3))
         for turn in ([0, 0, 0], [0.1, 0, 0], [0, -0.1, 0])
@@ -78,7 +78,7 @@ def test_starts_do_not_influence_each_other():
     def aligned(some):
         return camera_alignment.iterate_alignments(
             _Camera(),
-            tree,
+            cloud,
             places=places,
             normals=normals,
             gates=np.geomspace(0.5, 0.02, 12),
@@ -99,6 +99,22 @@ def test_starts_do_not_influence_each_other():
     np.testing.assert_allclose(
         together[0].rotation.as_rotvec(), [-0.05, 0.02, -0.03], atol=2e-3
     )
+
+
+def test_points_of_a_gridded_cloud_are_nearly_the_nearest():
+    rng = np.random.default_rng(3)
+    points = rng.uniform(size=(200, 3))
+    cell = 0.05
+    gridded = camera_alignment.GriddedCloud(points, cell_m=cell, margin_m=0.3)
+    exact = camera_alignment.ExactCloud(points)
+    places = rng.uniform(-0.3, 1.3, size=(40, 10, 3))
+    distances = [
+        np.linalg.norm(points[cloud.nearest(places)] - places, axis=2)
+        for cloud in (gridded, exact)
+    ]
+    assert np.all(distances[0] <= distances[1] + 2 * np.sqrt(3) * cell)
+    # Beyond the grid as well, there is a point.
+    assert exact.nearest(places + 5).shape == gridded.nearest(places + 5).shape
 
 
 def test_poses_that_hardly_differ_count_once():

@@ -18,7 +18,14 @@ from kit.problems import (
     times,
 )
 from kit.wrench_kinds import pressed
-from kit.wrenches import EVERYTHING, felt, fitted, sensing, wristed_cube
+from kit.wrenches import (
+    EVERYTHING,
+    felt,
+    fitted,
+    predicted_wrenches,
+    sensing,
+    wristed_cube,
+)
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.methods.comparison.shooting import simulate_variables
@@ -201,9 +208,9 @@ def test_samples_between_grid_times_are_read_to_the_third_order():
         slow = replace(cube, t_s=t_s, markers=replace(cube.markers, t_s=t_s))
         fine = np.linspace(0.03, 0.13, 87)
         part = at_truth(sensing(slow, fine))
-        (read,) = part.predict_wrenches()
+        (read,) = predicted_wrenches(part)
         dense = at_truth(sensing(slow, fine), substeps=8 // refinement)
-        (expected,) = dense.predict_wrenches()
+        (expected,) = predicted_wrenches(dense)
         errors.append(relative_error(read[:, :3], expected[:, :3]))
     assert errors[1] < 0.4 * errors[0]
 

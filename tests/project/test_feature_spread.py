@@ -19,14 +19,12 @@ from collocation_sysid.features.registry import FEATURES, merged_fields
 
 PACKAGE = Path(collocation_sysid.__file__).parent
 # Largest number of files that mention a feature.
-LIMITS = {"contact": 27, "depth": 47, "wrench": 32}
+LIMITS = {"contact": 25, "depth": 42, "wrench": 25}
 # Layers that iterate over features or use neutral interfaces, with the files in which a name is
-# part of the output, or that handle one kind of measurement: a search with many points of cameras
-# begins with thinned clouds.
+# part of the output.
 NEUTRAL = {
     "runs": {
         "check/__init__.py": {"wrench"},
-        "thinned_start.py": {"depth"},
     },
 }
 WORDS = re.compile("|".join(LIMITS), re.IGNORECASE)

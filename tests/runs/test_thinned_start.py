@@ -69,7 +69,7 @@ def standard_error(solution: cs.Solution) -> float:
 
 
 def test_thinned_points_are_measured_ones_and_few(many):
-    thinned = thinned_start.thinned_depth(depth())
+    thinned = depth().thinned(400)
     (cloud,) = thinned.clouds
     (given,) = depth().clouds
     assert len(given) > 1000
@@ -80,7 +80,6 @@ def test_thinned_points_are_measured_ones_and_few(many):
 
 
 def test_few_points_are_not_thinned():
-    assert thinned_start.thinned_depth(depth()) is depth()
     assert thinned_start.thinned_problem(problem()) is None
 
 

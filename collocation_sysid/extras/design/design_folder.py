@@ -16,15 +16,11 @@ import tomli_w
 from scipy.spatial.transform import RigidTransform
 
 from ...common.serialisation import as_json, content
+from ...features.registry import FEATURES
 from ...problem.gripper_transforms import gripper_transforms
 from ...problem.recording_schema import MovedSection
 from ...problem.schema import with_experiment_defaults
-from ...recording import (
-    PoseSequence,
-    write_markers_csv,
-    write_poses_csv,
-    write_wrench_csv,
-)
+from ...recording import PoseSequence, write_poses_csv
 from ...result.animation import film
 from ...result.pictures.album import save_pictures
 from ...result.replay import MotionRecord
@@ -34,8 +30,6 @@ from .motion_design import Design, ErrorBars
 
 DESIGN_FILE = "design.json"
 POSES_FILE = "poses.csv"
-MARKERS_FILE = "predicted_markers.csv"
-WRENCH_FILE = "predicted_wrench.csv"
 PROBLEM_FILE = "problem.toml"
 FILM_FILE = "motion.gif"
 NAME = "designed"
@@ -45,16 +39,6 @@ SCHEMA = 1
 FRAMES_PER_SECOND = 25.0
 # Keys of a grasp that describe the file of its poses: files of a design have the package's format.
 OF_POSES = MovedSection.model_fields.keys() - {"gripper_to_body"}
-# Keys of markers that describe their file.
-OF_MARKERS = (
-    "names",
-    "labels",
-    "length_unit",
-    "rate_hz",
-    "template_m",
-    "template_window_s",
-    "max_template_residual_m",
-)
 # Keys whose texts are names of files, in any table.
 OF_FILES = (
     "mesh",
@@ -65,8 +49,6 @@ OF_FILES = (
     "tension",
     "pressure",
 )
-# Keys of a wrench that describe its file.
-OF_TABLE = ("columns", "axis", "sign", "area_m2", "symmetry")
 # Keys of an experiment that select samples, or exclude it from the fit.
 OF_TIME = ("window_s", "resample_hz", "every", "validation")
 HEAD = """\
@@ -84,9 +66,9 @@ def write_design(
 ) -> Path:
     """Write the folder of a design atomically, and return its path.
 
-    It contains the poses (poses.csv), the predicted markers and, with a sensor, the predicted
-    wrench, pictures, design.json, with `with_film` motion.gif, and, if the problem was read from a
-    file, problem.toml for the recording.
+    It contains the poses (poses.csv), the predicted measurements of each feature, pictures,
+    design.json, with `with_film` motion.gif, and, if the problem was read from a file, problem.toml
+    for the recording.
 
     Parameters
     ----------
@@ -111,16 +93,8 @@ def write_design(
         write_poses_csv(place / POSES_FILE, _gripper_poses(design))
         experiment = design.experiment
         markers = experiment.markers
-        write_markers_csv(
-            place / MARKERS_FILE,
-            markers.t_s,
-            names=markers.names,
-            positions_m=markers.positions_m,
-        )
-        for sensor, wrench in zip(
-            experiment.wrenches, design.predicted.wrenches, strict=True
-        ):
-            write_wrench_csv(place / WRENCH_FILE, sensor.t_s, values=wrench)
+        for feature in FEATURES:
+            feature.write_predicted(experiment, design.predicted, place)
         if design.recording.problem.origin is not None:
             text = HEAD + tomli_w.dumps(
                 _problem_content(design, target.resolve())
@@ -229,8 +203,8 @@ def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
     middle draw, coefficients of fields none. Existing recordings are kept only if they are used
     (`Design.added`).
 
-    The table of the new recording, the last one, is a copy of the template's that reads poses,
-    markers and wrench from the files of the design in `folder`, see `_designed_table`. Its name is
+    The table of the new recording, the last one, is a copy of the template's that reads poses and
+    measurements from the files of the design in `folder`, see `_designed_table`. Its name is
     "designed", or "designed_2" and so on if that name is used. Other file names become relative to
     `folder`, an absolute path. The problem must have been read from a file.
     """
@@ -268,12 +242,12 @@ def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
 
 
 def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
-    """Return the table of an experiment, modified in place, so that it reads poses, markers and
-    wrench from the files of the design beside the problem file.
+    """Return the table of an experiment, modified in place, so that it reads poses and measurements
+    from the files of the design beside the problem file.
 
-    Keys that select samples are removed (`OF_TIME`), and so are keys that describe the files of the
-    original, in the table of the first grasp (`OF_POSES`) and of the markers (`OF_MARKERS`).
-    Markers and wrench are changed only if the table has them.
+    Keys that select samples are removed (`OF_TIME`), and so are keys that describe the original
+    file of poses in the table of the first grasp (`OF_POSES`). Each feature changes what it reads,
+    see `Feature.read_predicted`.
 
     Parameters
     ----------
@@ -290,32 +264,9 @@ def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
     for key in OF_POSES:
         grasp.pop(key, None)
     grasp["poses"] = POSES_FILE
-    if "wrench" in grasp:
-        grasp["wrench"] = _designed_wrench(grasp["wrench"])
-    if "markers" in table:
-        for key in OF_MARKERS:
-            table["markers"].pop(key, None)
-        table["markers"]["file"] = MARKERS_FILE
+    for feature in FEATURES:
+        feature.read_predicted(table)
     return table
-
-
-def _designed_wrench(wrench: dict[str, Any]) -> dict[str, Any]:
-    """Return a copy of a wrench's table that reads the file of the design, in newtons and for the
-    modelled part of the body.
-
-    The keys of the original file (`OF_TABLE`), among them its columns and "symmetry", are left out;
-    `sigma_n` and `sigma_nm` are divided by "symmetry".
-    """
-    parts = wrench.get("symmetry", 1)
-    sigmas = {
-        key: wrench[key] / parts
-        for key in ("sigma_n", "sigma_nm")
-        if key in wrench
-    }
-    remaining = {
-        key: value for key, value in wrench.items() if key not in OF_TABLE
-    }
-    return remaining | sigmas | {"file": WRENCH_FILE}
 
 
 def _relative_to(value: Any, old: Path, new: Path) -> Any:

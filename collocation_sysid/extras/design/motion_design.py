@@ -56,11 +56,11 @@ class DesignOptions(Options):
     evaluations : int
         Number of motions that are simulated, after a first-order evaluation of ten times as many.
     pairs : int
-        Number of pairs of draws from the prior.
+        Number of pairs of draws of the parameters from their priors, in addition to the guess.
     spread : float
-        Factor by which guesses without a prior may be wrong.
+        Factor by which the guess of a parameter without a prior may be wrong.
     waves : int
-        Number of waves of each of the six coordinates.
+        Number of waves in the motion of each of the six coordinates of the hand.
     seed : int
         Seed of the search and of the draws.
     """

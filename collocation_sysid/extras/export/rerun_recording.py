@@ -456,7 +456,7 @@ class _Recording:
         """Write each component of forces and torques as measured, fitted and simulated, as far as
         they are finite; grasps with a sensor are numbered from 1.
         """
-        for series in replay.list_force_series():
+        for series in replay.sensor_series:
             t_s = series.columns[:, 0]
             values = series.columns[:, 1:].reshape(
                 len(t_s), 3, len(series.names)

@@ -27,10 +27,10 @@ from typing import Any
 
 import numpy as np
 
-from ...common.array_types import Array
 from ...errors import InputError, SimulationError
+from ...features.registry import FEATURES, merged_fields, prediction_residuals
 from ...fem.laws.constants import symbol_of, unit_of
-from ...methods.solution import Solution, pooled_wrench_rms
+from ...methods.solution import Solution
 from ...problem import Problem, RolloutOptions
 from ...recording.experiment import Experiment
 from ...recording.measurement_selection import without_later_measurements
@@ -710,11 +710,7 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     record: dict[str, Any] = {
         "status": solution.status.value,
         "converged": solution.status.converged,
-        "rms": {
-            "m": solution.rms_m,
-            "N": pooled_wrench_rms(solution)[0],
-            STRESS_UNIT: _pooled_stress_rms_pa(solution),
-        },
+        "rms": merged_fields(each.fit_rms(solution) for each in FEATURES),
         "parameters": parameter_values(solution.collocation, solution.q),
         "at_bound": _names_at_bounds(solution),
         "free": [item.name for item in problem.parameters.free],
@@ -840,57 +836,19 @@ def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
     return replace(problem, experiments=experiments), start_s
 
 
-def _stress_residuals_pa(
-    experiment: Experiment, predicted: Mapping[str, Array]
-) -> tuple[Array, Array]:
-    """Return times (S,) [s] and differences (S,), predicted less measured, of all stresses [Pa] of
-    a specimen together, in the order of time; NaN where not measured.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Test of a specimen, with at least one measured stress: a custom sensor with the unit Pa.
-    predicted : mapping of str to (S, 1) array
-        Prediction at the samples of each stress [Pa], by the name of the custom sensor.
-    """
-    stresses = [
-        gauge for gauge in experiment.readings if gauge.unit == STRESS_UNIT
-    ]
-    t_s = np.concatenate([gauge.sample_times_s for gauge in stresses])
-    differences = [
-        predicted[gauge.name] - gauge.measured_values for gauge in stresses
-    ]
-    order = np.argsort(t_s, kind="stable")
-    return t_s[order], np.concatenate(differences)[order, 0]
-
-
-def _pooled_stress_rms_pa(solution: Solution) -> float | None:
-    """Return the RMS residual of the stresses of all fitted specimens [Pa]; None without any."""
-    residuals = [
-        _stress_residuals_pa(
-            segment.experiment, solution.readings[segment.experiment.name]
-        )[1]
-        for segment in solution.collocation.transcriptions
-        if segment.experiment.specimen is not None
-    ]
-    if not residuals:
-        return None
-    return float(np.sqrt(np.nanmean(np.concatenate(residuals) ** 2)))
-
-
 def _prediction_error(
     experiment: Experiment, rollout: ForwardSimulation, start_s: float
 ) -> dict[str, Any]:
     """Return RMS, number of samples and sums of squares by block, of held-out measurements against
     a simulation.
 
-    The measurements are stresses [Pa] of a specimen without a mesh, else markers [m], or without
-    any the forces [N] on the complete specimen; "unit" says which. Missing ones (NaN) do not count.
+    The measurements are those of the first feature that is measured, see
+    `Feature.prediction_residuals`; "unit" says which. Missing ones (NaN) do not count.
 
     Parameters
     ----------
     experiment : Experiment
-        Recording with all its measurements; a specimen, or with markers or at least one wrench
+        Recording with all its measurements, at least one of a feature that judges predictions
         (otherwise `ValueError`).
     rollout : ForwardSimulation
         Simulation at the same samples, which must be finite: a marker that is NaN would not count
@@ -904,39 +862,19 @@ def _prediction_error(
         "rms" (None without samples), "unit", "samples" (number of marker positions, force vectors
         or stresses), and "blocks", `BLOCKS` sums of squares in the order of time.
     """
-    markers = experiment.markers
-    unit = "m"
-    t_s = experiment.t_s
-    residuals = rollout.trajectory.markers_m - markers.positions_m
-    is_counted = markers.is_present
-    if experiment.specimen is not None:
-        t_s, stresses_pa = _stress_residuals_pa(
-            experiment, rollout.predicted.readings
-        )
-        unit = STRESS_UNIT
-        residuals = stresses_pa[:, None, None]
-        is_counted = np.isfinite(residuals[:, :, 0])
-    elif not markers.count_samples():
-        t_s = np.concatenate([sensor.t_s for sensor in experiment.wrenches])
-        pairs = zip(
-            rollout.predicted.wrenches, experiment.wrenches, strict=True
-        )
-        residuals = np.concatenate(
-            [
-                sensor.symmetry * (read - sensor.values)[:, :3]
-                for read, sensor in pairs
-            ]
-        )
-        order = np.argsort(t_s, kind="stable")
-        unit = "N"
-        t_s = t_s[order]
-        residuals = residuals[order, None]
-        is_counted = np.asarray(np.isfinite(residuals).any(axis=2))
-    is_test_sample = t_s > start_s
-    squares = np.where(is_counted, np.nansum(residuals**2, axis=2), 0.0)[
-        is_test_sample
-    ]
-    samples = int(is_counted[is_test_sample].sum())
+    residuals = prediction_residuals(
+        experiment, rollout.trajectory, rollout.predicted
+    )
+    is_test_sample = residuals.t_s > start_s
+    squares = np.where(
+        residuals.is_counted, np.nansum(residuals.values**2, axis=2), 0.0
+    )[is_test_sample]
+    samples = int(residuals.is_counted[is_test_sample].sum())
     blocks = [float(np.sum(each)) for each in np.array_split(squares, BLOCKS)]
     rms = float(np.sqrt(squares.sum() / samples)) if samples else None
-    return {"rms": rms, "unit": unit, "samples": samples, "blocks": blocks}
+    return {
+        "rms": rms,
+        "unit": residuals.unit,
+        "samples": samples,
+        "blocks": blocks,
+    }

@@ -316,7 +316,8 @@ class RunOptions(Options):
     scheduler : ADDRESS
         Address of a dask.distributed scheduler; its workers need the same files.
     time_limit_s : --time-limit SECONDS
-        Time after which a run is stopped, loading included [s]; it counts as a failure.
+        Time after which a run is stopped, including the time for loading [s]; a stopped run counts
+        as a failure.
     """
 
     workers: AtLeastOne | None = None

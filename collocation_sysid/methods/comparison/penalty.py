@@ -111,8 +111,9 @@ class PenaltyOptions(Options):
     ----------
     inner : {"cg-descent", "scipy-cg", "l-bfgs-b", "levenberg-marquardt"}
         Solver that minimises the merit function: the conjugate gradients of Hager and Zhang as in
-        the paper, those of SciPy, a quasi-Newton method, or damped Newton steps with a sparse
-        factorisation, the only ones that come near a minimum at large ρ.
+        the paper ("cg-descent"), the conjugate gradients of SciPy ("scipy-cg"), a quasi-Newton
+        method ("l-bfgs-b"), or damped Newton steps with a sparse factorisation
+        ("levenberg-marquardt"), which alone come near a minimum at large ρ.
     rho : float
         First ρ; loss and constraints are in the scaling of the NLP, where both are of order one.
     rho_max : float
@@ -125,8 +126,8 @@ class PenaltyOptions(Options):
         Largest entry of the gradient at the end, in the scaling of the NLP; not less than 1e-14
         times the sum of ρ and the loss's largest curvature, because of rounding.
     violation : float
-        Largest violation of the equations of motion at the end, over the largest force in them. A
-        stage that ends within it ends the solve.
+        Largest violation of the equations of motion at the end, over the largest force in them. If
+        a stage ends with a smaller violation, the solve ends.
     max_iterations : int
         Largest number of iterations of all stages together.
     max_time_s : float

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from ...common.array_types import Array
+from ...common.array_types import Array, Index
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from .depth_camera_model import DepthCameraModel
 from .visible_surface import GRAZING, VisibleSurface
@@ -28,6 +29,12 @@ SAMPLES = 250
 ITERATIONS = 25
 # Initial gate, relative to the diagonal of the body.
 REACH = 0.35
+# Cells along the first gate of the grid that stands for the cloud with the wider half of the gates.
+CELLS_OF_REACH = 12
+# Largest number of its cells; larger grids take longer than exact searches.
+MOST_CELLS = 300_000
+# Number of nearest points of each point of the cloud, itself included, among which that grid searches.
+NEIGHBOURS = 8
 # Weight of the complete distance relative to that along the normal: points may slide.
 SLIDING = 0.2
 # Number of independent points that the points count as, relative to the prior.
@@ -64,6 +71,91 @@ class AlignedPose(NamedTuple):
     mismatch: float = 1.0
 
 
+class NearestPoints(Protocol):
+    """Search of the nearest points of a cloud."""
+
+    points_m: Array
+
+    def nearest(self, places: Array) -> Index:
+        """Return the indices (…) of the points nearest to places (…, 3) [m]."""
+        ...
+
+
+class ExactCloud:
+    """Cloud with exact nearest points.
+
+    Parameters
+    ----------
+    points_m : (P, 3) array
+        Points [m].
+    """
+
+    def __init__(self, points_m: Array) -> None:
+        self.points_m = points_m
+        self._tree = KDTree(points_m)
+
+    def nearest(self, places: Array) -> Index:
+        """Return the indices (…) of the points nearest to places (…, 3) [m]."""
+        return np.asarray(self._tree.query(places)[1])
+
+
+class GriddedCloud:
+    """Cloud with nearly nearest points: for each cell of a grid a point nearby is stored, and the
+    nearest of this point and its neighbours in the cloud is used.
+
+    It may be farther away than the nearest one by about the diagonal of a cell; places beyond the
+    grid have the points of its nearest cell.
+
+    Parameters
+    ----------
+    points_m : (P, 3) array
+        Points, P ≥ 1 [m].
+    cell_m : float
+        Edge of a cell [m].
+    margin_m : float
+        Distance by which the grid extends beyond the points [m].
+    """
+
+    def __init__(self, points_m: Array, cell_m: float, margin_m: float) -> None:
+        self.points_m = points_m
+        self._cell_m = cell_m
+        self._corner_m = points_m.min(axis=0) - margin_m
+        cells = self._cells(points_m)
+        self._last = cells.max(axis=0) + int(np.ceil(margin_m / cell_m))
+        point = np.full(self._last + 1, -1)
+        point[tuple(cells.T)] = np.arange(len(points_m))
+        occupied = np.asarray(
+            distance_transform_edt(
+                point < 0, return_distances=False, return_indices=True
+            )
+        )
+        self._nearest = point[tuple(occupied)]
+        count = min(NEIGHBOURS, len(points_m))
+        _, neighbours = KDTree(points_m).query(points_m, count)
+        self._neighbours = np.reshape(neighbours, (len(points_m), count))
+
+    @classmethod
+    def is_possible(
+        cls, points_m: Array, cell_m: float, margin_m: float
+    ) -> bool:
+        """Return whether the grid has at most `MOST_CELLS` cells; arguments as for the class."""
+        sides_m = np.ptp(points_m, axis=0) + 2 * margin_m
+        return bool(np.prod(sides_m / cell_m + 2) <= MOST_CELLS)
+
+    def _cells(self, places: Array) -> Index:
+        """Return the indices (…, 3) of the cells of places (…, 3) [m], also beyond the grid."""
+        return np.floor((places - self._corner_m) / self._cell_m).astype(int)
+
+    def nearest(self, places: Array) -> Index:
+        """Return the indices (…) of points nearly nearest to places (…, 3) [m]."""
+        cells = np.clip(self._cells(places), 0, self._last)
+        nearest = self._nearest[tuple(np.moveaxis(cells, -1, 0))]
+        candidates = self._neighbours[nearest]
+        ways = self.points_m[candidates] - places[..., None, :]
+        best = np.einsum("...ci,...ci->...c", ways, ways).argmin(axis=-1)
+        return np.take_along_axis(candidates, best[..., None], axis=-1)[..., 0]
+
+
 def thinned(cloud: Array) -> Array:
     """Return every k-th point of a cloud (P, c), evenly spread over its order, so that at most
     `ENOUGH` remain; the complete cloud (k = 1) if it has fewer.
@@ -72,7 +164,11 @@ def thinned(cloud: Array) -> Array:
 
 
 def align_camera(
-    camera: DepthCameraModel, surface: VisibleSurface, x: Array, image: int
+    camera: DepthCameraModel,
+    surface: VisibleSurface,
+    x: Array,
+    image: int,
+    start: tuple[Array, Array] | None = None,
 ) -> tuple[Array, Array]:
     """Return the rotation vector (3,) [rad] and translation (3,) [m] of the camera error that align
     the points of an image with a shape, see `DepthCameraModel.with_pose`.
@@ -93,6 +189,9 @@ def align_camera(
         Surface nodes [m].
     image : int
         Index of the image, which must have points.
+    start : ((3,) array, (3,) array), optional
+        The result for a similar shape, from which alone the search then starts, with the narrower
+        half of the gates.
     """
     rotations, translations = camera.poses
     corners = ((x - translations[image]) @ rotations[image])[
@@ -114,40 +213,74 @@ def align_camera(
     )
     normals = sides[chosen] / area[chosen, None]
     size_m = float(np.linalg.norm(np.ptp(x, axis=0)))
-    tree = KDTree(thinned(camera.depth.points_m[image]))
+    cloud = ExactCloud(thinned(camera.depth.points_m[image]))
     gates = np.geomspace(REACH * size_m, camera.depth.gate_m, ITERATIONS)
+    wide_gates, narrow_gates = np.array_split(gates, 2)
+    iterate = partial(
+        iterate_alignments, camera, places=places, normals=normals
+    )
+    if start is None:
+        candidates = _first_candidates(
+            cloud.points_m, places, gate_m=float(gates[0])
+        )
+        wide_cloud = _nearly_nearest(cloud, reach_m=float(gates[0]))
+        for some_gates in np.array_split(wide_gates, CHOICES):
+            candidates = distinct_poses(
+                iterate(cloud=wide_cloud, gates=some_gates, starts=candidates),
+                size_m=size_m,
+                same_m=SAME_POSE * some_gates[-1],
+            )
+    else:
+        turn, shift_m = start
+        candidates = [AlignedPose(Rotation.from_rotvec(turn), shift_m)]
+    best = min(
+        iterate(
+            cloud=cloud,
+            gates=narrow_gates,
+            starts=candidates[:CONTINUED_STARTS],
+        ),
+        key=lambda each: each.mismatch,
+    )
+    return best.rotation.as_rotvec(), best.translation_m
+
+
+def _nearly_nearest(cloud: ExactCloud, reach_m: float) -> NearestPoints:
+    """Return the cloud in a grid that extends by the first gate `reach_m` [m] beyond its points;
+    the cloud itself if that has too many cells, for example with a background far away.
+    """
+    grid = {"cell_m": reach_m / CELLS_OF_REACH, "margin_m": reach_m}
+    if GriddedCloud.is_possible(cloud.points_m, **grid):
+        return GriddedCloud(cloud.points_m, **grid)
+    return cloud
+
+
+def _first_candidates(
+    cloud_m: Array, places: Array, gate_m: float
+) -> list[AlignedPose]:
+    """Return the poses from which an alignment starts: the stated one and the one that puts the
+    cloud at the middle of the shape, each also rotated in both directions about each axis.
+
+    Parameters
+    ----------
+    cloud_m : (P, 3) array
+        Points of the cloud in the camera's frame [m].
+    places : (k, 3) array
+        Points of the surface in the camera's stated frame [m].
+    gate_m : float
+        Points of the cloud farther than this from all places do not count for its middle [m].
+    """
     rotation_vectors = np.vstack(
         [np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)]
     )
-    cropped_cloud = np.asarray(tree.data)[
-        KDTree(places).query(tree.data)[0] < gates[0]
-    ]
-    shifts = [
-        np.zeros(3),
-        places.mean(axis=0) - cropped_cloud.mean(axis=0)
-        if len(cropped_cloud)
-        else np.zeros(3),
-    ]
-    candidates = [
+    is_near = KDTree(places).query(cloud_m)[0] < gate_m
+    shifts = [np.zeros(3), np.zeros(3)]
+    if is_near.any():
+        shifts[1] = places.mean(axis=0) - cloud_m[is_near].mean(axis=0)
+    return [
         AlignedPose(Rotation.from_rotvec(turn), shift)
         for turn in rotation_vectors
         for shift in shifts
     ]
-    iterate = partial(
-        iterate_alignments, camera, tree, places=places, normals=normals
-    )
-    wide_gates, narrow_gates = np.array_split(gates, 2)
-    for some_gates in np.array_split(wide_gates, CHOICES):
-        candidates = distinct_poses(
-            iterate(gates=some_gates, starts=candidates),
-            size_m=size_m,
-            same_m=SAME_POSE * some_gates[-1],
-        )
-    best = min(
-        iterate(gates=narrow_gates, starts=candidates[:CONTINUED_STARTS]),
-        key=lambda each: each.mismatch,
-    )
-    return best.rotation.as_rotvec(), best.translation_m
 
 
 def distinct_poses(
@@ -181,7 +314,7 @@ def distinct_poses(
 
 def iterate_alignments(
     camera: DepthCameraModel,
-    tree: KDTree,
+    cloud: NearestPoints,
     places: Array,
     normals: Array,
     gates: Array,
@@ -193,7 +326,7 @@ def iterate_alignments(
     ----------
     camera : DepthCameraModel
         Model of the camera.
-    tree : KDTree
+    cloud : NearestPoints
         Points of the cloud in the camera's frame.
     places, normals : (P, 3) arrays
         Points of the surface with their normals, in the camera's stated frame.
@@ -216,7 +349,7 @@ def iterate_alignments(
     for gate in gates:
         matched = _match_surface(
             camera,
-            tree,
+            cloud,
             places=places,
             normals=normals,
             rotations=rotations,
@@ -263,7 +396,7 @@ class _MatchedSurface(NamedTuple):
 
 def _match_surface(
     camera: DepthCameraModel,
-    tree: KDTree,
+    cloud: NearestPoints,
     places: Array,
     normals: Array,
     rotations: Rotation,
@@ -276,8 +409,8 @@ def _match_surface(
     turns = rotations.as_matrix()
     moved = translations_m[:, None] + pivot
     # Cloud points p are at R (p − c) + c + d: the surface looks for them in their own frame.
-    _, nearest = tree.query((places - moved) @ turns + pivot)
-    arms_m = (np.asarray(tree.data)[nearest] - pivot) @ turns.swapaxes(1, 2)
+    nearest = cloud.nearest((places - moved) @ turns + pivot)
+    arms_m = (cloud.points_m[nearest] - pivot) @ turns.swapaxes(1, 2)
     is_facing = np.ones(nearest.shape, dtype=bool)
     if camera.depth.camera.matrix is not None:
         ways = (moved - (turns @ pivot)[:, None]) - places

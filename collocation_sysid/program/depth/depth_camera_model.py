@@ -98,6 +98,11 @@ class DepthCameraModel:
         return {}
 
     @cached_property
+    def alignments(self) -> list[Any]:
+        """Alignments of the camera with shapes so far, in their order; empty at first."""
+        return []
+
+    @cached_property
     def outline_expressions(self) -> dict[tuple[int, int], Any]:
         """Cache of the generated functions of its outline residuals, shared by all copies of the
         measurement model; empty at first.
@@ -128,6 +133,21 @@ class DepthCameraModel:
         clouds = self.depth.points_m
         pinhole = self.depth.camera.matrix is not None
         return [p / p[:, 2:] if pinhole else np.zeros_like(p) for p in clouds]
+
+    def share_alignments(self, other: DepthCameraModel) -> None:
+        """Store alignments together with another model of the camera from now on, if both give the
+        same: points, pivot and priors of the pose are equal.
+        """
+        is_same = (
+            self.depth is other.depth
+            and (self.pivot_m == other.pivot_m).all()
+            and all(
+                (self.prior_weights(row) == other.prior_weights(row)).all()
+                for row in (DEPTH_TURN, DEPTH_SHIFT)
+            )
+        )
+        if is_same:
+            vars(self)["alignments"] = other.alignments
 
     def corrected_expression(
         self, point: ca.SX, ray: ca.SX, values: Mapping[NuisanceRow, ca.SX]

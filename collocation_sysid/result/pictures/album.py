@@ -147,9 +147,9 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
                 t_s, measured, fitted_m=fitted, natural_hz=replay.natural_hz
             ),
         )
-    force_series = replay.list_force_series()
-    for series in force_series:
-        which = "" if len(force_series) == 1 else f"_{series.number}"
+    for series in replay.sensor_series:
+        count = len(replay.sensor_columns[series.kind])
+        which = "" if count == 1 else f"_{series.number}"
         yield (
             f"{series.kind}_{replay.name}{which}",
             sensor_picture(series.columns, series.names, units=series.units),

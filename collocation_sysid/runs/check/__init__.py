@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 from ...common.array_types import Array
 from ...common.serialisation import content
@@ -122,6 +122,33 @@ class QuickCheck:
     holds: tuple[GraspCheck, ...]
 
 
+class LiftedKind(NamedTuple):
+    """Variables that only programs with lifted variables have.
+
+    Attributes
+    ----------
+    group : str
+        Their kind, see `LiftedVariables.kind`.
+    field : str
+        Field of `CheckResult` with their number.
+    row : str
+        Name of their row in a table.
+    meaning : str
+        What they are.
+    """
+
+    group: str
+    field: str
+    row: str
+    meaning: str
+
+
+LIFTED_KINDS = (
+    LiftedKind("memory", "overstresses", "memory", "the viscoelastic stresses"),
+    LiftedKind("reaction", "wrenches", "wrenches", "the measured wrenches"),
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class CheckResult(QuickCheck):
     """All findings of `check`.
@@ -189,6 +216,18 @@ class CheckResult(QuickCheck):
         return next(
             (cost for cost in self.costs if cost.method == self.method), None
         )
+
+    @property
+    def lifted_texts(self) -> dict[str, str]:
+        """Number and meaning of the lifted variables of each kind that the program has, by the name
+        of a row in a table.
+        """
+        return {
+            kind.row: f"{number:,} additional variables and constraints of the method "
+            f"interior-point for {kind.meaning}, included in the nonzeros"
+            for kind in LIFTED_KINDS
+            if (number := getattr(self, kind.field))
+        }
 
     @property
     def derivatives_agree(self) -> bool:
@@ -470,8 +509,7 @@ def _program_fields(
     return {
         "variables": collocation.variable_count,
         "constraints": collocation.constraint_count,
-        "overstresses": lifted_count(lifted, "memory"),
-        "wrenches": lifted_count(lifted, "reaction"),
+        **{k.field: lifted_count(lifted, k.group) for k in LIFTED_KINDS},
         "jacobian_nonzeros": jacobian,
         "hessian_nonzeros": hessian,
         "method": name,

@@ -398,6 +398,9 @@ class Assumption:
         a problem states its deviation.
     description : str
         Description.
+    remedy : str
+        What to measure or state in order to reduce the effect, as an imperative phrase without a
+        full stop.
     effect : callable
         Returns the effect of one unit, from an experiment at the answer and the index of the
         component, from 0; None if there is no effect in this experiment.
@@ -411,6 +414,7 @@ class Assumption:
     unit: str
     sigma: float | None
     description: str
+    remedy: str
     effect: Callable[[ExperimentAtAnswer, int], Effect | None]
     component_names: str = ""
     of_specimens: bool = False
@@ -866,6 +870,7 @@ ASSUMPTIONS = (
         "1",
         sigma=0.01,
         description="size of the mesh",
+        remedy="measure two lengths of the real body and scale the mesh to them",
         effect=_size,
     ),
     Assumption(
@@ -874,6 +879,8 @@ ASSUMPTIONS = (
         sigma=0.58,
         description="weight under which the mesh was deformed when it was made, along each axis, if "
         "object.rest_shape is not stated",
+        remedy="state object.rest_shape: whether the mesh is free of stress, or the shape in "
+        "which the body hung or stood during its scan",
         effect=_rest_shape,
         component_names="x y z",
     ),
@@ -882,6 +889,7 @@ ASSUMPTIONS = (
         "1",
         sigma=0.005,
         description="displacement of the surface along its normal, relative to the thickness",
+        remedy="measure the thickness of the real body at several places",
         effect=_surface,
         component_names=_MODES,
     ),
@@ -890,6 +898,7 @@ ASSUMPTIONS = (
         "1",
         sigma=0.01,
         description="mass of the body, if it is not estimated",
+        remedy="weigh the body",
         effect=_mass,
     ),
     Assumption(
@@ -897,6 +906,7 @@ ASSUMPTIONS = (
         "1",
         sigma=0.05,
         description="density at one end of the body relative to that in its middle",
+        remedy="weigh two halves of a specimen",
         effect=_density_gradient,
         component_names="x y z",
     ),
@@ -905,6 +915,8 @@ ASSUMPTIONS = (
         "1",
         sigma=0.05,
         description="stiffness along one axis relative to that across it",
+        remedy="record a second motion with the body held the other way round, or press a cube "
+        "along each of its axes",
         effect=_anisotropy,
         component_names="x y z",
         of_specimens=True,
@@ -914,6 +926,7 @@ ASSUMPTIONS = (
         "1",
         sigma=0.02,
         description="stiffness at the end of a recording relative to that at its beginning",
+        remedy="repeat the first recording at the end",
         effect=_drift,
         of_specimens=True,
     ),
@@ -922,6 +935,7 @@ ASSUMPTIONS = (
         "1",
         sigma=1e-4,
         description="rate of all clocks",
+        remedy="compare all clocks with a reference clock",
         effect=_time_scale,
     ),
     Assumption(
@@ -929,6 +943,9 @@ ASSUMPTIONS = (
         "",
         sigma=0.02,
         description="Poisson's ratio, if it is stated",
+        remedy="measure Poisson's ratio in a tension test, or estimate it; solid rubber is nearly "
+        "incompressible: state poisson = 0.499 in [parameters], and the deviation of this value, "
+        "poisson = 0.0005, in [uncertainty.assumptions]",
         effect=_poisson,
         of_specimens=True,
     ),
@@ -938,6 +955,8 @@ ASSUMPTIONS = (
         sigma=1.0,
         description="damping force of another objective law, as a fraction of its difference from the "
         "stated law",
+        remedy="compare the laws with compare-models --damping on faster and slower motions, "
+        'or state damping_law = "none" where the law is known',
         effect=_objective_damping,
         component_names=" ".join(OBJECTIVE_DAMPINGS),
     ),
@@ -947,6 +966,8 @@ ASSUMPTIONS = (
         sigma=None,
         description="damping force of the Rayleigh law, as a fraction of its difference from the stated "
         "law",
+        remedy="compare the laws with compare-models --damping on motions that rotate "
+        "the body",
         effect=_rayleigh_damping,
     ),
     Assumption(
@@ -954,6 +975,7 @@ ASSUMPTIONS = (
         "m",
         sigma=2e-4,
         description="compliance of grip and skin, as the thickness of a layer of the body's material",
+        remedy="glue the body to a stiff plate, or attach markers to the body beside the grip",
         effect=_grip,
     ),
     Assumption(
@@ -961,6 +983,9 @@ ASSUMPTIONS = (
         "m/N",
         sigma=1e-6,
         description="compliance of the test bench",
+        remedy="press the platens against each other without a specimen and state "
+        "the slope of displacement over force as machine_compliance_m_n = { mean = …, deviation = … } "
+        "in [uncertainty.assumptions]",
         effect=_machine,
         of_specimens=True,
     ),
@@ -969,6 +994,7 @@ ASSUMPTIONS = (
         "",
         sigma=0.1,
         description="coefficient of friction of platens between which nodes slide",
+        remedy="lubricate the platens, or glue the specimen to them",
         effect=_platen_friction,
     ),
     Assumption(
@@ -977,6 +1003,9 @@ ASSUMPTIONS = (
         sigma=1.0,
         description="slip of faces that are pressed by platens and held along all axes, as a fraction of "
         "that without friction, if only loads are measured",
+        remedy="measure the bulge, by markers on the side or depth images; or state "
+        'platen_slip = "none" in [uncertainty.assumptions] if the faces are glued, or axes = "z" if '
+        "they slide",
         effect=_platen_slip,
     ),
     Assumption(
@@ -984,6 +1013,8 @@ ASSUMPTIONS = (
         "1",
         sigma=1.0,
         description="compliance of the contact with obstacles, as a fraction of that of the pressure law",
+        remedy="refine the mesh at the contact, or state a larger stiffness_pa_m and a "
+        "smaller width_m of the obstacle",
         effect=_contact_stiffness,
     ),
     Assumption(
@@ -991,6 +1022,7 @@ ASSUMPTIONS = (
         "1",
         sigma=AIR_DENSITY_DEVIATION,
         description="buoyancy relative to that of the model, because of the density of the air",
+        remedy="state the density of the air",
         effect=_buoyancy,
     ),
     Assumption(
@@ -998,6 +1030,7 @@ ASSUMPTIONS = (
         "1",
         sigma=AIR_COEFFICIENT_DEVIATION,
         description="added mass of the air relative to that of the model",
+        remedy="repeat the motion more slowly, or with a heavier specimen",
         effect=_added_mass,
     ),
     Assumption(
@@ -1005,6 +1038,7 @@ ASSUMPTIONS = (
         "1",
         sigma=AIR_COEFFICIENT_DEVIATION,
         description="drag of the air relative to that of the model",
+        remedy="repeat the motion more slowly, or with a heavier specimen",
         effect=_air_drag,
     ),
 )
@@ -1033,7 +1067,7 @@ OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n")
 
 @dataclass(frozen=True, kw_only=True)
 class Assumptions(Options):
-    """Standard deviations of systematic effects; "none" for what is exact.
+    """Standard deviations of systematic effects; "none" for an effect that is exactly zero.
 
     An effect that is known to exist, such as the compliance of a machine, has a table of mean and
     deviation. Nuisance parameters of recordings, by their names, count if they are not estimated.
@@ -1090,11 +1124,12 @@ class Assumptions(Options):
     calibration_scale
         Scale error of all lengths that the cameras measure: the factor minus one [1].
     calibration_distortion_1_m2
-        Radial distortion of first order about the body's middle: a factor 1 + k r² [1/m²].
+        Coefficient k of a radial distortion by the cameras: distances r from the middle of the body
+        are multiplied by 1 + k r² [1/m²].
     time_shift_s
-        How much later than stated the markers were measured, on the grasps' clock [s].
+        How much later than stated the markers were measured, by the clock of the grasps [s].
     clock_rate
-        How much slower than the grasps' clock that of the markers runs [1].
+        How much slower the clock of the markers runs than the clock of the grasps [1].
     pose_turn_rad
         A constant rotation of grasps and body in the cameras' frame, which rotates gravity in the
         body's frame [rad].
@@ -1105,17 +1140,18 @@ class Assumptions(Options):
     hand_eye_rad
         A constant rotation of the body in its grasps [rad].
     hand_eye_m
-        A constant translation of the body in its grasps; both if the start is an equilibrium and
-        markers measure it [m].
+        A constant translation of the body in its grasps; rotation and translation are estimated if
+        the start is an equilibrium and there are markers [m].
     strain_zero
         A constant offset of the strains of a specimen [1].
     displacement_zero_m
-        A constant offset of each displacement along each of its axes [m].
+        A constant offset of each prescribed displacement along each of its axes [m].
     obstacle_offset_m
-        A constant offset of each obstacle along its normal, or along the axis of its displacement,
-        which changes when it touches the body [m].
+        A constant offset of each obstacle along its normal, or along the axis of its displacement;
+        it changes the time at which the obstacle touches the body [m].
     obstacle_tilt_rad
-        A constant tilt of each obstacle that is a plane or a box, about its point or middle [rad].
+        A constant tilt of each obstacle that is a plane or a box, about the point of the plane or
+        the middle of the box [rad].
     obstacle_time_s
         Delay of each obstacle's motion, to first order [s].
     tension_factor
@@ -1125,35 +1161,36 @@ class Assumptions(Options):
     pressure_factor
         Scale error of each pressure: the factor minus one [1].
     pressure_lost_pa
-        Offset by which each pressure is lower than stated [Pa].
+        Amount by which each pressure is lower than stated [Pa].
     pressure_lag
-        Lag of each pressure: the logarithm of its ratio to the stated lag_s [1].
+        Logarithm of the ratio of the true lag of each pressure to the stated lag_s [1].
     joining_s
-        Delay with which each point mass or force begins or ends, if it does so within the recording
-        [s].
+        Delay of the time at which each point mass or force begins or ends, if this time is within
+        the recording [s].
     tare
         A constant offset of each component of a force sensor, in multiples of its sigma [σ].
     sensor_time_s
-        Delay of the force sensors; at most three standard deviations [s].
+        Delay of the force sensors, limited to three standard deviations of its prior [s].
     sensor_lag_s
-        Time constant of a first-order low-pass in the sensor; between zero and three
-        standard deviations of its prior [s].
+        Time constant of a first-order low-pass in the sensor, limited to values between zero and
+        three standard deviations of its prior [s].
     tool_kg
         Mass of the tool between a sensor and the body [kg].
     tool_m
-        Centre of the tool relative to the sensor's point; in the world's frame, relative to that of
-        the grasped nodes [m].
+        Centre of the tool relative to the point of the sensor; in the frame of the world, relative
+        to the centre of the grasped nodes [m].
     depth_turn_rad
-        Rotation of each depth camera about the middle of the body, along the camera's axes [rad].
+        Rotation of each depth camera about the middle of the body, stated along the axes of the
+        camera [rad].
     depth_shift_m
-        Translation of each depth camera; if neither is given, the first image is first aligned with
-        the body [m].
+        Translation of each depth camera; if neither prior is stated, the search begins by aligning
+        the first image with the body [m].
     depth_bias_m
         Offset that is added to each depth of an image [m].
     depth_scale
         Scale error of each depth of an image: the factor minus one [1].
     depth_time_s
-        Delay of a depth camera; at most three standard deviations [s].
+        Delay of a depth camera, limited to three standard deviations of its prior [s].
     depth_edge_px
         Distance by which silhouettes in the images of each depth camera end inside the outline of
         the body, in pixels [px].

@@ -18,6 +18,25 @@ from ...recording.obstacle import Obstacle, ObstacleForces
 from ...recording.obstacle_solids import Plane
 from .misspecification_hypothesis import Hypothesis
 
+# Messages of the hypotheses by the codes of their concerns.
+MESSAGES = {
+    "description/obstacle-pull": "its force pulls at the body with {pull_n:.3g} N, in {samples} of "
+    "{of_samples} samples, which contact without adhesion cannot do: its sign is wrong, or "
+    "it was zeroed during the contact; set sign = -1, or zero the load before the contact",
+    "description/obstacle-friction": "its force is up to {ratio:.2g} times as large along the plane as "
+    "along the normal, and its friction is stated as {stated:.2g}: correct friction, or "
+    "estimate it as a parameter",
+    "description/obstacle-fixed": "its load changes by {change_n:.3g} N, although neither it nor a "
+    "grasp moves: check its poses or displacement",
+    "description/obstacle-stroke": "it moves by {stroke_m:.3g} m, the body is {size_m:.3g} m large: "
+    "check the unit of its displacement or poses, which are in metres",
+    "description/obstacle-load/far": "it has a load although it is up to {by_mm:.3g} mm away from the "
+    "undeformed body: check its place, its size, and the axis, sign and unit of its motion",
+    "description/obstacle-load/deep": "it has no load although it is up to {by_mm:.3g} mm inside the "
+    "undeformed body: check its place, its size, and the axis, sign and unit of its motion",
+    "description/obstacle-load/never": "it has a load although it never presses on the undeformed body, "
+    "along which it moves by {by_mm:.3g} mm: check the axis of its motion, and its place",
+}
 # Loads in standard deviations of their noise from which on they are loads.
 LOADED = 6.0
 # Share of the largest load that calibration and axes may be off.

@@ -1,0 +1,226 @@
+"""Keys of [[experiment.depth]], and how the files of a depth camera or scanner are read."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from ..common.array_types import Array
+from ..common.schema_tables import Section, Unit, Vector, declared_in
+from ..common.validated_types import Finite, Positive, Text
+from ..errors import InputError, located
+from ..recording import Depth, DepthCamera, read_poses
+from ..recording.depth_camera import (
+    Background,
+    PoseMatrix,
+    points_from_image,
+    samples_with_outlines,
+)
+from ..recording.formats.depth_files import DepthFileContent, read_depth
+from ..recording.formats.units import METRES_PER_UNIT
+from ..recording.node_selection import Nodes
+from ..recording.time_tables import is_within_experiment
+from .measurement_section import (
+    MeasurementSection,
+    RecordingFolder,
+    require_file_name,
+)
+from .named_files import existing_file
+
+
+class DepthCameraSection(Section):
+    """A depth camera, or the frame of a scanner; keys that an .npz or a log contains may be
+    omitted.
+
+    Attributes
+    ----------
+    matrix : list, optional
+        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs
+        no matrix; if it has one, an offset and a scale error of the depth are estimated, and
+        surfaces that face away from the camera are not used.
+    distortion : list
+        k1, k2, p1, p2, k3 of the model of Brown and Conrady.
+    pose : list, optional
+        Transform from the frame of the camera to the world or, with `poses`, to the frame whose
+        poses these are (hand–eye transform).
+    poses : str, optional
+        File of poses of the rigid body that carries the camera; by default the camera is at rest.
+    """
+
+    matrix: tuple[Vector, Vector, Vector] | None = None
+    distortion: list[Finite] = Field([])
+    pose: PoseMatrix | None = None
+    poses: Text | None = None
+
+
+class DepthSection(MeasurementSection):
+    """Depth images or point clouds of the body from a camera or a scanner, without labels.
+
+    Attributes
+    ----------
+    name : str
+        Name in messages, error bars and pictures.
+    sigma_m : float
+        Standard deviation of the noise along the normal of the surface.
+    spacing_m : float
+        Approximate distance to which the points are thinned, because the noise of neighbouring
+        pixels is correlated.
+    gate_m : float
+        Distance from the surface beyond which points are assumed to belong to other objects and are
+        not used.
+    faces : Nodes, optional
+        Faces that may be visible: those whose corners are all selected. All by default.
+    background : {"auto", "empty", "unknown"}
+        Meaning of a pixel without a depth. "empty": nothing is there, so that the body cannot be
+        there. "unknown": anything may be there, as where the sensor gets no echo from dark or steep
+        surfaces. "auto": "empty" in images where hardly any pixel shows something far behind the
+        body, otherwise "unknown". A measured depth well behind the body shows in either case that
+        the body is not there.
+    outline_sigma_px : float
+        Standard deviation [pixels] of the distance between the body's outline and the edge of its
+        silhouette in an image, at points of the outline that are `spacing_m` apart. Rounding to
+        pixels alone gives 0.3.
+    file : str
+        Depth images (.npz, .png of 16 bits, .exr) or clouds of points (.ply, .pcd, .npy, .xyz), or
+        a folder of these in the order of their names, with times.csv or t_s; or a topic of a log,
+        ``run.mcap#/camera/depth/image_rect_raw``.
+    camera : DepthCameraSection
+        Pose and projection of the camera.
+    t_s : list of float, optional
+        Times [s], if the file does not contain them; a single image is assigned to the first sample
+        by default.
+    count_m : float, optional
+        Depth of one count of an image, 0.001 by default.
+    length_unit : {"m", "cm", "mm", "in"}
+        Unit of the coordinates of clouds.
+    """
+
+    name: Annotated[str, AfterValidator(require_file_name)] = "depth"
+    sigma_m: Positive
+    spacing_m: Positive = 0.004
+    gate_m: Positive = 0.01
+    faces: Nodes | None = None
+    background: Background = "auto"
+    outline_sigma_px: Positive = 0.5
+    file: Text
+    camera: DepthCameraSection = Field(
+        default_factory=lambda: DepthCameraSection.model_construct()
+    )
+    t_s: list[Finite] | None = None
+    count_m: Positive | None = None
+    length_unit: Unit = "m"
+
+    def read_times_s(self, folder: RecordingFolder, where: str) -> Array:
+        """Return the times of all images or clouds [s], see `_read_images`."""
+        return self._read_images(folder, where)[1]
+
+    def read(self, folder: RecordingFolder, where: str, t_s: Array) -> Depth:
+        """Return the images or clouds within the times t_s (T,) of the experiment [s], and note how
+        many are used.
+
+        Images are converted to clouds of points. What the table states about the camera replaces
+        what the file contains.
+
+        Raises
+        ------
+        InputError
+            See `_read_images`; also if the camera is incomplete or no image is within the times.
+        """
+        content, at_s = self._read_images(folder, where)
+        camera = self._camera(folder, content, where=f"{where}.camera")
+        with located(where=where):
+            is_used = is_within_experiment(
+                at_s, t_s, name=self.file, is_static=folder.is_static
+            )
+            used = np.flatnonzero(is_used).tolist()
+            clouds = (
+                [content.clouds_m[k] for k in used] if content.clouds_m else []
+            )
+            images = []
+            outlined = samples_with_outlines(len(used))
+            for number, sample in enumerate(
+                used if len(content.images_m) else ()
+            ):
+                image = content.images_m[sample]
+                clouds.append(points_from_image(image, camera))
+                images.append(image if number in outlined else None)
+            arguments = {
+                "name": self.name,
+                **declared_in(self, Depth, where=where),
+            }
+            depth = Depth(
+                t_s=at_s[is_used],
+                clouds=clouds,
+                camera=camera,
+                images_m=images,
+                **arguments,
+            )
+        folder.add_note(
+            f"{self.file}: {len(clouds)} of {len(at_s)} images are used"
+        )
+        return depth
+
+    def _camera(
+        self, folder: RecordingFolder, content: DepthFileContent, where: str
+    ) -> DepthCamera:
+        """Return the camera of the table, completed by the content of its file; raise an
+        `InputError` at `where` if it is incomplete.
+        """
+        names = ("matrix", "pose", "distortion")
+        arguments: dict[str, Any] = {
+            name: getattr(content, name) for name in names
+        }
+        arguments |= declared_in(self.camera, DepthCamera, where=where)
+        if self.camera.poses is not None:
+            file = existing_file(
+                folder.path, self.camera.poses, key=f"{where}.poses"
+            )
+            arguments["poses"] = read_poses(file)
+        with located(where=where):
+            return DepthCamera(
+                **{
+                    name: value
+                    for name, value in arguments.items()
+                    if value is not None
+                }
+            )
+
+    def _read_images(
+        self, folder: RecordingFolder, where: str
+    ) -> tuple[DepthFileContent, Array]:
+        """Return the content of the file or folder of the table, and the times of its images or
+        clouds [s].
+
+        Times are the stated ones, or those of the file; for equilibria, or a single image, without
+        times they are 0, 1, 2, …
+
+        Raises
+        ------
+        InputError
+            If several images of a motion have no times, or the number of times is wrong.
+        """
+        file = folder.path / self.file
+        if not file.is_dir():
+            file = existing_file(folder.path, self.file, key=f"{where}.file")
+        content = read_depth(
+            file,
+            self.count_m,
+            length_m=METRES_PER_UNIT[self.length_unit],
+            known_camera_fields=self.camera.model_fields_set,
+        )
+        count = len(content.images_m) or len(content.clouds_m)
+        t_s = self.t_s if self.t_s is not None else content.t_s
+        if t_s is None and count > 1 and not folder.is_static:
+            message = f"{self.file} does not contain times of its {count} images; expected them in t_s"
+            raise InputError(message, where=f"{where}.t_s")
+        times = (
+            np.arange(float(count))
+            if t_s is None
+            else np.array(t_s, dtype=float).ravel()
+        )
+        if len(times) != count:
+            message = f"found {len(times)} times for {count} images or clouds; expected as many"
+            raise InputError(message, where=f"{where}.t_s")
+        return content, times
