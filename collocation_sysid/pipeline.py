@@ -618,14 +618,14 @@ def _fine_enough(
         finer = first
         failure = str(error)
     if failure is not None:
-        note = f"{why}; the solve with {substeps} failed: {failure}"
+        note = f"{why}; the solve with {substeps} steps per sample failed: {failure}"
         return replace(coarse, notes=(note, *coarse.notes)), fit
     most = (
         ", the largest number that is chosen automatically"
         if substeps == MOST_SUBSTEPS
         else ""
     )
-    reason = f"{why}; therefore it was solved again with {substeps}{most}"
+    reason = f"{why}; therefore the problem was solved again with {substeps} steps per sample{most}"
     return _checked(problem, finer.after(first, reason), say=say)
 
 

@@ -1,7 +1,7 @@
-"""Twins of a recording of which something that is assumed is wrong, by sizes that are known.
+"""Twins of a recording in which assumptions of the budget are wrong by known amounts.
 
-Each is simulated anew with the body as it would be: another mesh, density, law or air. `OFF` are
-the names of `statistics.budget.systematic_effects`, with their components.
+Each twin is simulated with the body as it is in truth: with another mesh, density, law or air. The
+names of the errors are those of `statistics.budget.systematic_effects`, with their components.
 """
 
 from __future__ import annotations
@@ -36,55 +36,59 @@ from collocation_sysid.statistics.budget.systematic_effects import (
 Array = NDArray[np.float64]
 SCHEME = "midpoint"
 AXES = "xyz"
-# Steps between changes of what drifts.
-PIECE = 2
+# Number of time steps between changes of a drifting stiffness.
+PIECE_STEPS = 2
 
 
-def wrong(
+def with_wrong_assumptions(
     experiment: Experiment,
     values: Mapping[str, float],
-    off: Mapping[str, float],
+    errors: Mapping[str, float],
 ) -> Experiment:
-    """The recording of a body held by one grasp, with its markers as they would be seen.
+    """Return the experiment with the marker tracks of a body that deviates from the assumptions.
 
     Parameters
     ----------
     experiment : Experiment
-        With markers at nodes.
-    values : mapping of parameter to its truth, by E and ν
-    off : mapping of assumption to how far it is off, in its unit; those of the air are shares of
-        what the air around the experiment does in the model
+        With one grasp, and with markers at nodes.
+    values : mapping of parameter name to true value
+        With the elastic constants E and ν.
+    errors : mapping of assumption to its error
+        In the unit of the assumption. Errors of the air are shares of the forces of the air in the
+        model; an assumption that is absent is correct.
     """
-    body = _body(experiment, values, off)
+    body = _body(experiment, values, errors)
     (grasp,) = experiment.grasps
-    slower = 1 - off.get("time_scale", 0.0)
+    slower_clock = 1 - errors.get("time_scale", 0.0)
     poses = grasp.poses
-    slowed = PoseSequence(
-        slower * poses.t_s, poses.positions_m, poses.quaternions_xyzw
+    slowed_poses = PoseSequence(
+        slower_clock * poses.t_s, poses.positions_m, poses.quaternions_xyzw
     )
-    # Added mass is that of denser air, and what else this air does is taken back.
-    denser = 1 + off.get("added_mass", 0.0)
+    # Added mass is that of denser air; buoyancy and drag of this denser air are corrected below.
+    denser_air = 1 + errors.get("added_mass", 0.0)
     truth = replace(
         experiment,
         body=body,
-        t_s=slower * experiment.t_s,
-        grasps=(Grasp(grasp.nodes, slowed),),
+        t_s=slower_clock * experiment.t_s,
+        grasps=(Grasp(grasp.nodes, slowed_poses),),
         markers=replace(
-            experiment.markers, t_s=slower * experiment.t_s, located=None
+            experiment.markers, t_s=slower_clock * experiment.t_s, located=None
         ),
-        forces=_lift(experiment, body, off),
-        air_density_kg_m3=denser * experiment.air_density_kg_m3,
+        forces=_buoyancy_errors(experiment, body, errors),
+        air_density_kg_m3=denser_air * experiment.air_density_kg_m3,
     )
-    values = dict(values, poisson=values["poisson"] + off.get("poisson", 0.0))
+    values = dict(
+        values, poisson=values["poisson"] + errors.get("poisson", 0.0)
+    )
     return with_markers(
-        experiment, _tracks(truth, values, off.get("stiffness_drift", 0.0))
+        experiment, _tracks(truth, values, errors.get("stiffness_drift", 0.0))
     )
 
 
 def _tracks(
     truth: Experiment, values: Mapping[str, float], drift: float
 ) -> Array:
-    """(T, M, 3) of a body whose stiffness drifts, one piece of the recording after another."""
+    """Return the tracks (T, M, 3) [m] of a body whose stiffness changes by a share `drift` in total."""
     values = _lame(truth, values)
     if not drift:
         return simulate(truth, values, SCHEME, substeps=1).markers_m
@@ -95,45 +99,51 @@ def _tracks(
     start = {}
     velocity = 0.0
     steps = len(t_s) - 1
-    for first in range(0, steps - 1, PIECE):  # the last piece has what is left
-        here = slice(
-            first, (first + PIECE if first + 2 * PIECE <= steps else steps) + 1
+    for first in range(
+        0, steps - 1, PIECE_STEPS
+    ):  # the last piece has the remaining steps
+        samples = slice(
+            first,
+            (first + PIECE_STEPS if first + 2 * PIECE_STEPS <= steps else steps)
+            + 1,
         )
-        since = (t_s[here].mean() - t_s.mean()) / np.ptp(t_s)
-        now = {
-            n: v * (1 + drift * since) if n in moduli else v
+        elapsed_share = (t_s[samples].mean() - t_s.mean()) / np.ptp(t_s)
+        current_values = {
+            n: v * (1 + drift * elapsed_share) if n in moduli else v
             for n, v in values.items()
         }
-        seen = replace(
+        piece_markers = replace(
             markers,
-            t_s=t_s[here],
-            positions_m=markers.positions_m[here],
+            t_s=t_s[samples],
+            positions_m=markers.positions_m[samples],
             located=None,
         )
-        piece = replace(truth, t_s=t_s[here], markers=seen, **start)
-        moved = simulate(piece, now, SCHEME, substeps=1)
-        for way in np.diff(
-            moved.positions_m, axis=0
-        ):  # as the midpoint rule has it
-            velocity = 2 * way / truth.timestep_s - velocity
+        piece = replace(truth, t_s=t_s[samples], markers=piece_markers, **start)
+        forward_run = simulate(piece, current_values, SCHEME, substeps=1)
+        for displacement_m in np.diff(
+            forward_run.positions_m, axis=0
+        ):  # velocities of the midpoint rule
+            velocity = 2 * displacement_m / truth.timestep_s - velocity
         start = {
             "start": "given",
-            "start_positions_m": moved.positions_m[-1],
+            "start_positions_m": forward_run.positions_m[-1],
             "start_velocities_m_s": velocity,
         }
-        tracks.append(moved.markers_m[bool(first) :])
+        tracks.append(forward_run.markers_m[bool(first) :])
     return np.concatenate(tracks)
 
 
 def _lame(truth: Experiment, values: Mapping[str, float]) -> dict[str, float]:
-    """The values by λ and μ, where the body has a law of its own."""
+    """Return the values with λ and μ in place of E and ν if the material is user-defined."""
     if truth.body.parts[0].material.name == "neo-hookean":
         return dict(values)
     young = values["young_pa"]
     poisson = values["poisson"]
-    kept = {n: v for n, v in values.items() if n not in ("young_pa", "poisson")}
+    others = {
+        n: v for n, v in values.items() if n not in ("young_pa", "poisson")
+    }
     mu = young / 2 / (1 + poisson)
-    return kept | {
+    return others | {
         "mu_pa": mu,
         "lambda_pa": 2 * mu * poisson / (1 - 2 * poisson),
     }
@@ -142,33 +152,40 @@ def _lame(truth: Experiment, values: Mapping[str, float]) -> dict[str, float]:
 def _body(
     experiment: Experiment,
     values: Mapping[str, float],
-    off: Mapping[str, float],
+    errors: Mapping[str, float],
 ) -> Body:
     old = experiment.body
     (grasp,) = experiment.grasps
     pivot_m = old.nodes_m[grasp.nodes].mean(axis=0)
-    larger = 1 + off.get("body_scale", 0.0)
+    scale = 1 + errors.get("body_scale", 0.0)
     mesh = TetMesh(
-        pivot_m + larger * (old.mesh.points_m - pivot_m), old.mesh.tetrahedra
+        pivot_m + scale * (old.mesh.points_m - pivot_m), old.mesh.tetrahedra
     )
-    stiffer = [off.get(f"anisotropy {axis}", 0.0) for axis in AXES]
-    own: dict[str, Any] = {"damping": _damping(old.parts[0].damping, off)}
-    if any(stiffer):
-        own |= {"material": _stiffer_along(stiffer), "evaluator": "casadi"}
-    more_drag = off.get("air_drag", 0.0) - off.get("added_mass", 0.0)
+    extra_stiffness = [errors.get(f"anisotropy {axis}", 0.0) for axis in AXES]
+    body_options: dict[str, Any] = {
+        "damping": _damping(old.parts[0].damping, errors)
+    }
+    if any(extra_stiffness):
+        body_options |= {
+            "material": _anisotropic_law(extra_stiffness),
+            "evaluator": "casadi",
+        }
+    more_drag = errors.get("air_drag", 0.0) - errors.get("added_mass", 0.0)
     if more_drag:
-        own["forces"] = [_drag(more_drag * experiment.air_density_kg_m3)]
-    density = old.mass_kg / old.mesh.volume_m3 * (1 + off.get("mass", 0.0))
-    body = Body(mesh, density_kg_m3=density, **own)
+        body_options["forces"] = [
+            _drag(more_drag * experiment.air_density_kg_m3)
+        ]
+    density = old.mass_kg / old.mesh.volume_m3 * (1 + errors.get("mass", 0.0))
+    body = Body(mesh, density_kg_m3=density, **body_options)
     factor = np.ones(len(body.nodes_m))
     for axis, name in enumerate(AXES):
-        place = body.nodes_m[:, axis] - np.average(
+        distance_m = body.nodes_m[:, axis] - np.average(
             body.nodes_m[:, axis], weights=body.node_mass
         )
         factor += (
-            off.get(f"density_gradient {name}", 0.0)
-            * place
-            / np.abs(place).max()
+            errors.get(f"density_gradient {name}", 0.0)
+            * distance_m
+            / np.abs(distance_m).max()
         )
     body._lumped_m3 = [
         lumped * np.repeat(factor, 3) for lumped in body._lumped_m3
@@ -177,7 +194,7 @@ def _body(
     return body
 
 
-def _stiffer_along(shares: Sequence[float]) -> Material:
+def _anisotropic_law(shares: Sequence[float]) -> Material:
     def energy(f, lambda_pa, mu_pa):
         j = ca.det(f)
         young_pa = mu_pa * (3 * lambda_pa + 2 * mu_pa) / (lambda_pa + mu_pa)
@@ -191,22 +208,22 @@ def _stiffer_along(shares: Sequence[float]) -> Material:
     return Material.from_energy(energy)
 
 
-def _damping(stated: DampingLaw, off: Mapping[str, float]) -> DampingLaw:
-    """The stated law, which is a stress, with a share of the differences of others from it."""
+def _damping(stated_law: DampingLaw, errors: Mapping[str, float]) -> DampingLaw:
+    """Return the stated damping law, plus shares of the differences of other laws from it."""
     shares = {
-        law: off.get(key, 0.0)
+        law: errors.get(key, 0.0)
         for law, key in (
             *((law, f"damping_law {law}") for law in OBJECTIVE_DAMPINGS),
             ("rayleigh", "rayleigh_damping"),
         )
     }
     if not any(shares.values()):
-        return stated
-    own = 1 - sum(shares.values())
+        return stated_law
+    own_share = 1 - sum(shares.values())
 
     def stress(psi, f, rate, gamma_r_s):
         terms = [
-            (own, stated),
+            (own_share, stated_law),
             *((shares[law], DAMPINGS[law]) for law in OBJECTIVE_DAMPINGS),
         ]
         stresses = ca.SX(9, 1)
@@ -224,20 +241,20 @@ def _damping(stated: DampingLaw, off: Mapping[str, float]) -> DampingLaw:
 
 
 def _drag(density_kg_m3: float) -> NodeForce:
-    """Return −½ ρ c_d a |v| v of each node, where a is the share of its surface that faces v."""
+    """Return the drag force −½ ρ c_d a |v| v of each node, where a is the area that faces v."""
     per_area = 0.5 * density_kg_m3 * DRAG_COEFFICIENT * FACING_SHARE
 
-    def drag(x, v, at):
-        return -per_area * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-8) * v
+    def drag(x, v, node):
+        return -per_area * node.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-8) * v
 
     return NodeForce.from_law(drag)
 
 
-def _lift(
-    experiment: Experiment, body: Body, off: Mapping[str, float]
+def _buoyancy_errors(
+    experiment: Experiment, body: Body, errors: Mapping[str, float]
 ) -> tuple[Force, ...]:
-    """Return the forces by which buoyancy differs from that of air with the true added mass."""
-    more = off.get("buoyancy", 0.0) - off.get("added_mass", 0.0)
+    """Return the forces that correct the buoyancy of air whose density gives the true added mass."""
+    more_buoyancy = errors.get("buoyancy", 0.0) - errors.get("added_mass", 0.0)
     air_kg = (
         experiment.air_density_kg_m3
         * body.node_mass
@@ -245,7 +262,7 @@ def _lift(
         / body.mass_kg
     )
     return tuple(
-        Force([k], [0, 0, 9.81 * more * m])
+        Force([k], [0, 0, 9.81 * more_buoyancy * m])
         for k, m in enumerate(air_kg)
-        if more * m
+        if more_buoyancy * m
     )

@@ -40,18 +40,18 @@ def repository_url(pyproject: str) -> str | None:
         If it is no web address.
     """
     urls = tomllib.loads(pyproject)["project"].get("urls", {})
-    stated = next(
+    address = next(
         (url for key, url in urls.items() if key.lower() == "repository"), None
     )
-    if stated is None:
+    if address is None:
         return None
-    parts = urlsplit(stated)
+    parts = urlsplit(address)
     if parts.scheme not in ("http", "https") or not parts.path.strip("/"):
         raise ValueError(
-            f"[project.urls] Repository = {stated!r}; expected an address such as "
+            f"[project.urls] Repository = {address!r}; expected an address such as "
             "https://github.com/OWNER/NAME"
         )
-    return stated.rstrip("/").removesuffix(".git")
+    return address.rstrip("/").removesuffix(".git")
 
 
 def colab_url(repository: str, notebook: str) -> str | None:
@@ -69,15 +69,13 @@ def binder_url(repository: str, notebook: str) -> str:
     """Return the address that opens a notebook in Binder, for a repository on any host."""
     parts = urlsplit(repository)
     provider = BINDER_PROVIDERS.get(parts.netloc, "git")
-    place = parts.path.strip("/")
+    repository_path = parts.path.strip("/")
     if provider == "gl":
-        place = quote(place, safe="")
+        repository_path = quote(repository_path, safe="")
     elif provider == "git":
-        place = quote(repository, safe="")
+        repository_path = quote(repository, safe="")
     file = quote(f"{NOTEBOOKS}/{notebook}.ipynb", safe="")
-    return (
-        f"https://mybinder.org/v2/{provider}/{place}/{REVISION}?labpath={file}"
-    )
+    return f"https://mybinder.org/v2/{provider}/{repository_path}/{REVISION}?labpath={file}"
 
 
 def badges(repository: str | None) -> str:
@@ -113,8 +111,8 @@ def with_badges(page: str, lines: str) -> str:
 
 def main() -> None:
     """Write the badges into the pages."""
-    stated = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    lines = badges(repository_url(stated))
+    pyproject = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    lines = badges(repository_url(pyproject))
     for name in PAGES:
         file = ROOT / name
         page = file.read_text(encoding="utf-8")

@@ -1,8 +1,8 @@
-"""Time one sweep of the paper's size under both damping laws, side by side in one run.
+"""Time of one sweep of the size of the paper with both damping laws, measured in one run.
 
-A sweep is what an iteration of reduced space costs: all timesteps evaluated, their blocks
-factorised, the feasibility step and the sensitivities solved for. Kelvin and Voigt's blocks are not
-symmetric. Rounds of both laws alternate; the best times are compared.
+A sweep is the cost of one iteration of reduced space: all time steps are evaluated, their blocks are
+factorised, and the feasibility step and the sensitivities are computed. The blocks of the
+Kelvin–Voigt law are not symmetric. Rounds of both laws alternate; the best times are compared.
 
     python scripts/benchmark_damping.py
 """
@@ -38,59 +38,77 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--json", action="store_true")
-    given = parser.parse_args()
-    found = measure(
-        given.mesh, given.steps, given.element, given.threads, given.rounds
+    arguments = parser.parse_args()
+    times_ms = measure(
+        arguments.mesh,
+        arguments.steps,
+        arguments.element,
+        arguments.threads,
+        arguments.rounds,
     )
-    if given.json:
-        print(json.dumps(found, indent=1))
+    if arguments.json:
+        print(json.dumps(times_ms, indent=1))
         return
     for law in LAWS:
         print(
             f"{law:>13}: "
-            + ", ".join(f"{k} {v:.1f} ms" for k, v in found[law].items())
+            + ", ".join(f"{k} {v:.1f} ms" for k, v in times_ms[law].items())
         )
     print(
-        f"a sweep of kelvin-voigt takes {found['ratio']:.2f} of one of rayleigh"
+        f"time of a sweep with kelvin-voigt over that with rayleigh: {times_ms['ratio']:.2f}"
     )
 
 
 def measure(
     mesh: str, steps: int, element: str, threads: int, rounds: int
 ) -> dict:
-    """Best times in milliseconds, which a busy machine disturbs least, and the sweeps' ratio."""
-    sweeps = {law: sweep_of(mesh, steps, element, threads, law) for law in LAWS}
-    taken: dict[str, list[tuple[float, ...]]] = {law: [] for law in LAWS}
+    """Return the best times of each law by part of the sweep [ms], and the ratio of both sweeps.
+
+    The best of all rounds depends least on other work of the machine. For the arguments see the
+    options of the command line.
+    """
+    sweeps = {
+        law: make_sweep(mesh, steps, element, threads, law) for law in LAWS
+    }
+    measured_s: dict[str, list[tuple[float, ...]]] = {law: [] for law in LAWS}
     for _ in range(rounds):
         for law in LAWS:
-            taken[law].append(sweeps[law]())
+            measured_s[law].append(sweeps[law]())
     names = ("sweep", "evaluation", "linear algebra")
-    found: dict = {
+    times_ms: dict = {
         law: {
             name: 1e3 * min(times)
             for name, times in zip(
-                names, zip(*taken[law], strict=True), strict=True
+                names, zip(*measured_s[law], strict=True), strict=True
             )
         }
         for law in LAWS
     }
-    return found | {"ratio": found[LAWS[1]]["sweep"] / found[LAWS[0]]["sweep"]}
+    return times_ms | {
+        "ratio": times_ms[LAWS[1]]["sweep"] / times_ms[LAWS[0]]["sweep"]
+    }
 
 
-def sweep_of(
+def make_sweep(
     mesh: str, steps: int, element: str, threads: int, law: str
 ) -> Callable[[], tuple[float, ...]]:
-    """A sweep of the swung cylinder, at the truth."""
+    """Return a function that sweeps over the swung cylinder at the true parameters.
+
+    It returns the times of the sweep, of its evaluations and of its linear algebra [s].
+    """
     rings, layers = map(int, mesh.split("x"))
-    made = experiment_of(mesh, steps)
+    recording = experiment_of(mesh, steps)
     shape = cylinder_mesh(0.04, 0.16, rings, layers)
     body = Body(
         shape, density_kg_m3=20.0, element=element, damping=law, threads=threads
     )
-    held = body.nodes_m[:, 2] < 1e-9
-    grasp = replace(made.grasps[0], nodes=np.flatnonzero(held))
+    is_clamped = body.nodes_m[:, 2] < 1e-9
+    grasp = replace(recording.grasps[0], nodes=np.flatnonzero(is_clamped))
     experiment = replace(
-        made, body=body, grasps=(grasp,), markers=made.markers.on_body(body)
+        recording,
+        body=body,
+        grasps=(grasp,),
+        markers=recording.markers.on_body(body),
     )
     collocation = Collocation([experiment], PARAMETERS)
     (segment,) = collocation.transcriptions

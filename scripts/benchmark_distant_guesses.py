@@ -4,7 +4,7 @@ A soft bar (90 nodes, 91 samples) is clamped at one end and swung. Its nine mark
 places, the nuisance parameters are those that are estimated by default, the number of time steps
 per sample is chosen by the run, and the four parameters are guessed wrong by factors of 3, 3, 3.6
 and 3. Prints processor time, iterations of IPOPT (of all solves together, where the run solves
-again with more steps), and the largest distance of a parameter's logarithm from reduced space's.
+again with more steps), and the largest difference of the logarithm of a parameter from that of reduced space.
 
     python scripts/benchmark_distant_guesses.py                    # the full size, all cases
     python scripts/benchmark_distant_guesses.py --cells 5 2 2 --samples 41 --cases distant warm
@@ -39,8 +39,8 @@ TRUTH = {
     "gamma_r_s": 0.01,
     "gamma_m_1_s": 0.5,
 }
-# By how much the initial guesses are wrong.
-FACTORS = {
+# Initial guesses over true values.
+GUESS_FACTORS = {
     "lambda_pa": 1 / 3,
     "mu_pa": 1 / 3,
     "gamma_r_s": 3.6,
@@ -52,14 +52,17 @@ BOUNDS = {
     "gamma_r_s": (1e-5, 1.0),
     "gamma_m_1_s": (1e-3, 100.0),
 }
+# Edges of the bar [m].
 SIZE_M = (0.22, 0.035, 0.05)
 DENSITY_KG_M3 = 95.0
+# Sampling interval [s], and standard deviation of each marker coordinate [m].
 STEP_S = 0.01
 NOISE_M = 5e-4
-MARKERS = 9
+MARKER_COUNT = 9
+# Seed of the choice of marked nodes and of the noise.
 SEED = 1
-# "none": without nuisance parameters; "distant": with those by default; "warm": the same, from the
-# run folder of reduced space.
+# "none": without nuisance parameters; "distant": with the default ones; "warm": as "distant", started
+# from the run folder of reduced space.
 CASES = ("none", "distant", "warm")
 
 
@@ -85,36 +88,44 @@ def bar(divisions: Sequence[int], samples: int, *, ideal: bool) -> Problem:
         start=Rotation.identity(),
     )
     poses = motion.poses(STEP_S)
-    held = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
-    free = np.flatnonzero(body.nodes_m[:, 0] >= 1e-9)
-    random = np.random.default_rng(SEED)
+    clamped_nodes = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
+    free_nodes = np.flatnonzero(body.nodes_m[:, 0] >= 1e-9)
+    rng = np.random.default_rng(SEED)
     places_m = body.nodes_m[
-        np.sort(random.choice(free, MARKERS, replace=False))
+        np.sort(rng.choice(free_nodes, MARKER_COUNT, replace=False))
     ]
     markers = Markers(
-        poses.t_s, np.zeros((samples, MARKERS, 3)), NOISE_M, places_m=places_m
+        poses.t_s,
+        np.zeros((samples, MARKER_COUNT, 3)),
+        NOISE_M,
+        places_m=places_m,
     )
     experiment = Experiment(
-        body, poses.t_s, [Grasp(held, poses)], markers, name="soft bar"
+        body, poses.t_s, [Grasp(clamped_nodes, poses)], markers, name="soft bar"
     )
     tracks = simulate(experiment, TRUTH, timestep_s=STEP_S / 8).markers_m
-    tracks = tracks + NOISE_M * random.normal(size=tracks.shape)
+    tracks = tracks + NOISE_M * rng.normal(size=tracks.shape)
     if ideal:
-        described = replace(
+        description = replace(
             with_markers(experiment, tracks), nuisance=Nuisance.none()
         )
     else:
-        unplaced = Markers(poses.t_s, tracks, NOISE_M, markers.names)
-        described = replace(experiment, markers=unplaced, nuisance=Nuisance())
+        unplaced_markers = Markers(poses.t_s, tracks, NOISE_M, markers.names)
+        description = replace(
+            experiment, markers=unplaced_markers, nuisance=Nuisance()
+        )
     guesses = {
-        name: Unknown(value * FACTORS[name], *BOUNDS[name])
+        name: Unknown(value * GUESS_FACTORS[name], *BOUNDS[name])
         for name, value in TRUTH.items()
     }
-    return Problem([described], guesses, scheme="midpoint")
+    return Problem([description], guesses, scheme="midpoint")
 
 
-def measured(case: str, divisions: Sequence[int], samples: int) -> None:
-    """Solve one of `CASES` by reduced space and by interior point, and print what both took."""
+def print_comparison(case: str, divisions: Sequence[int], samples: int) -> None:
+    """Solve one of `CASES` by reduced space and by interior point, and print times and differences.
+
+    `divisions` and `samples` are those of `bar`.
+    """
     problem = bar(divisions, samples, ideal=case == "none")
     began_s = time.process_time()
     reference = pipeline.run(problem, ReducedSpace(), seek_causes=False)
@@ -126,12 +137,12 @@ def measured(case: str, divisions: Sequence[int], samples: int) -> None:
             else None
         )
         began_s = time.process_time()
-        found = pipeline.run(
+        answer = pipeline.run(
             problem, InteriorPoint(), start=start, seek_causes=False
         )
-        found_s = time.process_time() - began_s
-    solution = found.solution
-    off = np.log(
+        answer_s = time.process_time() - began_s
+    solution = answer.solution
+    log_differences = np.log(
         [
             solution.parameters[n] / reference.solution.parameters[n]
             for n in TRUTH
@@ -139,9 +150,9 @@ def measured(case: str, divisions: Sequence[int], samples: int) -> None:
     )
     print(
         f"{case}: {solution.status.value}, {solution.iterations} iterations of IPOPT, "
-        f"{solution.collocation.substeps} steps a sample, {found_s:.1f} s of processor time; "
+        f"{solution.collocation.substeps} time steps per sample, {answer_s:.1f} s of processor time; "
         f"reduced space {reference.solution.iterations} sweeps, {reference_s:.1f} s; "
-        f"log parameters differ by {np.abs(off).max():.1e}",
+        f"log parameters differ by {np.abs(log_differences).max():.1e}",
         flush=True,
     )
     for note in solution.notes:
@@ -149,13 +160,17 @@ def measured(case: str, divisions: Sequence[int], samples: int) -> None:
 
 
 def main() -> None:
-    """Print what the cases take that the command line asks for."""
+    """Run the cases that the command line names."""
     parser = argparse.ArgumentParser(
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "--cells", nargs=3, type=int, default=[9, 2, 2], help="of the mesh"
+        "--cells",
+        nargs=3,
+        type=int,
+        default=[9, 2, 2],
+        help="cells of the mesh along the three edges",
     )
     parser.add_argument("--samples", type=int, default=91)
     parser.add_argument(
@@ -163,7 +178,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     for case in arguments.cases:
-        measured(case, arguments.cells, arguments.samples)
+        print_comparison(case, arguments.cells, arguments.samples)
 
 
 if __name__ == "__main__":

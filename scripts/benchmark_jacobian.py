@@ -1,6 +1,7 @@
-"""Time the assembled derivatives of the collocation NLP, evaluator against evaluator.
+"""Time of the assembled derivatives of the nonlinear program, by evaluator.
 
-Values in the final sparse matrix, for the paper's size (about 176 nodes × 100 steps). The
+The values of the final sparse matrix are computed for the size of the paper (about 176 nodes × 100
+steps). The
 baseline is the same expressions through `casadi.Function.map`; the paper quotes 57 ms (minimum)
 and 82 ms (median) for its Jacobian on its own machine.
 """
@@ -24,7 +25,8 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 
 PROBLEM = Path(__file__).parents[1] / "problems" / "table1" / "problem.toml"
-PAPER_MS = 57.0
+# Smallest time that the paper states for the Jacobian [ms].
+PAPER_JACOBIAN_MS = 57.0
 
 
 def main() -> None:
@@ -36,39 +38,44 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=21)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    measured = measure(arguments.problem, arguments.scheme, arguments.repeats)
+    measurements = measure(
+        arguments.problem, arguments.scheme, arguments.repeats
+    )
     if arguments.json:
-        print(json.dumps(measured, indent=1))
+        print(json.dumps(measurements, indent=1))
     else:
-        report(measured)
+        report(measurements)
 
 
 def measure(path: Path, scheme: str, repeats: int) -> dict:
-    """Medians in milliseconds, sides of one run interleaved."""
+    """Return the median times of Jacobian and Hessian by evaluator [ms]; evaluators alternate in one run."""
     problem = Problem.read(path)
     threads = max(2, available_threads())
-    sides = {"simd_1_ms": ("simd", 1), f"simd_{threads}_ms": ("simd", threads)}
-    sides["casadi_map_ms"] = ("casadi", 1)
+    evaluators = {
+        "simd_1_ms": ("simd", 1),
+        f"simd_{threads}_ms": ("simd", threads),
+    }
+    evaluators["casadi_map_ms"] = ("casadi", 1)
     collocations = {}
-    for side, (evaluator, count) in sides.items():
+    for evaluator_name, (evaluator, thread_count) in evaluators.items():
         body = Body(
             problem.bodies[0].mesh,
             density_kg_m3=problem.bodies[0].mass_kg
             / problem.bodies[0].mesh.volume_m3,
             damping="rayleigh",
             evaluator=evaluator,
-            threads=count,
+            threads=thread_count,
         )
         experiments = [replace(e, body=body) for e in problem.experiments]
-        collocations[side] = Collocation(
+        collocations[evaluator_name] = Collocation(
             experiments, problem.parameters, scheme
         )
     first = collocations["simd_1_ms"]
     rng = np.random.default_rng(0)
-    shape = [
+    rest_positions_m = [
         s.experiment.rigid_positions(s.dynamics.t_s) for s in first.segments
     ]
-    z = first.pack(first.parameters.guess_q, shape)
+    z = first.pack(first.parameters.guess_q, rest_positions_m)
     z[first.nq :] += 1e-3 * rng.normal(size=len(z) - first.nq)
     multipliers = rng.normal(size=first.constraints)
     jacobian = np.empty(len(first.jacobian_structure[1]))
@@ -87,46 +94,50 @@ def measure(path: Path, scheme: str, repeats: int) -> dict:
             "steps": sum(s.grid_rows for s in first.segments),
             "scheme": scheme,
         },
-        "jacobian": _times(collocations, residual_and_jacobian, repeats)
+        "jacobian": _median_times_ms(
+            collocations, residual_and_jacobian, repeats
+        )
         | {
             "nonzeros": len(jacobian),
-            "extra_memory_ratio": _extra(first, z, jacobian),
+            "extra_memory_ratio": _extra_memory_ratio(first, z, jacobian),
         },
-        "hessian": _times(collocations, lagrangian, repeats)
+        "hessian": _median_times_ms(collocations, lagrangian, repeats)
         | {"nonzeros": len(hessian)},
-        "paper_jacobian_ms": PAPER_MS,
+        "paper_jacobian_ms": PAPER_JACOBIAN_MS,
     }
 
 
-def _times(
+def _median_times_ms(
     collocations: dict[str, Collocation],
-    call: Callable[[Collocation], None],
+    evaluate: Callable[[Collocation], None],
     repeats: int,
 ) -> dict[str, float]:
     for collocation in collocations.values():
-        call(collocation)
-    seconds: dict[str, list[float]] = {side: [] for side in collocations}
+        evaluate(collocation)
+    seconds: dict[str, list[float]] = {
+        evaluator_name: [] for evaluator_name in collocations
+    }
     for repeat in range(repeats):
-        for side, collocation in collocations.items():
-            if "casadi" in side and repeat >= 3:
-                continue  # it takes a hundred times as long and varies little
+        for evaluator_name, collocation in collocations.items():
+            if "casadi" in evaluator_name and repeat >= 3:
+                continue  # CasADi takes a hundred times as long, and its times vary little
             began = time.perf_counter()
-            call(collocation)
-            seconds[side].append(time.perf_counter() - began)
+            evaluate(collocation)
+            seconds[evaluator_name].append(time.perf_counter() - began)
     return {
-        side: 1e3 * statistics.median(values)
-        for side, values in seconds.items()
+        evaluator_name: 1e3 * statistics.median(values)
+        for evaluator_name, values in seconds.items()
     }
 
 
-def _extra(
+def _extra_memory_ratio(
     collocation: Collocation, z: np.ndarray, values: np.ndarray
 ) -> float:
-    """Peak memory of residual and Jacobian beside the values, over the size of the values.
+    """Return the peak memory of residual and Jacobian without the values, over the size of the values.
 
-    Counts the arrays kept between calls as well.
+    Arrays that are kept between calls count as well.
     """
-    kept = sum(
+    buffer_bytes = sum(
         segment.linearisation_buffer.nbytes
         for segment in collocation.transcriptions
     )
@@ -134,29 +145,31 @@ def _extra(
     collocation.constraints_and_jacobian(z, values)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    return (peak + kept) / values.nbytes
+    return (peak + buffer_bytes) / values.nbytes
 
 
-def report(measured: dict) -> None:
-    sizes = measured["problem"]
+def report(measurements: dict) -> None:
+    """Print the result of `measure`."""
+    sizes = measurements["problem"]
     print(
         f"{sizes['nodes']} nodes, {sizes['elements']} elements, {sizes['steps']} steps, "
         f"{sizes['scheme']}; medians"
     )
     for name in ("jacobian", "hessian"):
-        row = measured[name]
+        row = measurements[name]
         baseline = row["casadi_map_ms"]
         print(
             f"\n{name}, {row['nonzeros']:,} nonzeros in the final sparse matrix"
         )
-        for side, value in row.items():
-            if side.endswith("_ms"):
+        for evaluator_name, value in row.items():
+            if evaluator_name.endswith("_ms"):
                 print(
-                    f"  {side[:-3]:12s} {value:8.1f} ms   {baseline / value:6.1f} × Function.map"
+                    f"  {evaluator_name[:-3]:12s} {value:8.1f} ms   {baseline / value:6.1f} × Function.map"
                 )
         if name == "jacobian":
             print(
-                f"  {'paper':12s} {measured['paper_jacobian_ms']:8.1f} ms   (its own machine)"
+                f"  {'paper':12s} {measurements['paper_jacobian_ms']:8.1f} ms   "
+                "(on the machine of its authors)"
             )
             print(
                 f"  peak extra memory {row['extra_memory_ratio']:.2f} × the sparse values"

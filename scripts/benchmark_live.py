@@ -1,8 +1,8 @@
-"""Latency of live estimates, and how far they end from the batch's answer.
+"""Latency of live estimates, and their difference from the answer of the batch.
 
-Streams table1's size (171 nodes, with noise of sigma_m) and foam_cylinder at 100 Hz. Times are the
-processor's, of this process, which other work on the machine does not lengthen much; the yardstick
-beside them is the time that one row takes in a sweep of the whole recording at once.
+Streams table1 (171 nodes, with noise of sigma_m) and foam_cylinder at 100 Hz. Times are processor
+times of this process, which other work on the machine changes little; they are compared with the time
+of one row in a sweep over the complete recording.
 
     python scripts/benchmark_live.py
     python scripts/benchmark_live.py --frames 360000 --problem block --rows 1   # an hour
@@ -34,7 +34,7 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 PROBLEMS = Path(__file__).parent.parent / "problems"
-# Standard deviation of the noise that is added, and of the truth.
+# Standard deviation of the noise that is added to the tracks [m]; foam_cylinder has noise already.
 NOISE_M = {"table1": 1e-3, "foam_cylinder": 0.0}
 TRUTH = {
     "table1": {
@@ -51,27 +51,33 @@ TRUTH = {
     },
     "block": SOFT,
 }
+# Time at which the errors of the estimates are printed [s].
 EARLY_S = 0.3
 # Time between frames at 100 Hz [s].
 FRAME_S = 0.01
-SWEEPS = 5
+# Number of sweeps, of which the shortest counts.
+TIMED_SWEEPS = 5
 
 
 def main() -> None:
-    """Stream the problems and print what was found."""
+    """Stream the problems that the command line names, and print the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--problem", choices=[*TRUTH], action="append")
     parser.add_argument(
-        "--rows", type=int, help="passed again a frame, in place of a budget"
+        "--rows",
+        type=int,
+        help="rows that are linearised again with each frame, in place of a time budget",
     )
     parser.add_argument("--budget-ms", type=float)
     parser.add_argument(
-        "--frames", type=int, help="stream to and fro for so many"
+        "--frames",
+        type=int,
+        help="stream the recording to and fro for this number of frames",
     )
     parser.add_argument(
         "--recorded",
         type=int,
-        help="stream a block that moves at random for so many samples, and compare with the batch",
+        help="number of samples of a block that moves at random; compare with the batch",
     )
     arguments = parser.parse_args()
     budget_s = (
@@ -82,16 +88,16 @@ def main() -> None:
         compare_long_recording(arguments.recorded, options)
         return
     for name in arguments.problem or NOISE_M:
-        problem = _noisy(name)
+        problem = noisy_problem(name)
         live = LiveEstimator(problem, options, time.thread_time)
         frames = list(frames_of_recording(problem.experiments[0], live.model))
         if arguments.frames:
-            _endless(name, live, frames, arguments.frames)
+            stream_repeatedly(name, live, frames, arguments.frames)
         else:
-            _compared(name, problem, live, frames)
+            print_comparison(name, problem, live, frames)
 
 
-def _noisy(name: str) -> Problem:
+def noisy_problem(name: str) -> Problem:
     if name == "block":
         return twin(name, SOFT, seed=0, samples=101, integrator="midpoint")
     problem = Problem.read(PROBLEMS / name / "problem.toml")
@@ -101,57 +107,59 @@ def _noisy(name: str) -> Problem:
         scale=NOISE_M[name] or 1.0, size=tracks.shape
     )
     tracks = tracks + noise * bool(NOISE_M[name])
-    seen = replace(
+    noisy_recording = replace(
         experiment, markers=replace(experiment.markers, positions_m=tracks)
     )
     return Problem(
-        [seen],
+        [noisy_recording],
         problem.parameters,
         scheme=problem.scheme,
         substeps=problem.substeps,
     )
 
 
-def _compared(
+def print_comparison(
     name: str, problem: Problem, live: LiveEstimator, frames: list[Frame]
 ) -> None:
-    took = []
-    again = []
+    latencies_s = []
+    relinearised_rows = []
     with without_garbage_of_startup():
         for frame in frames:
             update = live.process_frame(frame)
-            took.append(update.latency_s)
-            again.append(update.relinearised)
+            latencies_s.append(update.latency_s)
+            relinearised_rows.append(update.relinearised)
             if abs(frame.t_s - EARLY_S) < 1e-6:
                 early = update
     settled = live.finish() or update
-    row_s = _row_s(problem)
-    median, late = 1e3 * np.percentile(took, [50, 99])
+    row_s = row_time_s(problem)
+    median, upper = 1e3 * np.percentile(latencies_s, [50, 99])
     print(
-        f"{name}: {len(frames)} frames of {live.model.collocation.substeps} rows, {np.mean(again):.1f} again"
+        f"{name}: {len(frames)} frames of {live.model.collocation.substeps} rows, "
+        f"{np.mean(relinearised_rows):.1f} rows linearised again per frame"
     )
     print(
-        f"    median {median:.2f} ms, 99 % below {late:.2f} ms, first {1e3 * took[0]:.2f} ms"
+        f"    median {median:.2f} ms, 99 % below {upper:.2f} ms, first {1e3 * latencies_s[0]:.2f} ms"
     )
     print(
-        f"    a row of the batch's sweep {1e3 * row_s:.2f} ms: {1e-3 * median / row_s:.1f} of these"
+        f"    a row in a sweep of the batch {1e3 * row_s:.2f} ms; "
+        f"median latency over this time {1e-3 * median / row_s:.1f}"
     )
     solution = solve(problem, ReducedSpace())
     batch = uncertainty_at(solution.collocation, solution.z).estimates
-    for key, true in TRUTH[name].items():
-        found = update.estimates[key]
-        known = batch[key]
-        apart, at_last = (
-            abs(each.value - known.value)
-            / (known.statistical_std_error or np.nan)
-            for each in (found, settled.estimates[key])
+    for key, true_value in TRUTH[name].items():
+        live_estimate = update.estimates[key]
+        batch_estimate = batch[key]
+        difference, settled_difference = (
+            abs(each.value - batch_estimate.value)
+            / (batch_estimate.statistical_std_error or np.nan)
+            for each in (live_estimate, settled.estimates[key])
         )
-        off = 100 * (early.estimates[key].value / true - 1)
-        error = known.statistical_std_error or np.nan
+        error_percent = 100 * (early.estimates[key].value / true_value - 1)
+        error = batch_estimate.statistical_std_error or np.nan
         print(
-            f"    {key}: {found.value:.5g}, batch {known.value:.5g} ± {error:.2g}: "
-            f"{apart:.3f} standard errors apart, settled {at_last:.3f}; "
-            f"{off:+.1f} % from the truth at {EARLY_S:g} s"
+            f"    {key}: {live_estimate.value:.5g}, batch {batch_estimate.value:.5g} ± {error:.2g}: "
+            f"difference {difference:.3f} standard errors, after settling {settled_difference:.3f}; "
+            f"error {error_percent:+.1f} % at {EARLY_S:g} s"
         )
     print(f"    verdict: {update.trust.verdict} {update.trust.reasons}")
     print(
@@ -159,21 +167,21 @@ def _compared(
     )
 
 
-def _row_s(problem: Problem) -> float:
-    """Processor time of a row in a sweep of the whole recording, the least of some."""
+def row_time_s(problem: Problem) -> float:
+    """Return the processor time of a row in a sweep over the complete recording [s]."""
     collocation = problem.collocation()
     rows = collocation.transcriptions[0].grid_times
     horizon = Horizon(collocation, [rows])
-    found = []
+    times_s = []
     x, _ = horizon.simulate(collocation.guess_p)
-    for _ in range(SWEEPS):
+    for _ in range(TIMED_SWEEPS):
         began = time.thread_time()
         horizon.evaluate(collocation.guess_p, x)
-        found.append((time.thread_time() - began) / rows)
-    return min(found)
+        times_s.append((time.thread_time() - began) / rows)
+    return min(times_s)
 
 
-def _to_and_fro(frames: list[Frame]) -> Iterator[Frame]:
+def _frames_to_and_fro(frames: list[Frame]) -> Iterator[Frame]:
     there_and_back = [*frames, *frames[-2:0:-1]]
     interval_s = frames[1].t_s - frames[0].t_s
     for k in count():
@@ -182,16 +190,24 @@ def _to_and_fro(frames: list[Frame]) -> Iterator[Frame]:
         )
 
 
-def _endless(
-    name: str, live: LiveEstimator, frames: list[Frame], wanted: int
+def stream_repeatedly(
+    name: str, live: LiveEstimator, frames: list[Frame], frame_count: int
 ) -> None:
-    """The poses there and back again, with markers that stay behind: memory is what counts."""
-    for k, frame in zip(range(wanted), _to_and_fro(frames), strict=False):
+    """Stream the recording to and fro, and print the memory; estimates have no meaning here.
+
+    `frame_count` is the number of frames.
+    """
+    for k, frame in zip(
+        range(frame_count), _frames_to_and_fro(frames), strict=False
+    ):
         live.process_frame(frame)
-        if k in (999, wanted - 1) or (k + 1) % max(1, wanted // 10) == 0:
+        if (
+            k in (999, frame_count - 1)
+            or (k + 1) % max(1, frame_count // 10) == 0
+        ):
             used_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
             print(
-                f"{name}: {k + 1} frames, {len(live.log)} rows kept, {used_mb:.0f} MB at most"
+                f"{name}: {k + 1} frames, {len(live.log)} rows kept, peak memory {used_mb:.0f} MB"
             )
 
 
@@ -209,14 +225,14 @@ def compare_long_recording(samples: int, options: LiveOptions) -> None:
         Camera frames at 100 Hz, above 1,000.
     options : LiveOptions
     """
-    short = LiveEstimator(twin("block", SOFT, seed=0), options)
+    short_estimator = LiveEstimator(twin("block", SOFT, seed=0), options)
     problem = twin(
         "block",
         SOFT,
         seed=0,
         samples=samples,
         integrator="midpoint",
-        substeps=short.model.collocation.substeps,
+        substeps=short_estimator.model.collocation.substeps,
     )
     live = LiveEstimator(problem, options, time.thread_time)
     frames = list(frames_of_recording(problem.experiments[0], live.model))
@@ -227,29 +243,30 @@ def compare_long_recording(samples: int, options: LiveOptions) -> None:
             latencies_s[k] = update.latency_s
             if k in (999, len(frames) - 1):
                 print(f"block: {k + 1} frames, {peak_memory_mb():.0f} MB")
-    median_ms, late_ms, worst_ms = 1e3 * np.percentile(
+    median_ms, upper_ms, worst_ms = 1e3 * np.percentile(
         latencies_s, [50, 99, 100]
     )
     print(
-        f"    median {median_ms:.2f} ms, 99 % below {late_ms:.2f} ms, longest {worst_ms:.2f} ms; "
+        f"    median {median_ms:.2f} ms, 99 % below {upper_ms:.2f} ms, longest {worst_ms:.2f} ms; "
         f"{100 * np.mean(latencies_s < FRAME_S):.2f} % within {1e3 * FRAME_S:g} ms"
     )
     began_s = time.process_time()
-    whole = replace(problem, substeps=live.model.collocation.substeps)
-    solution = solve(whole, ReducedSpace())
+    batch_problem = replace(problem, substeps=live.model.collocation.substeps)
+    solution = solve(batch_problem, ReducedSpace())
     print(
         f"    batch: {len(solution.history)} sweeps, {time.process_time() - began_s:.0f} s, "
         f"{peak_memory_mb():.0f} MB"
     )
     batch = uncertainty_at(solution.collocation, solution.z).estimates
-    for key, true in SOFT.items():
-        found = update.estimates[key]
-        known = batch[key]
-        error = known.statistical_std_error or np.nan
+    for key, true_value in SOFT.items():
+        live_estimate = update.estimates[key]
+        batch_estimate = batch[key]
+        error = batch_estimate.statistical_std_error or np.nan
         print(
-            f"    {key}: live {found.value:.6g} ± {found.statistical_std_error or np.nan:.2g}, "
-            f"batch {known.value:.6g} ± {error:.2g}, truth {true:g}: "
-            f"{abs(found.value - known.value) / error:.2f} standard errors apart"
+            f"    {key}: live {live_estimate.value:.6g} "
+            f"± {live_estimate.statistical_std_error or np.nan:.2g}, "
+            f"batch {batch_estimate.value:.6g} ± {error:.2g}, truth {true_value:g}: "
+            f"{abs(live_estimate.value - batch_estimate.value) / error:.2f} standard errors of difference"
         )
     print(f"    verdict: {update.trust.verdict} {update.trust.reasons}")
 

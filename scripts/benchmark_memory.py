@@ -13,6 +13,7 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from collocation_sysid import (
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.sweep import Sweep
 
+# Problem with the size of the paper, and true constants without and with two Prony terms.
 FILE = Path(__file__).parents[1] / "problems/table1/problem.toml"
 TRUTH = {
     "lambda_pa": 200.0,
@@ -45,66 +47,76 @@ MEMORY = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description="What branches of memory cost a sweep."
+        description="Cost of viscoelastic branches in a sweep."
     )
     parser.add_argument("--repeats", type=int, default=15)
     repeats = parser.parse_args().repeats
     (experiment,) = Problem.read(FILE).experiments
-    for estimated in (True, False):
-        print(f"memory's parameters {'estimated' if estimated else 'fixed'}")
+    for is_estimated in (True, False):
+        print(
+            f"parameters of the branches {'estimated' if is_estimated else 'fixed'}"
+        )
         sweeps = [
-            sweep(experiment, branches, estimated) for branches in range(3)
+            make_sweep(experiment, branches, is_estimated)
+            for branches in range(3)
         ]
         seconds = np.array(
-            [[timed(run) for run, _ in sweeps] for _ in range(repeats)]
+            [
+                [processor_time_s(run) for run, _ in sweeps]
+                for _ in range(repeats)
+            ]
         )
-        best = seconds.min(axis=0)
+        best_s = seconds.min(axis=0)
         relative = np.median(seconds / seconds[:, :1], axis=0)
         for branches, (_, columns) in enumerate(sweeps):
             print(
-                f"  {branches} branches, {columns} columns: {1e3 * best[branches]:6.1f} ms at best,"
-                f" {best[branches] / best[0]:.2f} times as long; median ratio "
-                f"{relative[branches]:.2f}"
+                f"  {branches} branches, {columns} columns: {1e3 * best_s[branches]:6.1f} ms at best, "
+                f"{best_s[branches] / best_s[0]:.2f} times that without branches; "
+                f"median ratio {relative[branches]:.2f}"
             )
 
 
-def sweep(
-    experiment: Experiment, branches: int, estimated: bool
+def make_sweep(
+    experiment: Experiment, branches: int, is_estimated: bool
 ) -> tuple[Callable[[], object], int]:
-    """A sweep of the experiment with so many branches, and how many columns it has."""
-    plain = experiment.body
+    """Return a function that sweeps over the experiment, and its number of right-hand sides.
+
+    `branches` is the number of Prony terms, whose parameters are estimated or fixed.
+    """
+    plain_body = experiment.body
     names = [f"prony_{k + 1}" for k in range(branches)]
     body = Body(
-        plain.mesh,
-        density_kg_m3=plain.parts[0].density_kg_m3,
+        plain_body.mesh,
+        density_kg_m3=plain_body.parts[0].density_kg_m3,
         prony=names,
         threads=1,
     )
     memory = {n: v for n, v in MEMORY.items() if n.partition(".")[0] in names}
-    given: dict[str, Unknown | float] = {
+    values: dict[str, Unknown | float] = {
         name: Unknown(guess=v) for name, v in TRUTH.items()
     }
-    given |= {
-        name: Unknown(guess=v) if estimated else v for name, v in memory.items()
+    values |= {
+        name: Unknown(guess=v) if is_estimated else v
+        for name, v in memory.items()
     }
     collocation = Collocation(
-        [replace(experiment, body=body)], Parameters.from_mapping(given)
+        [replace(experiment, body=body)], Parameters.from_mapping(values)
     )
     (segment,) = collocation.transcriptions
-    setting = segment.equations_at(
+    equations = segment.equations_at(
         collocation.guess_p, np.zeros(segment.nuisance.size)
     )
     x = simulate_scheme(
-        experiment=segment.experiment, dynamics=setting.dynamics
+        experiment=segment.experiment, dynamics=equations.dynamics
     )
     solver = Sweep(segment)
-    solver.forward(x, setting)
-    return lambda: solver.forward(x, setting), 1 + len(
+    solver.forward(x, equations)
+    return partial(solver.forward, x, equations), 1 + len(
         segment.dynamic_parameters
     )
 
 
-def timed(run: Callable[[], object]) -> float:
+def processor_time_s(run: Callable[[], object]) -> float:
     """Processor time of a run [s]."""
     began = time.process_time()
     run()

@@ -1,13 +1,14 @@
-"""Time whole identifications: simulation alone, reduced space, and interior point where it can run.
+"""Time of complete identifications: one simulation, reduced space, and interior point.
 
-A cylinder of table1's material is hung, swung, and "measured" by the midpoint scheme itself;
-every run starts from table1's guess in a process of its own. Writes a table, JSON and plots.
+A cylinder with the material of table1 hangs and is swung; its tracks are simulated with the midpoint
+scheme. Every run starts from the guess of table1, in a separate process. Writes a table, JSON and
+plots.
 
     python scripts/benchmark_methods.py                      # the paper's size, both methods
     python scripts/benchmark_methods.py --scaling            # T = 50 … 1600, 95 … 5000 nodes
     python scripts/benchmark_methods.py --mesh 4x32 --steps 1000 --methods reduced-space
     python scripts/benchmark_methods.py --cluster --mesh 3x12 --steps 50   # one and two workers
-    python scripts/benchmark_methods.py --unknown --mesh 2x4 --steps 50    # what is not known costs
+    python scripts/benchmark_methods.py --unknown --mesh 2x4 --steps 50    # cost of nuisance parameters
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import with_markers, with_wrenches
 from collocation_sysid.recording import Nuisance, Wrench, place_markers
 
-BOTH = ["interior-point", "reduced-space"]
+DEFAULT_METHODS = ["interior-point", "reduced-space"]
 TRUTH = {
     "lambda_pa": 200.0,
     "mu_pa": 300.0,
@@ -65,15 +66,18 @@ PARAMETERS = Parameters(
         Parameter("gamma_m_1_s", 0.5, 1e-3, 100.0),
     )
 )
+# Sampling interval [s].
 STEP_S = 0.01
+# Rings x layers of the cylinder and number of steps, as in the paper.
 PAPER_SIZE = ("2x8", 100)
 # Rings x layers of the cylinder: 95 to about 5,000 nodes.
 MESHES = ("2x4", "2x8", "3x12", "4x16", "4x32", "6x38")
+# Numbers of time steps with --scaling.
 STEPS = (50, 100, 200, 400, 800, 1600)
 
 
 @dataclass(frozen=True)
-class Row:
+class MethodRow:
     """Measurements of one run of one method: sizes, iterations, times [s] and peak memory [MB]."""
 
     method: str
@@ -93,14 +97,17 @@ class Row:
 
     @property
     def us_per_node_and_step(self) -> float:
-        """Cost of the whole solve over nodes and steps."""
+        """Time of the solve per node and step [µs]."""
         return 1e6 * self.total_s / self.nodes / self.steps
 
 
 def experiment_of(
     mesh: str, steps: int, seed: int = 0, noise_m: float = 0.0
 ) -> Experiment:
-    """A hung and swung cylinder with tracks from the midpoint scheme."""
+    """Return the swung cylinder with tracks of the midpoint scheme and noise [m].
+
+    `mesh` has the numbers of rings and layers, such as 2x8; `steps` is the number of samples.
+    """
     body = Body(cylinder(mesh), density_kg_m3=20.0, damping="rayleigh")
     experiment = swung(body, steps)
     tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
@@ -111,13 +118,13 @@ def experiment_of(
 
 
 def cylinder(mesh: str) -> TetMesh:
-    """The cylinder of so many rings and layers."""
+    """Return the mesh of a cylinder with numbers of rings and layers, such as 2x8."""
     rings, layers = map(int, mesh.split("x"))
     return cylinder_mesh(0.04, 0.16, rings, layers)
 
 
 def swung(body: Body, steps: int) -> Experiment:
-    """A cylinder hung by its base and swung, its markers still to be seen."""
+    """Return the recording of a hanging, swung cylinder without tracks, with `steps` samples."""
     t_s = np.arange(steps, dtype=np.float64) * STEP_S
     poses = swing(
         t_s,
@@ -129,19 +136,21 @@ def swung(body: Body, steps: int) -> Experiment:
     )
     angle = np.arange(8) * 2.4
     height = np.linspace(0.04, 0.16, 8)
-    places = np.column_stack(
+    places_m = np.column_stack(
         [0.035 * np.cos(angle), 0.035 * np.sin(angle), height]
     )
-    placement = place_markers(places, body.nodes_m, body, "vertex")
+    placement = place_markers(places_m, body.nodes_m, body, "vertex")
     markers = Markers(t_s, np.zeros((steps, 8, 3)), 0.001, placement=placement)
-    held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
-    grasp = Grasp(held, poses)
-    ideal = Nuisance.none()
-    return Experiment(body, t_s, [grasp], markers, name="swing", nuisance=ideal)
+    clamped_nodes = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
+    grasp = Grasp(clamped_nodes, poses)
+    no_nuisance = Nuisance.none()
+    return Experiment(
+        body, t_s, [grasp], markers, name="swing", nuisance=no_nuisance
+    )
 
 
-def measure(mesh: str, steps: int, method: str) -> Row:
-    """One identification from the guess; kernels are warm, the process is fresh."""
+def measure(mesh: str, steps: int, method: str) -> MethodRow:
+    """Identify once from the guess with compiled kernels; call this in a new process for its memory."""
     experiment = experiment_of(mesh, steps)
     began = time.perf_counter()
     simulate(experiment, TRUTH, "midpoint", substeps=1)
@@ -156,9 +165,9 @@ def measure(mesh: str, steps: int, method: str) -> Row:
     solution = METHODS[method]()(collocation)
     total_s = time.perf_counter() - began
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    # The full Jacobian of a large problem would take more memory than its solution did.
-    small = collocation.variable_count < 500_000
-    return Row(
+    # The complete Jacobian of a large problem would need more memory than the solve.
+    is_small = collocation.variable_count < 500_000
+    return MethodRow(
         method=method,
         nodes=len(experiment.body.nodes_m),
         elements=len(experiment.body.cells),
@@ -171,31 +180,37 @@ def measure(mesh: str, steps: int, method: str) -> Row:
         linear_algebra_s=solution.timing.linear_algebra,
         total_s=total_s,
         peak_mb=peak_mb,
-        kkt_residual=solution.kkt_residual if small else float("nan"),
+        kkt_residual=solution.kkt_residual if is_small else float("nan"),
         theta_error=float(np.abs(solution.theta / truth - 1).max()),
     )
 
 
-def in_own_process(mesh: str, steps: int, method: str) -> Row:
-    """`measure` in a fresh interpreter, so that peak memory is its own."""
+def measure_in_own_process(mesh: str, steps: int, method: str) -> MethodRow:
+    """Call `measure` in a new interpreter, so that the peak memory is that of this run."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(measure, (mesh, steps, method))
 
 
-# What may not be known, each beside the same with nothing unknown but the parameters.
-UNKNOWN = (
+# Cases with nuisance parameters; each is compared with the same recording without them.
+UNKNOWN_CASES = (
     "clock, gravity, grasp",
     "places as well",
     "with a wrench",
     "with memory",
 )
 MEMORY = {"prony_1.share": 0.3, "prony_1.tau_s": 0.05}
+# Standard deviations of force [N] and torque [N m].
 WRENCH_SIGMAS = 0.01, 0.001
 
 
-def problem_of(mesh: str, steps: int, case: str, ideal: bool) -> Problem:
-    """A recording with noise and what is unknown by default, or nothing."""
-    noise = np.random.default_rng(0).normal
+def problem_with_unknowns(
+    mesh: str, steps: int, case: str, is_ideal: bool
+) -> Problem:
+    """Return the noisy problem of a case of `UNKNOWN_CASES`.
+
+    If `is_ideal`, no nuisance parameters are estimated, and the places of the markers are known.
+    """
+    draw_noise = np.random.default_rng(0).normal
     memory = MEMORY if case == "with memory" else {}
     body = Body(
         cylinder(mesh), density_kg_m3=20.0, prony=["prony_1"] if memory else []
@@ -205,20 +220,27 @@ def problem_of(mesh: str, steps: int, case: str, ideal: bool) -> Problem:
         sensor = Wrench(experiment.t_s, np.zeros((steps, 6)), *WRENCH_SIGMAS)
         grasps = [replace(grasp, wrench=sensor) for grasp in experiment.grasps]
         experiment = replace(experiment, grasps=grasps)
-    made = simulate(experiment, TRUTH | memory, "midpoint", substeps=1)
+    simulation = simulate(experiment, TRUTH | memory, "midpoint", substeps=1)
     markers = experiment.markers
     sigmas = np.repeat(WRENCH_SIGMAS, 3)
-    felt = [
-        wrench + sigmas * noise(size=wrench.shape) for wrench in made.wrenches
+    noisy_wrenches = [
+        wrench + sigmas * draw_noise(size=wrench.shape)
+        for wrench in simulation.wrenches
     ]
     placement = (
-        None if case == "places as well" and not ideal else markers.placement
+        None if case == "places as well" and not is_ideal else markers.placement
     )
-    tracks = made.markers_m + 1e-3 * noise(size=made.markers_m.shape)
-    seen = Markers(markers.t_s, tracks, markers.sigma_m, placement=placement)
-    nuisance = Nuisance.none() if ideal else Nuisance()
+    tracks = simulation.markers_m + 1e-3 * draw_noise(
+        size=simulation.markers_m.shape
+    )
+    noisy_markers = Markers(
+        markers.t_s, tracks, markers.sigma_m, placement=placement
+    )
+    nuisance = Nuisance.none() if is_ideal else Nuisance()
     experiment = replace(
-        with_wrenches(experiment, felt), markers=seen, nuisance=nuisance
+        with_wrenches(experiment, noisy_wrenches),
+        markers=noisy_markers,
+        nuisance=nuisance,
     )
     guesses = {
         item.name: Unknown(item.guess, item.lower, item.upper)
@@ -227,67 +249,84 @@ def problem_of(mesh: str, steps: int, case: str, ideal: bool) -> Problem:
     return Problem([experiment], guesses | memory, scheme="midpoint")
 
 
-def identified(
-    mesh: str, steps: int, case: str, ideal: bool
+def measure_interior_point(
+    mesh: str, steps: int, case: str, is_ideal: bool
 ) -> tuple[float, int, float]:
-    """Processor time and iterations of interior point, and how far reduced space ends from it."""
-    expected = solve(problem_of(mesh, steps, case, ideal), ReducedSpace())
+    """Return processor time [s] and iterations of interior point, and its difference from reduced space.
+
+    The difference is the largest one of the transformed parameters.
+
+    Raises
+    ------
+    SystemExit
+        If interior point does not converge.
+    """
+    reference = solve(
+        problem_with_unknowns(mesh, steps, case, is_ideal), ReducedSpace()
+    )
     began = time.process_time()
-    found = InteriorPoint()(expected.collocation)  # where its markers are read
+    solution = InteriorPoint()(
+        reference.collocation
+    )  # with the same association of the markers
     spent_s = time.process_time() - began
-    if not found.status.converged:
-        raise SystemExit(f"{case}: {found.message}")
-    return spent_s, found.iterations, float(np.abs(found.q - expected.q).max())
+    if not solution.status.converged:
+        raise SystemExit(f"{case}: {solution.message}")
+    return (
+        spent_s,
+        solution.iterations,
+        float(np.abs(solution.q - reference.q).max()),
+    )
 
 
 def show_unknown(mesh: str, steps: int) -> None:
     """Print the time of interior point with nuisance parameters, divided by the time without."""
-    for case in UNKNOWN:
+    for case in UNKNOWN_CASES:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
-            ideal, whole = (
-                pool.apply(identified, (mesh, steps, case, e))
+            without, with_nuisance = (
+                pool.apply(measure_interior_point, (mesh, steps, case, e))
                 for e in (True, False)
             )
         print(
-            f"{case:22} {mesh}, {steps} steps: {ideal[0]:7.2f} s, {ideal[1]} iterations without; "
-            f"{whole[0]:7.2f} s, {whole[1]} with: {whole[0] / ideal[0]:.2f} times; "
-            f"log parameters off reduced space's by {max(ideal[2], whole[2]):.1e}",
+            f"{case:22} {mesh}, {steps} steps: {without[0]:7.2f} s, {without[1]} iterations without; "
+            f"{with_nuisance[0]:7.2f} s, {with_nuisance[1]} with: {with_nuisance[0] / without[0]:.2f} times; "
+            f"log parameters differ from reduced space by {max(without[2], with_nuisance[2]):.1e}",
             flush=True,
         )
 
 
-def shared_out(
+def print_parallel_speed(
     mesh: str, steps: int, experiments: int = 4, repeats: int = 3
 ) -> None:
-    """Print how much faster two workers, and two threads, are than one, in turns.
+    """Print the times of a solve with one and two workers, and with one and two threads, in turns.
 
-    Beside the wall's time stands processor time, of the busiest worker and of this process, which
-    other work on the machine lengthens little. Bodies and recordings are there already, as threads
-    have them, and so are the kernels.
+    The processor times are those of the busiest worker and of this process, which other work on the
+    machine changes little. Workers have bodies, recordings and kernels before the first solve.
     """
     from distributed import Client, LocalCluster
 
-    first = experiment_of(mesh, steps)
+    first_recording = experiment_of(mesh, steps)
     recordings = []
     for k in range(experiments):
         noise_m = 1e-3 * np.random.default_rng(k).normal(
-            size=first.markers.positions_m.shape
+            size=first_recording.markers.positions_m.shape
         )
-        made = with_markers(first, first.markers.positions_m + noise_m)
-        recordings.append(replace(made, name=f"swing {k}"))
+        noisy_recording = with_markers(
+            first_recording, first_recording.markers.positions_m + noise_m
+        )
+        recordings.append(replace(noisy_recording, name=f"swing {k}"))
 
     collocation = Collocation(recordings, PARAMETERS)
 
     def solve(
         workers: DaskExecutor | None, threads: int
     ) -> tuple[float, float, float]:
-        first.body.threads = threads
+        first_recording.body.threads = threads
         busy_s = workers.client.run(time.process_time) if workers else {}
-        here_s = time.process_time()
+        own_s = time.process_time()
         began = time.perf_counter()
         solution = ReducedSpace()(collocation, workers=workers)
         wall_s = time.perf_counter() - began
-        here_s = time.process_time() - here_s
+        own_s = time.process_time() - own_s
         busiest_s = 0.0
         if workers:
             after_s = workers.client.run(time.process_time)
@@ -298,7 +337,7 @@ def shared_out(
         print(
             f"  {solution.status.value} after {solution.iterations} sweeps: {wall_s:.2f} s"
         )
-        return wall_s, busiest_s, here_s
+        return wall_s, busiest_s, own_s
 
     with ExitStack() as stack:
         clusters: list[DaskExecutor] = []
@@ -321,16 +360,18 @@ def shared_out(
             for name, case in cases.items():
                 times[name].append(solve(*case))
     print(
-        f"{experiments} experiments, {mesh}, {steps} samples, {os.getloadavg()[0]:.1f} at work"
+        f"{experiments} experiments, {mesh}, {steps} samples, load average {os.getloadavg()[0]:.1f}"
     )
-    for name, found in times.items():
-        wall_s, busiest_s, here_s = np.median(found, axis=0)
+    for name, measured_s in times.items():
+        wall_s, busiest_s, own_s = np.median(measured_s, axis=0)
         print(
-            f"{name:12} {wall_s:6.2f} s; processors {busiest_s:6.2f} s there {here_s:6.2f} s here"
+            f"{name:12} wall time {wall_s:6.2f} s; processor time "
+            f"{busiest_s:6.2f} s of the busiest worker, {own_s:6.2f} s of this process"
         )
 
 
-def show(row: Row) -> None:
+def print_row(row: MethodRow) -> None:
+    """Print one row."""
     print(
         f"{row.method:15s} {row.nodes:5d} nodes {row.steps:5d} steps  {row.status:10s} "
         f"{row.iterations:3d} iterations  total {row.total_s:8.2f} s "
@@ -342,18 +383,23 @@ def show(row: Row) -> None:
     )
 
 
-def plot(rows: list[Row], folder: Path) -> None:
+def plot(rows: list[MethodRow], folder: Path) -> None:
+    """Write a figure of the times over steps and over nodes to `benchmark_methods.png`."""
     figure = Figure(figsize=(8, 3.2), layout="constrained")
-    for place, (key, fixed) in enumerate(
+    for panel, (key, fixed) in enumerate(
         (("steps", "nodes"), ("nodes", "steps"))
     ):
-        axes = figure.add_subplot(1, 2, place + 1)
+        axes = figure.add_subplot(1, 2, panel + 1)
         for method in sorted({row.method for row in rows}):
-            common = [row for row in rows if row.method == method]
-            values = [getattr(row, fixed) for row in common]
-            most = max(set(values), key=values.count)
+            method_rows = [row for row in rows if row.method == method]
+            values = [getattr(row, fixed) for row in method_rows]
+            common_value = max(set(values), key=values.count)
             chosen = sorted(
-                (row for row in common if getattr(row, fixed) == most),
+                (
+                    row
+                    for row in method_rows
+                    if getattr(row, fixed) == common_value
+                ),
                 key=lambda row: getattr(row, key),
             )
             x = [getattr(row, key) for row in chosen]
@@ -361,7 +407,7 @@ def plot(rows: list[Row], folder: Path) -> None:
                 x,
                 [row.total_s for row in chosen],
                 "o-",
-                label=f"{method}, {most} {fixed}",
+                label=f"{method}, {common_value} {fixed}",
             )
             axes.loglog(
                 x, [row.simulation_s for row in chosen], ":", color="0.5"
@@ -381,29 +427,31 @@ def main() -> None:
     )
     parser.add_argument("--steps", nargs="*", type=int, default=[PAPER_SIZE[1]])
     parser.add_argument(
-        "--methods", nargs="*", default=BOTH, choices=list(METHODS)
+        "--methods", nargs="*", default=DEFAULT_METHODS, choices=list(METHODS)
     )
     parser.add_argument(
-        "--scaling", action="store_true", help="reduced space over T and meshes"
+        "--scaling",
+        action="store_true",
+        help="reduced space with several numbers of steps and meshes",
     )
     parser.add_argument("--out", type=Path, default=Path("results"))
     parser.add_argument("--json", action="store_true")
     parser.add_argument(
         "--cluster",
         action="store_true",
-        help="four experiments on 1, 2 workers",
+        help="four experiments on one and two workers",
     )
     parser.add_argument(
         "--unknown",
         action="store_true",
-        help="nuisances, places, wrench, memory",
+        help="cost of nuisance parameters, unknown places, wrench and memory",
     )
     arguments = parser.parse_args()
     if arguments.unknown:
         show_unknown(arguments.mesh[0], arguments.steps[0])
         return
     if arguments.cluster:
-        shared_out(arguments.mesh[0], arguments.steps[0])
+        print_parallel_speed(arguments.mesh[0], arguments.steps[0])
         return
     cases = [
         (m, t, k)
@@ -420,9 +468,9 @@ def main() -> None:
         ]
     rows = []
     for case in cases:
-        rows.append(in_own_process(*case))
+        rows.append(measure_in_own_process(*case))
         if not arguments.json:
-            show(rows[-1])
+            print_row(rows[-1])
     arguments.out.mkdir(parents=True, exist_ok=True)
     content = json.dumps([asdict(row) for row in rows], indent=1)
     (arguments.out / "benchmark_methods.json").write_text(content + "\n")

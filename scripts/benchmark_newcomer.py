@@ -13,7 +13,7 @@ import statistics
 import time
 
 import numpy as np
-from study_starts import CASES, described, problem_of, with_noise
+from study_starts import CASES, problem_of, with_description, with_noise
 
 from collocation_sysid import run
 
@@ -23,30 +23,36 @@ def main() -> None:
     parser.add_argument("--body", default="cylinder", choices=list(CASES))
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
-    case = CASES[arguments.body]()
-    known, unknown = (
-        with_noise(described(case, unplaced, ideal=False), case.noise_m, 0)
+    body = CASES[arguments.body]()
+    described_body, undescribed_body = (
+        with_noise(
+            with_description(body, unplaced, ideal=False), body.noise_m, 0
+        )
         for unplaced in (False, True)
     )
-    truth = np.array(list(known.truth.values()))
+    truth = np.array(list(described_body.truth.values()))
     problems = {
-        "with guess and places": problem_of(known, 2 * truth),
-        "with neither": problem_of(unknown, np.full(len(truth), np.nan)),
+        "with guess and places": problem_of(described_body, 2 * truth),
+        "with neither": problem_of(
+            undescribed_body, np.full(len(truth), np.nan)
+        ),
     }
     times_s: dict[str, list[float]] = {name: [] for name in problems}
     run(problems["with guess and places"])
     for _ in range(arguments.repeats):
         for name, problem in problems.items():
             began = time.perf_counter()
-            found = run(problem)
+            answer = run(problem)
             times_s[name].append(time.perf_counter() - began)
-            if not found.solution.status.converged:
-                raise SystemExit(f"{name}: {found.solution.message}")
+            if not answer.solution.status.converged:
+                raise SystemExit(f"{name}: {answer.solution.message}")
     medians = {name: statistics.median(each) for name, each in times_s.items()}
     for name, median_s in medians.items():
         print(f"{name}: {median_s:.2f} s (median of {arguments.repeats})")
-    both, neither = medians.values()
-    print(f"ratio {neither / both:.2f}")
+    time_with_both_s, time_with_neither_s = medians.values()
+    print(
+        f"time with neither over time with both: {time_with_neither_s / time_with_both_s:.2f}"
+    )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Time sweeps with materials in powers of the stretches beside one with neo-Hookean material.
+"""Time of sweeps with materials in powers of the stretches over that with neo-Hookean material.
 
-A sweep is what an iteration of reduced space costs: all timesteps evaluated, their blocks
-factorised, the feasibility step and the sensitivities solved for. Rounds of all materials
-alternate; the best times are compared, of which the ratios are printed.
+A sweep is the cost of one iteration of reduced space: all time steps are evaluated, their blocks are
+factorised, and the feasibility step and the sensitivities are computed. Rounds of all materials
+alternate; the ratios of the best times are printed.
 
     python scripts/benchmark_ogden.py
 """
@@ -76,7 +76,7 @@ def main() -> None:
         text = ", ".join(
             f"{name} {value:.2f}" for name, value in values.items()
         )
-        print(f"{material:>13}: {text} of {REFERENCE}")
+        print(f"{material:>13}: {text} times {REFERENCE}")
 
 
 def measure(arguments: argparse.Namespace) -> dict[str, dict[str, float]]:
@@ -84,14 +84,16 @@ def measure(arguments: argparse.Namespace) -> dict[str, dict[str, float]]:
     sweeps = {
         material: make_sweep(material, arguments) for material in MATERIALS
     }
-    names = ("sweep", "evaluation", "linear algebra")
-    best = {material: np.full(len(names), np.inf) for material in MATERIALS}
+    part_names = ("sweep", "evaluation", "linear algebra")
+    best = {
+        material: np.full(len(part_names), np.inf) for material in MATERIALS
+    }
     for _ in range(arguments.rounds):
         for material, sweep in sweeps.items():
             best[material] = np.minimum(best[material], sweep())
     return {
         material: dict(
-            zip(names, (times / best[REFERENCE]).tolist(), strict=True)
+            zip(part_names, (times / best[REFERENCE]).tolist(), strict=True)
         )
         for material, times in best.items()
     }
@@ -105,7 +107,7 @@ def make_sweep(
     All constants are estimated, so that their sensitivities are part of the sweep.
     """
     rings, layers = map(int, arguments.mesh.split("x"))
-    recorded = experiment_of(arguments.mesh, arguments.steps)
+    recording = experiment_of(arguments.mesh, arguments.steps)
     body = Body(
         cylinder_mesh(0.04, 0.16, rings, layers),
         material,
@@ -113,10 +115,10 @@ def make_sweep(
         damping=arguments.damping,
         threads=arguments.threads,
     )
-    held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
-    grasp = replace(recorded.grasps[0], nodes=held)
-    markers = recorded.markers.on_body(body)
-    experiment = replace(recorded, body=body, grasps=(grasp,), markers=markers)
+    clamped_nodes = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
+    grasp = replace(recording.grasps[0], nodes=clamped_nodes)
+    markers = recording.markers.on_body(body)
+    experiment = replace(recording, body=body, grasps=(grasp,), markers=markers)
     values = {**MATERIALS[material], **DAMPING}
     unknowns = {
         name: Unknown(

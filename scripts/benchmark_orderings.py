@@ -1,7 +1,7 @@
 """Orderings, scalings and BLAS threads of IPOPT's linear solvers, on the matrices of a problem.
 
 Each setting runs IPOPT alone, from the simulation at the guess, for the same number of iterations,
-in a process of its own. Prints processor time and its ratio to the default of interior point, the
+in a separate process. Prints processor time and its ratio to the default of interior point, the
 number of factorisations, and what MUMPS states about the last one: entries of the factor over
 entries of the matrix (fill), operations of the elimination and delayed pivots. IPOPT may factorise
 a matrix more than once in an iteration, so compare the time per factorisation as well.
@@ -187,7 +187,9 @@ class SolveTimes:
     loss: float
 
 
-def run_here(problem: str, setting: Setting, iterations: int) -> SolveTimes:
+def run_in_this_process(
+    problem: str, setting: Setting, iterations: int
+) -> SolveTimes:
     """Run IPOPT with a setting in this process; MUMPS prints its statistics.
 
     The markers are associated by reduced space, whose time does not count.
@@ -225,7 +227,7 @@ def run_here(problem: str, setting: Setting, iterations: int) -> SolveTimes:
     )
 
 
-def run_apart(
+def run_in_own_process(
     problem: str, name: str, iterations: int
 ) -> tuple[SolveTimes | None, Factorisations | None]:
     """Run IPOPT with a setting in a process of its own.
@@ -288,7 +290,7 @@ def measure(problem: str, names: list[str], iterations: int) -> None:
     print(f"{problem}, {iterations} iterations", flush=True)
     reference_s: float | None = None
     for name in names:
-        times, factors = run_apart(problem, name, iterations)
+        times, factors = run_in_own_process(problem, name, iterations)
         if times is None:
             print(f"  {name}: the process failed", flush=True)
             continue
@@ -297,7 +299,7 @@ def measure(problem: str, names: list[str], iterations: int) -> None:
             f"{times.status}",
             f"{times.iterations} iterations",
             f"{times.processor_s:.1f} s of processor time",
-            f"{times.processor_s / reference_s:.2f} times the first",
+            f"{times.processor_s / reference_s:.2f} times the time of the first setting",
             f"linear algebra {times.linear_algebra_share:.0%}",
             f"wall {times.wall_s:.1f} s",
             f"loss {times.loss:.6g}",
@@ -334,7 +336,7 @@ def main() -> None:
     options = parser.parse_args()
     for problem in options.problems:
         if options.here:
-            times = run_here(
+            times = run_in_this_process(
                 problem, SETTINGS[options.here], options.iterations
             )
             print(f"\n{RESULT}{json.dumps(asdict(times))}", flush=True)

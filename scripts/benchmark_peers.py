@@ -36,8 +36,8 @@ from numpy.typing import NDArray
 from peer_case import (
     BOUNDS,
     GUESS,
+    MARKED_NODES,
     NOISE_M,
-    SEEN_NODES,
     STEPS_PER_SAMPLE,
     TRUTH,
     cylinder,
@@ -60,15 +60,15 @@ Array = NDArray[np.float64]
 Function = Callable[[Array], Array]
 
 # Relative distance from the best answer within which the answer counts as reached.
-REACHED = 0.01
+REACHED_SHARE = 0.01
 # Time steps per sample of the best answer, whose time error is negligible.
 BEST_STEPS_PER_SAMPLE = 16
 # Residuals of a simulation that fails, in standard deviations of the noise.
-FAILED = 1e3
+FAILED_RESIDUAL = 1e3
 # Computing time after which a candidate is stopped [s].
 LIMIT_S = 600.0
 # Step of forward differences of simulations that are solved to about 1e-8 [relative].
-DIFFERENCE = 1e-4
+DIFFERENCE_STEP = 1e-4
 # Step of MuJoCo's implicit integrator; a simulation takes two thirds of
 # the time of one with explicit steps [s].
 DISCRETE_STEP_S = 5e-4
@@ -205,7 +205,7 @@ def search(
         counted_residuals(simulate, experiment, progress),
         np.log(list(GUESS.values())),
         bounds=(low, high),
-        diff_step=DIFFERENCE,
+        diff_step=DIFFERENCE_STEP,
         xtol=1e-6,
         ftol=1e-8,
     )
@@ -218,7 +218,7 @@ def counted_residuals(
 ) -> Function:
     """Return the residuals as a function that records each simulation.
 
-    The residuals of a simulation that fails are `FAILED`.
+    The residuals of a simulation that fails are `FAILED_RESIDUAL`.
     """
     measured_m = np.asarray(experiment.markers.positions_m)
 
@@ -226,10 +226,12 @@ def counted_residuals(
         try:
             positions_m = simulate(parameter_values(x))
         except (UnstableSimulationError, cs.SimulationError):
-            rows = np.full(measured_m.size, FAILED)
+            rows = np.full(measured_m.size, FAILED_RESIDUAL)
         else:
-            away_m = positions_m[:, list(SEEN_NODES)] - measured_m
-            rows = (away_m.ravel() / NOISE_M).clip(-FAILED, FAILED)
+            distances_m = positions_m[:, list(MARKED_NODES)] - measured_m
+            rows = (distances_m.ravel() / NOISE_M).clip(
+                -FAILED_RESIDUAL, FAILED_RESIDUAL
+            )
         progress.record(parameter_values(x), float(rows @ rows))
         return rows
 
@@ -241,8 +243,10 @@ def parameter_values(x: Array) -> dict[str, float]:
     return dict(zip(GUESS, np.exp(x).tolist(), strict=True))
 
 
-def search_around_ours(experiment: cs.Experiment, progress: Progress) -> None:
-    """Search by SciPy around the simulation of this project."""
+def search_with_own_simulation(
+    experiment: cs.Experiment, progress: Progress
+) -> None:
+    """Search by SciPy with the simulation of this project."""
 
     def simulate(values: dict[str, float]) -> Array:
         return cs.simulate(
@@ -255,19 +259,17 @@ def search_around_ours(experiment: cs.Experiment, progress: Progress) -> None:
     search(simulate, experiment, progress)
 
 
-def search_around_scikit_fem(
+def search_with_scikit_fem(
     experiment: cs.Experiment, progress: Progress
 ) -> None:
-    """Search by SciPy around a simulation of scikit-fem."""
+    """Search by SciPy with a simulation of scikit-fem."""
     from peer_scikit_fem import ScikitFemCylinder
 
     search(ScikitFemCylinder().simulate, experiment, progress)
 
 
-def search_around_calculix(
-    experiment: cs.Experiment, progress: Progress
-) -> None:
-    """Search by SciPy around runs of CalculiX in a temporary folder."""
+def search_with_calculix(experiment: cs.Experiment, progress: Progress) -> None:
+    """Search by SciPy with runs of CalculiX in a temporary folder."""
     with tempfile.TemporaryDirectory() as folder:
         simulate = partial(simulate_with_calculix, folder=Path(folder))
         search(simulate, experiment, progress)
@@ -288,13 +290,13 @@ def descend_with_warp(experiment: cs.Experiment, progress: Progress) -> None:
     scale = FIRST_CHANGE / float(np.linalg.norm(first.gradient))
 
     def evaluate(x: Array) -> tuple[float, Array]:
-        found = body.evaluate(x)
-        if not np.isfinite(found.loss):
+        evaluation = body.evaluate(x)
+        if not np.isfinite(evaluation.loss):
             progress.record(parameter_values(x), np.inf)
-            loss = FAILED**2 * experiment.markers.positions_m.size
+            loss = FAILED_RESIDUAL**2 * experiment.markers.positions_m.size
             return scale * loss, np.zeros(len(x))
-        progress.record(parameter_values(x), found.loss)
-        return scale * found.loss, scale * found.gradient
+        progress.record(parameter_values(x), evaluation.loss)
+        return scale * evaluation.loss, scale * evaluation.gradient
 
     bounds = [tuple(np.log(limits)) for limits in BOUNDS.values()]
     minimize(
@@ -323,7 +325,7 @@ def solve_with_mujoco(
     def simulate(values: dict[str, float]) -> Array:
         return simulate_flex(mesh, values, step_s=step_s, integrator=integrator)
 
-    single = counted_residuals(simulate, experiment, progress)
+    residuals_of_one = counted_residuals(simulate, experiment, progress)
     parameters = sysid.ParameterDict()
     for name in GUESS:
         low, high = np.log(BOUNDS[name])
@@ -331,8 +333,8 @@ def solve_with_mujoco(
 
     def residuals(x: Array, _: object, **__: object) -> tuple:
         if np.ndim(x) == 1:
-            return [single(x)], None, None
-        columns = [single(column) for column in np.asarray(x).T]
+            return [residuals_of_one(x)], None, None
+        columns = [residuals_of_one(column) for column in np.asarray(x).T]
         return [np.stack(columns, axis=1)], None, None
 
     sysid.optimize(parameters, residuals, optimizer=backend, verbose=False)
@@ -401,8 +403,8 @@ CANDIDATES = {
         is_compiled=True,
     ),
     "scipy-ours": Candidate(
-        "SciPy `least_squares` around our simulation",
-        search_around_ours,
+        "SciPy `least_squares` with the simulation of this project",
+        search_with_own_simulation,
         is_compiled=True,
     ),
     "mujoco-sysid": Candidate(
@@ -443,13 +445,13 @@ CANDIDATES = {
         is_compiled=True,
     ),
     "calculix": Candidate(
-        "SciPy `least_squares` around CalculiX",
-        search_around_calculix,
+        "SciPy `least_squares` with CalculiX",
+        search_with_calculix,
         program="ccx",
     ),
     "scikit-fem": Candidate(
-        "SciPy `least_squares` around scikit-fem",
-        search_around_scikit_fem,
+        "SciPy `least_squares` with scikit-fem",
+        search_with_scikit_fem,
         package="scikit-fem",
         module="skfem",
     ),
@@ -469,10 +471,12 @@ def reached_entry(track: Track, best: Mapping[str, float]) -> int | None:
     if not track.values:
         return None
     values = np.array([[each[name] for name in best] for each in track.values])
-    away = np.abs(values / np.array(list(best.values())) - 1).max(axis=1)
-    far = np.flatnonzero(away > REACHED)
-    first = int(far[-1]) + 1 if len(far) else 0
-    return first if first < len(values) else None
+    largest_error = np.abs(values / np.array(list(best.values())) - 1).max(
+        axis=1
+    )
+    outside_entries = np.flatnonzero(largest_error > REACHED_SHARE)
+    first_inside = int(outside_entries[-1]) + 1 if len(outside_entries) else 0
+    return first_inside if first_inside < len(values) else None
 
 
 def measure(name: str) -> Track:
@@ -504,8 +508,8 @@ def measure(name: str) -> Track:
     )
 
 
-def measure_alone(name: str) -> Track:
-    """Run a candidate in a process of its own, on one core.
+def measure_in_own_process(name: str) -> Track:
+    """Run a candidate in a separate process, on one core.
 
     Raises subprocess.CalledProcessError when it fails; its messages are on standard error.
     """
@@ -528,7 +532,7 @@ def row(
     name: str,
     track: Track,
     best: Mapping[str, float],
-    ours_s: float | None,
+    reduced_space_s: float | None,
 ) -> tuple[str, ...]:
     """Return a row of the table.
 
@@ -545,7 +549,9 @@ def row(
     """
     entry = reached_entry(track, best)
     reached_s = None if entry is None else track.times_s[entry]
-    ratio = reached_s / ours_s if reached_s and ours_s else None
+    ratio = (
+        reached_s / reduced_space_s if reached_s and reduced_space_s else None
+    )
     last = track.values[-1] if track.values else {}
     return (
         CANDIDATES[name].title,
@@ -563,7 +569,7 @@ def row(
 
 def table(
     tracks: Mapping[str, Track],
-    unmeasured: Mapping[str, str],
+    failures: Mapping[str, str],
     best: Mapping[str, float],
 ) -> str:
     """Return the results as a Markdown table.
@@ -579,41 +585,54 @@ def table(
     """
     heads = (
         "candidate",
-        "time to 1 % / ours",
+        "time to 1 % over that of this project",
         "time to 1 %, s",
-        "simulations",
-        "until it stops, s",
-        "simulations",
+        "simulations to 1 %",
+        "time until it stops, s",
+        "simulations until it stops",
         *best,
     )
-    ours = tracks.get("reduced-space")
-    entry = None if ours is None else reached_entry(ours, best)
-    ours_s = None if ours is None or entry is None else ours.times_s[entry]
-    rows = [row(name, track, best, ours_s) for name, track in tracks.items()]
+    reduced_space_track = tracks.get("reduced-space")
+    entry = (
+        None
+        if reduced_space_track is None
+        else reached_entry(reduced_space_track, best)
+    )
+    reduced_space_s = (
+        None
+        if reduced_space_track is None or entry is None
+        else reduced_space_track.times_s[entry]
+    )
+    rows = [
+        row(name, track, best, reduced_space_s)
+        for name, track in tracks.items()
+    ]
     empty = [""] * (len(heads) - 2)
     rows += [
         (CANDIDATES[name].title, reason, *empty)
-        for name, reason in unmeasured.items()
+        for name, reason in failures.items()
     ]
     return markdown(heads, rows)
 
 
 def report(
     tracks: Mapping[str, Track],
-    unmeasured: Mapping[str, str],
+    failures: Mapping[str, str],
     best: Mapping[str, float],
 ) -> str:
     """Return the table with the best answer and the versions of the tools."""
     errors = ", ".join(
         f"{name} {100 * (best[name] / TRUTH[name] - 1):+.2f} %" for name in best
     )
-    found = [CANDIDATES[name].version() for name in tracks]
-    versions = dict.fromkeys(each for each in found if each is not None)
-    base = (f"{each} {version(each)}" for each in ("scipy", "casadi"))
+    tool_versions = [CANDIDATES[name].version() for name in tracks]
+    versions = dict.fromkeys(each for each in tool_versions if each is not None)
+    common_versions = (
+        f"{each} {version(each)}" for each in ("scipy", "casadi")
+    )
     return (
-        f"{table(tracks, unmeasured, best)}\n\n"
-        f"Best answer beside the truth: {errors}.\n"
-        f"Versions: {', '.join((*base, *versions))}.\n"
+        f"{table(tracks, failures, best)}\n\n"
+        f"Errors of the best answer: {errors}.\n"
+        f"Versions: {', '.join((*common_versions, *versions))}.\n"
     )
 
 
@@ -627,23 +646,23 @@ def compare(names: list[str], out: Path | None) -> None:
     out : path or None
         File for the table, whose folder is created; None: only print.
     """
-    best = measure_alone(BEST).values[-1]
+    best = measure_in_own_process(BEST).values[-1]
     tracks = {}
-    unmeasured = {}
+    failures = {}
     for name in names:
-        how = CANDIDATES[name].missing_requirement()
-        if how is not None:
-            unmeasured[name] = f"not installed: {how}"
+        installation = CANDIDATES[name].missing_requirement()
+        if installation is not None:
+            failures[name] = f"not installed: {installation}"
             continue
         try:
             if CANDIDATES[name].is_compiled:
-                measure_alone(name)
-            tracks[name] = measure_alone(name)
+                measure_in_own_process(name)
+            tracks[name] = measure_in_own_process(name)
         except subprocess.CalledProcessError as error:
-            unmeasured[name] = f"failed with exit code {error.returncode}"
+            failures[name] = f"failed with exit code {error.returncode}"
             continue
-        print(table(tracks, unmeasured, best), flush=True)
-    text = report(tracks, unmeasured, best)
+        print(table(tracks, failures, best), flush=True)
+    text = report(tracks, failures, best)
     print(text)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Interior point beside reduced space on shipped problems, from the default start and warm.
+"""Interior point compared with reduced space on shipped problems, from the default start and warm.
 
 For each problem: reduced space, interior point from the default start, and interior point from the
 answer of reduced space, as with `--start`. Prints processor time of the solves, without error bars,
@@ -26,7 +26,7 @@ from collocation_sysid.runs.warm_start import WarmStart
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
 # Problems whose data are in the repository and that interior point solves within minutes.
-DEFAULT = (
+DEFAULT_PROBLEMS = (
     "foam_cylinder",
     "noisy_cylinder",
     "table1/problem_scheme.toml",
@@ -72,12 +72,12 @@ def measure(name: str, cases: tuple[str, ...], max_time_s: float) -> None:
             problem, InteriorPoint(max_time_s=max_time_s), start=start
         )
         solution_s = time.process_time() - began_s
-        apart = np.abs(solution.q - reference.q).max(initial=0.0)
+        largest_difference = np.abs(solution.q - reference.q).max(initial=0.0)
         print(
             f"    {case}: {solution.status.value}, {solution.iterations} iterations, "
             f"{solution_s:.1f} s, {solution_s / reference_s:.1f} times reduced space, linear "
             f"algebra {solution.timing.linear_algebra / solution.timing.total:.0%}; "
-            f"parameters differ by {apart:.1e} of the solver's unit",
+            f"parameters differ by {largest_difference:.1e} of the solver's unit",
             flush=True,
         )
         for note in solution.notes:
@@ -90,7 +90,7 @@ def main() -> None:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("problems", nargs="*", default=list(DEFAULT))
+    parser.add_argument("problems", nargs="*", default=list(DEFAULT_PROBLEMS))
     parser.add_argument("--cases", nargs="*", default=CASES, choices=CASES)
     parser.add_argument("--max-time-s", type=float, default=1e6)
     options = parser.parse_args()

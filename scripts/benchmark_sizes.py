@@ -32,7 +32,7 @@ from collocation_sysid.program.linear_algebra.factorisation import Choice
 from collocation_sysid.program.stopwatch import Stopwatch
 from collocation_sysid.program.sweep import Sweep
 
-# Rings x layers of the cylinder, element, and steps that are enough to tell, by nodes.
+# Rings x layers of the cylinder, element, and a sufficient number of time steps, by number of nodes.
 SIZES = {
     "500": ("3x12", "tet4", 40),
     "2000": ("4x32", "tet4", 20),
@@ -43,20 +43,21 @@ SIZES = {
 
 
 @dataclass(frozen=True)
-class Cost:
-    """Seconds of one part, and how they are shared out."""
+class PartCost:
+    """Total time of one part [s], and the stopwatch with its shares."""
 
     total_s: float
     stopwatch: Stopwatch
 
-    def told(self, steps: int) -> str:
-        spent = self.stopwatch
+    def as_text(self, steps: int) -> str:
+        """Return the time per step and the shares of evaluation and linear algebra, as text."""
+        stopwatch = self.stopwatch
         shares = (
-            spent.evaluations / self.total_s,
-            spent.linear_algebra / self.total_s,
+            stopwatch.evaluations / self.total_s,
+            stopwatch.linear_algebra / self.total_s,
         )
         return (
-            f"{1e3 * self.total_s / steps:8.1f} ms a step (elements {shares[0]:4.0%}, "
+            f"{1e3 * self.total_s / steps:8.1f} ms per step (elements {shares[0]:4.0%}, "
             f"linear algebra {shares[1]:4.0%})"
         )
 
@@ -71,21 +72,24 @@ def main() -> None:
     )
     parser.add_argument("--damping", default="kelvin-voigt")
     parser.add_argument("--steps", type=int)
-    given = parser.parse_args()
-    for size in given.size:
-        for choice in given.factorisation:
-            for threads in given.threads:
-                arguments = size, given.steps, threads, choice, given.damping
+    arguments = parser.parse_args()
+    for size in arguments.size:
+        for choice in arguments.factorisation:
+            for threads in arguments.threads:
+                case = size, arguments.steps, threads, choice, arguments.damping
                 with multiprocessing.get_context("spawn").Pool(1) as pool:
-                    print(pool.apply(measured, arguments), flush=True)
+                    print(pool.apply(measure_size, case), flush=True)
 
 
-def measured(
+def measure_size(
     size: str, steps: int | None, threads: int, choice: Choice, damping: str
 ) -> str:
-    """A line on one body."""
-    mesh, element, few = SIZES[size]
-    steps = steps or few
+    """Measure simulation and sweep of one body, and return a line of the table.
+
+    `size` is a key of `SIZES`; if `steps` is None, the number of steps there is used.
+    """
+    mesh, element, default_steps = SIZES[size]
+    steps = steps or default_steps
     body = Body(
         cylinder(mesh),
         density_kg_m3=20.0,
@@ -95,52 +99,54 @@ def measured(
     )
     collocation = Collocation([swung(body, steps + 1)], PARAMETERS)
     (segment,) = collocation.transcriptions
-    setting = segment.equations_at(
+    equations = segment.equations_at(
         np.log([TRUTH[name] for name in PARAMETERS.names]), np.zeros(0)
     )
     before_mb = peak_mb()
     clock = time.perf_counter if threads > 1 else time.process_time
     began = clock()
-    spent = Stopwatch(clock)
+    stopwatch = Stopwatch(clock)
     x, failure = continue_simulation(
         segment.experiment,
-        setting.dynamics,
+        equations.dynamics,
         options=NewtonOptions(tolerance=1e-6),
-        stopwatch=spent,
+        stopwatch=stopwatch,
     )
     if failure:
         raise failure
-    march = Cost(clock() - began, spent)
-    spent = Stopwatch(clock)
-    solver = Sweep(segment, stopwatch=spent, factorisation=choice)
-    # The analysis of the pattern is made once for all sweeps.
-    numbers = solver.estimate_chunk_bytes()
+    simulation_cost = PartCost(clock() - began, stopwatch)
+    stopwatch = Stopwatch(clock)
+    solver = Sweep(segment, stopwatch=stopwatch, factorisation=choice)
+    # The symbolic factorisation is computed once for all sweeps; accessing this computes it.
+    chunk_bytes = solver.estimate_chunk_bytes()
     began = clock()
-    solver.forward(x, setting)
-    sweep = Cost(clock() - began, spent)
+    solver.forward(x, equations)
+    sweep_cost = PartCost(clock() - began, stopwatch)
     return (
         f"{len(body.nodes_m):6d} nodes {element:5s} {steps:4d} steps {threads} threads "
-        f"{kind(solver):10s} march {march.told(steps)}  sweep {sweep.told(steps)}  "
-        f"at a time {solver.choose_chunk_rows()} steps, {numbers / 1e6:.0f} MB; "
-        f"peak {peak_mb():.0f} MB, before {before_mb:.0f} MB"
+        f"{factorisation_name(solver):10s} simulation {simulation_cost.as_text(steps)}  "
+        f"sweep {sweep_cost.as_text(steps)}  "
+        f"chunks of {solver.choose_chunk_rows()} steps, {chunk_bytes / 1e6:.0f} MB; "
+        f"peak memory {peak_mb():.0f} MB, before {before_mb:.0f} MB"
     )
 
 
-def kind(solver: Sweep) -> str:
+def factorisation_name(solver: Sweep) -> str:
     """Return the name of the factorisation that a sweep uses."""
-    chosen = solver.factoriser
-    if chosen.skyline:
+    factoriser = solver.factoriser
+    if factoriser.skyline:
         return "skyline"
     return (
         "band"
-        if chosen.is_banded
+        if factoriser.is_banded
         else "supernodal"
-        if chosen.is_supernodal
+        if factoriser.is_supernodal
         else "sparse"
     )
 
 
 def peak_mb() -> float:
+    """Return the largest memory of this process so far [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 

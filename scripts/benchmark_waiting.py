@@ -24,12 +24,13 @@ from pathlib import Path
 PROBLEM = (
     Path(__file__).parents[1] / "problems" / "foam_cylinder" / "recording.toml"
 )
-MAIN = "from collocation_sysid.cli import main; main()"
+# Program that runs the command line.
+PROGRAM = "from collocation_sysid.cli import main; main()"
 
 
 @dataclass(frozen=True)
-class Waited:
-    """Seconds to the first text, to the end, and of processor time."""
+class WaitingTimes:
+    """Times of a command: to the first text, to its end, and of the processor [s]."""
 
     first_s: float
     wall_s: float
@@ -41,11 +42,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--problem", type=Path, default=PROBLEM)
     parser.add_argument("--repeats", type=int, default=3)
-    arguments = parser.parse_args()
-    problem = str(arguments.problem)
-    with tempfile.TemporaryDirectory() as place:
+    options = parser.parse_args()
+    problem = str(options.problem)
+    with tempfile.TemporaryDirectory() as folder:
         run, warm, cold = (
-            str(Path(place) / name) for name in ("run", "warm", "cold")
+            str(Path(folder) / name) for name in ("run", "warm", "cold")
         )
         solve = ["solve", problem, "--out", run]
         commands = {
@@ -55,13 +56,15 @@ def main() -> None:
             "solve": (solve, warm),
             "report": (["report", run], warm),
         }
-        waited(solve, warm)
-        print("| | first text s | wall s | processor s |\n|---|---|---|---|")
-        for name, (words, cache) in commands.items():
+        time_command(solve, warm)
+        print(
+            "| command | time to first text, s | wall time, s | processor time, s |\n|---|---|---|---|"
+        )
+        for name, (arguments, cache) in commands.items():
             times = []
-            for _ in range(arguments.repeats):
+            for _ in range(options.repeats):
                 shutil.rmtree(cold, ignore_errors=True)
-                times.append(waited(words, cache))
+                times.append(time_command(arguments, cache))
             columns = ("first_s", "wall_s", "processor_s")
             medians = [
                 statistics.median(getattr(t, c) for t in times) for c in columns
@@ -73,32 +76,42 @@ def main() -> None:
             )
 
 
-def waited(words: list[str], cache: str) -> Waited:
-    """Run a command of the command line on a terminal of its own."""
-    ours, theirs = pty.openpty()
+def time_command(arguments: list[str], cache: str) -> WaitingTimes:
+    """Run a command on a pseudo-terminal, and return its times.
+
+    Parameters
+    ----------
+    arguments : list of str
+        Arguments of the command line.
+    cache : str
+        Folder of compiled kernels.
+    """
+    own_terminal, command_terminal = pty.openpty()
     environment = {**os.environ, "XDG_CACHE_HOME": cache, "TERM": "xterm"}
     before = os.times()
     began = time.perf_counter()
     with subprocess.Popen(
-        [sys.executable, "-c", MAIN, *words],
-        stdout=theirs,
-        stderr=theirs,
+        [sys.executable, "-c", PROGRAM, *arguments],
+        stdout=command_terminal,
+        stderr=command_terminal,
         env=environment,
     ) as process:
-        os.close(theirs)
-        first_s = _drained(ours, began)
+        os.close(command_terminal)
+        first_s = _time_of_first_text(own_terminal, began)
         process.wait()
     after = os.times()
-    os.close(ours)
+    os.close(own_terminal)
     if process.returncode not in (0, 1):
-        raise SystemExit(f"{' '.join(words)} ended with {process.returncode}")
-    spent = after.children_user + after.children_system
-    spent -= before.children_user + before.children_system
-    return Waited(first_s, time.perf_counter() - began, spent)
+        raise SystemExit(
+            f"{' '.join(arguments)} ended with {process.returncode}"
+        )
+    processor_s = after.children_user + after.children_system
+    processor_s -= before.children_user + before.children_system
+    return WaitingTimes(first_s, time.perf_counter() - began, processor_s)
 
 
-def _drained(terminal: int, began: float) -> float:
-    """Read all that is written; when the first visible text came."""
+def _time_of_first_text(terminal: int, began: float) -> float:
+    """Read the output to its end, and return the time of the first letter since `began` [s]; NaN if none."""
     first_s = float("nan")
     while select.select([terminal], [], [], 600.0)[0]:
         try:

@@ -39,13 +39,13 @@ ROUND_OFF_M = 1e-6
 BALL_RADIUS_M = 0.0032
 POKED_DEPTHS_M = 4e-4 * np.arange(6)
 POKED_NOISE_N = 2.5e-4
-# Prior of the place of the surface [m].
+# Standard deviation of the prior of the position of the surface [m].
 ONSET_M = 1e-4
-# The dragged block, its gap above the plate, and the way of the gripper down and along.
+# The dragged block, its gap above the plate, and the shifts (T, 3) of the gripper: down, then along x.
 BLOCK_M = (0.04, 0.04, 0.02)
 BLOCK_DIVISIONS = (2, 2, 1)
 GAP_M = 5e-4
-WAY_M = np.array(
+GRIPPER_SHIFTS_M = np.array(
     [[0.0, 0.0, -4e-4 * k] for k in range(6)]
     + [[5e-4 * k, 0.0, -2e-3] for k in range(1, 6)]
 )
@@ -55,11 +55,11 @@ SLIP_M = 1e-4
 DRAGGED_NOISE_N = 5e-3
 
 
-def translation(ways_m: Array) -> PoseSequence:
+def translation(shifts_m: Array) -> PoseSequence:
     """Return poses without rotation at one sample each second, from shifts (T, 3) [m]."""
-    upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(ways_m), 1))
-    times_s = np.arange(len(ways_m), dtype=float)
-    return PoseSequence(times_s, ways_m, upright, "linear")
+    upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1))
+    times_s = np.arange(len(shifts_m), dtype=float)
+    return PoseSequence(times_s, shifts_m, upright, "linear")
 
 
 def poked_twin(seed: int) -> Problem:
@@ -108,28 +108,32 @@ def _poked() -> Experiment:
     """Return the indentation with its exact forces; cached."""
     body = Body(quarter(), density_kg_m3=DENSITY_KG_M3, element="tet10")
     x, y, z = body.nodes_m.T
-    glued = np.flatnonzero(z < z.min() + ROUND_OFF_M)
-    left = np.flatnonzero((x < ROUND_OFF_M) & (z > z.min() + ROUND_OFF_M))
-    front = np.flatnonzero((y < ROUND_OFF_M) & (z > z.min() + ROUND_OFF_M))
+    glued_nodes = np.flatnonzero(z < z.min() + ROUND_OFF_M)
+    side_nodes = np.flatnonzero((x < ROUND_OFF_M) & (z > z.min() + ROUND_OFF_M))
+    front_nodes = np.flatnonzero(
+        (y < ROUND_OFF_M) & (z > z.min() + ROUND_OFF_M)
+    )
     fixed = PoseSequence.fixed()
-    reach_m = 0.0035
+    contact_edge_m = 0.0035
     tip = Obstacle(
         poses=translation(np.outer(POKED_DEPTHS_M, [0.0, 0.0, -1.0])),
         shape=Sphere(BALL_RADIUS_M, (0.0, 0.0, BALL_RADIUS_M)),
         name="tip",
-        faces=Box((-1.0, -1.0, -1e-4), (reach_m, reach_m, 1e-4)),
+        faces=Box((-1.0, -1.0, -1e-4), (contact_edge_m, contact_edge_m, 1e-4)),
     )
     grasps = [
-        Grasp(glued, fixed),
-        Grasp(left, fixed, axes="x"),
-        Grasp(front, fixed, axes="y"),
+        Grasp(glued_nodes, fixed),
+        Grasp(side_nodes, fixed, axes="x"),
+        Grasp(front_nodes, fixed, axes="y"),
     ]
     experiment = _simulated(body, grasps, tip, sigma_n=POKED_NOISE_N)
     (tip,) = experiment.obstacles
     assert tip.wrench is not None
-    along_z = np.where(np.arange(3) == 2, tip.wrench.values[:, :3], np.nan)
+    axial_forces_n = np.where(
+        np.arange(3) == 2, tip.wrench.values[:, :3], np.nan
+    )
     return experiment.with_obstacles(
-        [_with_force(tip, along_z, sigma_n=POKED_NOISE_N)]
+        [_with_force(tip, axial_forces_n, sigma_n=POKED_NOISE_N)]
     )
 
 
@@ -148,7 +152,7 @@ def _sheared() -> Experiment:
         friction=FRICTION,
         slip=SLIP_M,
     )
-    gripper = Grasp(top, translation(WAY_M))
+    gripper = Grasp(top, translation(GRIPPER_SHIFTS_M))
     return _simulated(body, [gripper], plate, sigma_n=DRAGGED_NOISE_N)
 
 

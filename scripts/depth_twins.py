@@ -40,7 +40,7 @@ TRUTH = {
     "gamma_m_1_s": 0.1,
 }
 UNKNOWN = {**TRUTH, "young_pa": Unknown(2e5)}
-# The principal point is beside the middle of the image, as in a cropped one.
+# Camera matrix [px]; the principal point is not at the centre, as in a cropped image.
 MATRIX = [[260.0, 0.0, 66.0], [0.0, 260.0, 70.0], [0.0, 0.0, 1.0]]
 SHAPE_PX = (120, 160)
 # Noise of the depth of each pixel [m].
@@ -72,11 +72,13 @@ def bar() -> Body:
 
 def camera_pose() -> Array:
     """Return the pose (4, 4) of a camera that looks at the bar from the side and from above."""
-    ahead = (TARGET_M - EYE_M) / np.linalg.norm(TARGET_M - EYE_M)
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    optical_axis = (TARGET_M - EYE_M) / np.linalg.norm(TARGET_M - EYE_M)
+    right = np.cross(optical_axis, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     pose = np.eye(4)
-    pose[:3] = np.column_stack([right, np.cross(ahead, right), ahead, EYE_M])
+    pose[:3] = np.column_stack(
+        [right, np.cross(optical_axis, right), optical_axis, EYE_M]
+    )
     return pose
 
 
@@ -100,9 +102,13 @@ def _motion(times_s: Array) -> PoseSequence:
     rise = times_s**2 / (times_s**2 + 0.08**2)
     waves = np.sin(2 * np.pi * np.outer(times_s, [2.0, 2.7, 3.3]))
     positions_m = rise[:, None] * waves * np.array([0.01, 0.015, 0.03])
-    turns_rad = rise[:, None] * waves[:, ::-1] * np.array([0.05, 0.2, 0.15])
+    rotation_vectors_rad = (
+        rise[:, None] * waves[:, ::-1] * np.array([0.05, 0.2, 0.15])
+    )
     return PoseSequence(
-        times_s, positions_m, Rotation.from_rotvec(turns_rad).as_quat()
+        times_s,
+        positions_m,
+        Rotation.from_rotvec(rotation_vectors_rad).as_quat(),
     )
 
 
@@ -110,11 +116,11 @@ def _experiment(
     times_s: Array, clamp: PoseSequence, depth: Depth
 ) -> Experiment:
     """Return the experiment of the bar in a clamp that a camera observes."""
-    held = Grasp(np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), clamp)
+    clamp_grasp = Grasp(np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), clamp)
     return Experiment(
         bar(),
         times_s,
-        [held],
+        [clamp_grasp],
         name="bar",
         kind="static" if len(times_s) == 1 else "dynamic",
         depths=[depth],
@@ -142,7 +148,7 @@ def _problem(
     images_m = np.array(
         _images_m(tuple(times_s), tuple(image_samples))
     ) + NOISE_M * rng.normal(size=(len(image_samples), *SHAPE_PX))
-    camera = DepthCamera(MATRIX, pose=_stated_pose(rng))
+    camera = DepthCamera(MATRIX, pose=_pose_with_error(rng))
     depth = Depth.of_images(
         "front",
         images_m,
@@ -162,7 +168,7 @@ def _problem(
 def _images_m(
     times_s: tuple[float, ...], image_samples: tuple[int, ...]
 ) -> Array:
-    """Return the images (S, rows, columns) without noise, NaN beside the bar; cached."""
+    """Return the images (S, rows, columns) without noise, NaN where the bar is not visible; cached."""
     times = np.array(times_s)
     image_times_s = times[list(image_samples)]
     blank = Depth(
@@ -184,15 +190,15 @@ def _images_m(
     return np.array(images_m)
 
 
-def _stated_pose(rng: np.random.Generator) -> Array:
+def _pose_with_error(rng: np.random.Generator) -> Array:
     """Return the camera pose (4, 4) with a random error of one standard deviation or less."""
     pose = camera_pose()
     turn = Rotation.from_rotvec(TURN_RAD * rng.uniform(-1, 1, 3)).as_matrix()
     shift_m = SHIFT_M * rng.uniform(-1, 1, 3)
-    stated = pose.copy()
-    stated[:3, :3] = turn @ pose[:3, :3]
-    stated[:3, 3] = turn @ (pose[:3, 3] - TARGET_M) + TARGET_M + shift_m
-    return stated
+    described_pose = pose.copy()
+    described_pose[:3, :3] = turn @ pose[:3, :3]
+    described_pose[:3, 3] = turn @ (pose[:3, 3] - TARGET_M) + TARGET_M + shift_m
+    return described_pose
 
 
 def with_depth(experiment: Experiment, depth: Depth) -> Experiment:

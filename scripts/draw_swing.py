@@ -1,4 +1,4 @@
-"""Draw the README's picture: the foam cylinder's shapes over time, with measured markers."""
+"""Draw the picture of the README: shapes of the foam cylinder over time, with measured markers."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def main() -> None:
     problem = Problem.read(ROOT / "problems" / "foam_cylinder" / "problem.toml")
     experiment = problem.experiments[0]
     trajectory = simulate(experiment, TRUTH)
-    seen = MotionRecord.from_experiment(
+    motion = MotionRecord.from_experiment(
         experiment, (trajectory.positions_m, trajectory.markers_m)
     )
-    save_pictures(ROOT / "docs", {"swing": shapes_picture(seen)})
+    save_pictures(ROOT / "docs", {"swing": shapes_picture(motion)})
 
 
 if __name__ == "__main__":

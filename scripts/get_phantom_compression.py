@@ -26,7 +26,10 @@ RUNS = tuple(f"A{k}" for k in range(1, 6))
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--from", dest="source", type=Path, help="a folder that has the files"
+        "--from",
+        dest="source",
+        type=Path,
+        help="folder that has the files; without it, they are downloaded",
     )
     source = parser.parse_args().source
     for material in MATERIALS:

@@ -176,20 +176,18 @@ def rigid_transform(
     from_m: NDArray[np.float64], to_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotation (3, 3) and shift (3,) that map points (n, 3) to others with least squares."""
-    from_middle_m = from_m.mean(axis=0)
-    to_middle_m = to_m.mean(axis=0)
-    left, _, right = np.linalg.svd(
-        (to_m - to_middle_m).T @ (from_m - from_middle_m)
-    )
-    handedness = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = left @ handedness @ right
-    return rotation, to_middle_m - rotation @ from_middle_m
+    from_centre_m = from_m.mean(axis=0)
+    to_centre_m = to_m.mean(axis=0)
+    u, _, vt = np.linalg.svd((to_m - to_centre_m).T @ (from_m - from_centre_m))
+    handedness = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ handedness @ vt
+    return rotation, to_centre_m - rotation @ from_centre_m
 
 
 def onset(tip_m: NDArray[np.float64]) -> int:
     """Return the index of the first sample at which the middle of the tip has moved."""
-    middle_m = tip_m.mean(axis=1)
-    distance_m = np.linalg.norm(middle_m - middle_m[REST].mean(axis=0), axis=1)
+    centre_m = tip_m.mean(axis=1)
+    distance_m = np.linalg.norm(centre_m - centre_m[REST].mean(axis=0), axis=1)
     return int(np.flatnonzero(distance_m > ONSET_M)[0])
 
 
@@ -201,7 +199,7 @@ def arm_mesh(shape: ArmShape) -> TetMesh:
 
     The point array `chamber` is 1 on the wall of the chamber at x > 0 and on its end at the tip.
     The cell arrays `ring_1` to `ring_7` are 1 in sectors of the outer wall between `ring_angles`,
-    without the end. The chambers are open at the base, where the nodes are held.
+    without the end. The chambers are open at the base, where the nodes are clamped.
     """
     section_m, wall_triangles, chamber_triangles, chamber_corners = (
         cross_section(shape)
@@ -276,20 +274,22 @@ def cross_section(
     points_m = np.vstack(
         [core_m, inner_m * directions, shape.radius_m * directions]
     )
-    wall = list(range(3, 11))
-    outer = list(range(11, 19))
-    quads = [(0, wall[2], wall[3], 1), (1, wall[5], wall[6], 2)]
-    quads += [(wall[k], outer[k], outer[k + 1], wall[k + 1]) for k in range(7)]
+    inside = list(range(3, 11))
+    outside = list(range(11, 19))
+    quads = [(0, inside[2], inside[3], 1), (1, inside[5], inside[6], 2)]
+    quads += [
+        (inside[k], outside[k], outside[k + 1], inside[k + 1]) for k in range(7)
+    ]
     walls = [[0, 1, 2]]
     for a, b, c, d in quads:
         walls += [[a, b, c], [a, c, d]]
-    chambers = [[wall[0], wall[1], 0], [wall[1], wall[2], 0]]
+    chambers = [[inside[0], inside[1], 0], [inside[1], inside[2], 0]]
     chambers += [
-        [wall[3], wall[4], 1],
-        [wall[4], wall[5], 1],
-        [wall[6], wall[7], 2],
+        [inside[3], inside[4], 1],
+        [inside[4], inside[5], 1],
+        [inside[6], inside[7], 2],
     ]
-    return points_m, walls, chambers, [0, *wall[:3]]
+    return points_m, walls, chambers, [0, *inside[:3]]
 
 
 def ring_angles(shape: ArmShape) -> NDArray[np.float64]:

@@ -25,16 +25,17 @@ from collocation_sysid.fem.meshes.structured import box_mesh
 
 FOLDER = Path(__file__).parents[1] / "problems" / "silicone_depth"
 IMAGES = ("h_e_c", "h_m_c", "h_em_c", "t_em_c")
-# Where the clamp begins on the bar.
+# Edge of the clamp on the bar [m].
 CLAMP_M = np.array([0.07, 0.0, 0.0])
-# Planes are fitted to so many pixels either way, every few of them; they are those of one face
-# where depth differs by less and leaves less beside the plane.
-HALF = 6
-EVERY = 2
-DEEP_M = 0.02
-ROUGH_M = 0.002
-# Normals count that are within these angles [degrees] of an axis, in turn.
-WITHIN = (15, 12, 10, 8, 6, 5, 4, 3, 3, 3, 3, 3)
+# Planes are fitted to squares of 2 · 6 + 1 pixels, at every second pixel. A square is on one face if
+# its depths differ by less than the first length, and its points are closer to the plane than the
+# second one (root mean square).
+HALF_WIDTH_PX = 6
+STEP_PX = 2
+FACE_DEPTH_RANGE_M = 0.02
+FACE_ROUGHNESS_M = 0.002
+# Largest angles of a normal from an axis in successive iterations [degrees].
+ANGLE_LIMITS_DEG = (15, 12, 10, 8, 6, 5, 4, 3, 3, 3, 3, 3)
 
 
 def main() -> None:
@@ -48,26 +49,30 @@ def main() -> None:
     ]
     if missing:
         sys.exit(f"{source} has no {missing[0]}.json")
-    told = {
+    descriptions = {
         name: json.loads((source / f"{name}.json").read_text())
         for name in IMAGES
     }
-    to_world = np.array(told[IMAGES[0]]["mesh_to_object"])
-    for name, said in told.items():
-        stated = np.array(said["object_to_camera"]) @ np.array(
-            said["mesh_to_object"]
+    to_world = np.array(descriptions[IMAGES[0]]["mesh_to_object"])
+    for name, description in descriptions.items():
+        stated_pose = np.array(description["object_to_camera"]) @ np.array(
+            description["mesh_to_object"]
         )
-        seen = np.load(source / f"{name}.npz")
-        matrix = np.array(said["camera_matrix"])
+        image_data = np.load(source / f"{name}.npz")
+        matrix = np.array(description["camera_matrix"])
         to_camera = np.eye(4)
-        depth_m = seen["depth_counts"] * float(seen["count_m"])
-        turned = upright(face_normals(depth_m, matrix), stated[:3, :3])
-        to_camera[:3, :3] = turned
-        to_camera[:3, 3] = (stated[:3, :3] - turned) @ CLAMP_M + stated[:3, 3]
+        depth_m = image_data["depth_counts"] * float(image_data["count_m"])
+        rotation = aligned_rotation(
+            face_normals(depth_m, matrix), stated_pose[:3, :3]
+        )
+        to_camera[:3, :3] = rotation
+        to_camera[:3, 3] = (
+            stated_pose[:3, :3] - rotation
+        ) @ CLAMP_M + stated_pose[:3, 3]
         np.savez_compressed(
             FOLDER / f"{name}.npz",
-            depth_counts=seen["depth_counts"],
-            count_m=seen["count_m"],
+            depth_counts=image_data["depth_counts"],
+            count_m=image_data["count_m"],
             camera_matrix=matrix,
             camera_pose=to_world @ np.linalg.inv(to_camera),
         )
@@ -77,74 +82,93 @@ def main() -> None:
 
 
 def face_normals(depth_m: Array, matrix: Array) -> Array:
-    """Normals (P, 3) of the flat faces in an image, in the camera's frame, of either sign."""
+    """Return the normals (P, 3) of flat faces in an image, in the frame of the camera, of either sign."""
     v, u = np.indices(depth_m.shape)
     rays = np.linalg.solve(
         matrix, np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
     ).T
     points = rays.reshape(*depth_m.shape, 3) * depth_m[..., None]
-    size = 2 * HALF + 1
-    near, far = (
+    size = 2 * HALF_WIDTH_PX + 1
+    smallest_depth, largest_depth = (
         each(depth_m, size) for each in (minimum_filter, maximum_filter)
     )
-    inside = np.zeros(depth_m.shape, dtype=bool)
-    inside[HALF:-HALF:EVERY, HALF:-HALF:EVERY] = True
-    here = np.nonzero(inside & (near > 0) & (far - near < DEEP_M))
-    mean = [uniform_filter(points[..., i], size)[here] for i in range(3)]
-    spread = [
+    is_tested = np.zeros(depth_m.shape, dtype=bool)
+    is_tested[
+        HALF_WIDTH_PX:-HALF_WIDTH_PX:STEP_PX,
+        HALF_WIDTH_PX:-HALF_WIDTH_PX:STEP_PX,
+    ] = True
+    fitted_pixels = np.nonzero(
+        is_tested
+        & (smallest_depth > 0)
+        & (largest_depth - smallest_depth < FACE_DEPTH_RANGE_M)
+    )
+    mean = [
+        uniform_filter(points[..., i], size)[fitted_pixels] for i in range(3)
+    ]
+    covariance = [
         [
-            uniform_filter(points[..., i] * points[..., j], size)[here]
+            uniform_filter(points[..., i] * points[..., j], size)[fitted_pixels]
             - mean[i] * mean[j]
             for j in range(3)
         ]
         for i in range(3)
     ]
-    values, vectors = np.linalg.eigh(np.moveaxis(np.array(spread), 2, 0))
-    return vectors[np.sqrt(np.maximum(values[:, 0], 0)) < ROUGH_M, :, 0]
+    values, vectors = np.linalg.eigh(np.moveaxis(np.array(covariance), 2, 0))
+    return vectors[
+        np.sqrt(np.maximum(values[:, 0], 0)) < FACE_ROUGHNESS_M, :, 0
+    ]
 
 
-def upright(normals: Array, rotation: Array) -> Array:
-    """The rotation near one given whose axes most faces are across."""
-    for degrees in WITHIN:
+def aligned_rotation(normals: Array, rotation: Array) -> Array:
+    """Return the rotation (3, 3), close to a given one, whose axes are parallel to most face normals."""
+    for degrees in ANGLE_LIMITS_DEG:
         cosines = normals @ rotation
         nearest = np.abs(cosines).argmax(axis=1)
-        along = np.take_along_axis(cosines, nearest[:, None], axis=1)
-        near = np.abs(along[:, 0]) > np.cos(np.radians(degrees))
+        cosine = np.take_along_axis(cosines, nearest[:, None], axis=1)
+        is_aligned = np.abs(cosine[:, 0]) > np.cos(np.radians(degrees))
         columns = []
         for axis in range(3):
-            own = near & (nearest == axis)
-            mean = (normals * np.sign(along))[own].sum(axis=0)
-            columns.append(mean / np.sqrt(max(own.sum(), 1)))
-        left, _, right = np.linalg.svd(np.column_stack(columns))
-        rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+            is_of_axis = is_aligned & (nearest == axis)
+            mean = (normals * np.sign(cosine))[is_of_axis].sum(axis=0)
+            columns.append(mean / np.sqrt(max(is_of_axis.sum(), 1)))
+        u, _, vt = np.linalg.svd(np.column_stack(columns))
+        rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
     return rotation
 
 
-def bar(motion: np.ndarray, fine: int = 2) -> TetMesh:
-    """The bar in the frame of the object: 30 mm square between heads of 60 mm, one in the clamp."""
-    bricks = 6 * fine, 4, fine
+def bar(motion: np.ndarray, refinement: int = 2) -> TetMesh:
+    """Return the mesh of the bar: 30 mm square between heads of 60 mm, of which one is in the clamp.
+
+    Parameters
+    ----------
+    motion : (4, 4) array
+        Pose of the object.
+    refinement : int
+        Number of bricks along 30 mm.
+    """
+    bricks = 6 * refinement, 4, refinement
     grid = box_mesh((6.0, 2.0, 1.0), bricks)
-    along, up, across = grid.points_m.T
-    own = np.column_stack(
+    axial, up, across = grid.points_m.T
+    points_m = np.column_stack(
         [
-            np.interp(along, [0, 1, 6], [-0.1, -0.07, 0.07]),
+            np.interp(axial, [0, 1, 6], [-0.1, -0.07, 0.07]),
             0.03 * up - 0.03,
             0.03 * across - 0.015,
         ]
     )
-    middles = own[grid.tetrahedra].mean(axis=1)
+    centres_m = points_m[grid.tetrahedra].mean(axis=1)
     cells = grid.tetrahedra[
-        (middles[:, 0] < -0.07) | (np.abs(middles[:, 1]) < 0.015)
+        (centres_m[:, 0] < -0.07) | (np.abs(centres_m[:, 1]) < 0.015)
     ]
     masks = {
-        "clamped": own[:, 0] >= 0.07 - 1e-9,
-        "turned": own[:, 0] <= -0.07 + 1e-9,
-        "free": own[:, 0] >= -0.07 - 1e-9,
+        "clamped": points_m[:, 0] >= 0.07 - 1e-9,
+        "turned": points_m[:, 0] <= -0.07 + 1e-9,
+        "free": points_m[:, 0] >= -0.07 - 1e-9,
     }
-    near = (own[cells].mean(axis=1)[:, 0] > 0).astype(np.int8)
-    placed = own @ motion[:3, :3].T + motion[:3, 3]
-    named = {name: mask.astype(np.int8) for name, mask in masks.items()}
-    return TetMesh(placed, cells, named, {"near": near})
+    is_near_half = (points_m[cells].mean(axis=1)[:, 0] > 0).astype(np.int8)
+    world_points_m = points_m @ motion[:3, :3].T + motion[:3, 3]
+    point_arrays = {name: mask.astype(np.int8) for name, mask in masks.items()}
+    return TetMesh(world_points_m, cells, point_arrays, {"near": is_near_half})
 
 
 if __name__ == "__main__":

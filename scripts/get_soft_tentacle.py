@@ -18,7 +18,7 @@ from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import cylinder_mesh
 
 FOLDER = Path(__file__).parents[1] / "problems" / "soft_tentacle"
-# The group of columns in each file that is the base marker, then M1 to M4.
+# Indices of the groups of columns in each file: of the base marker, then of M1 to M4.
 GROUPS = {
     "m1_u01": (4, 0, 3, 1, 2),
     "m1_u015": (3, 2, 4, 1, 0),
@@ -32,11 +32,12 @@ GROUPS = {
 BASE_TO_CENTRE_M = np.array([-0.030, -0.013, 0.0])
 LENGTH_M = 0.360
 LAYERS = 14
-# Places along the axis, and radii there.
+# Positions along the axis and radii there [m].
 PLACES_M = (0.0, 0.305, 0.360)
 RADII_M = (0.01541, 0.00642, 0.00480)
-# A hexagon through the circle has 31 % less bending stiffness: the same second moment of area.
-HEXAGON = (np.pi / 4 / (5 * np.sqrt(3) / 16)) ** 0.25
+# Factor on the radius of the hexagon for the second moment of area of the circle; a hexagon with its
+# corners on the circle has 31 % less bending stiffness.
+HEXAGON_FACTOR = (np.pi / 4 / (5 * np.sqrt(3) / 16)) ** 0.25
 
 
 def main() -> None:
@@ -70,27 +71,41 @@ def main() -> None:
 
 
 def markers_m(file: Path, groups: tuple[int, ...]) -> np.ndarray:
-    """(4, 3) mean places of M1 to M4 from the centre of the clamped section."""
-    mean = (
+    """Return the mean positions (4, 3) of M1 to M4 from the centre of the clamped section [m].
+
+    `groups` are the indices of the column groups of the base marker and of M1 to M4.
+    """
+    means_m = (
         np.loadtxt(file, delimiter=",")[:, 2:]
         .mean(axis=0)
         .reshape(5, 3)[list(groups)]
     )
-    x, y, z = (mean[1:] - mean[0] - BASE_TO_CENTRE_M).T
+    x, y, z = (means_m[1:] - means_m[0] - BASE_TO_CENTRE_M).T
     return np.column_stack([x, z, -y])
 
 
 def tentacle() -> TetMesh:
-    """A hexagonal tentacle that hangs from z = 0, with layers as long as it is thick there."""
+    """Return a hexagonal tentacle that hangs from z = 0, with layers as long as their diameter there."""
     mesh = cylinder_mesh(1.0, float(LAYERS), 1, LAYERS)
-    s = np.linspace(0, LENGTH_M, 2001)
-    thickness = np.interp(s, PLACES_M, RADII_M)
-    layer = np.concatenate(
-        [[0], np.cumsum(np.diff(s) / (thickness[1:] + thickness[:-1]))]
+    axial_grid_m = np.linspace(0, LENGTH_M, 2001)
+    radius_grid_m = np.interp(axial_grid_m, PLACES_M, RADII_M)
+    layer_number = np.concatenate(
+        [
+            [0],
+            np.cumsum(
+                np.diff(axial_grid_m) / (radius_grid_m[1:] + radius_grid_m[:-1])
+            ),
+        ]
     )
-    along = np.interp(mesh.points_m[:, 2] / LAYERS, layer / layer[-1], s)
-    radius = HEXAGON * np.interp(along, PLACES_M, RADII_M)
-    points = np.column_stack([mesh.points_m[:, :2] * radius[:, None], -along])
+    axial_m = np.interp(
+        mesh.points_m[:, 2] / LAYERS,
+        layer_number / layer_number[-1],
+        axial_grid_m,
+    )
+    radii_m = HEXAGON_FACTOR * np.interp(axial_m, PLACES_M, RADII_M)
+    points = np.column_stack(
+        [mesh.points_m[:, :2] * radii_m[:, None], -axial_m]
+    )
     return TetMesh(points, mesh.tetrahedra)
 
 

@@ -65,11 +65,11 @@ from collocation_sysid.runs import check  # noqa: F401
 
 Rng = np.random.Generator
 OUTCOMES = ("refused", "accepted", "traceback", "unclear", "hang", "crash")
-# Address space of a case [bytes]: a reader that asks for more has found a forged size.
-MOST_MEMORY = 8 << 30
-# How much longer than its limit a case may take on a machine that does other work.
-WAITING = 10
-# An ordinary user, where the script is started by root.
+# Largest address space of a case [bytes]; a reader that needs more trusts a forged size.
+MEMORY_LIMIT_BYTES = 8 << 30
+# Wall time over the limit of processor time after which a case is stopped: the machine does other work.
+WAITING_FACTOR = 10
+# User id for cases without privileges, if the script is started by root.
 NOBODY = 65534
 PROGRAM = "from collocation_sysid.cli import main; main()"
 MARKERS = "swing_markers.csv"
@@ -79,25 +79,25 @@ COUNTS = (b"-1", b"0", b"4294967295", b"1e308", b"nan", b"99999999999999999999")
 
 
 @dataclass(frozen=True)
-class Ended:
-    """End of a process: exit code, negative signal number, or None after the time limit; its output."""
+class CommandEnd:
+    """End of a process: exit code, negative signal number or None after the time limit, and its output."""
 
     code: int | None
     out: str
     err: str
 
     def outcome(self, is_clean: bool = True) -> str:
-        """One of `OUTCOMES`; `is_clean` tells whether a refusal left the folder as it was."""
+        """Return one of `OUTCOMES`; `is_clean` states whether the command left the folder unchanged."""
         if self.code is None or -self.code == signal.SIGXCPU:
             return "hang"
         if self.code < 0:
             return "crash"
         if "Traceback (most recent call last)" in self.err:
             return "traceback"
-        said = self.err.strip().splitlines()
+        output_text = self.err.strip().splitlines()
         if (
             self.code == 2
-            and len(said) == 1
+            and len(output_text) == 1
             and is_clean
             and _is_printable(self.err)
         ):
@@ -118,19 +118,21 @@ def _is_printable(text: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Running:
-    """The command line in a fork of this process, and the files that it writes its texts to."""
+class RunningCommand:
+    """Command line in a fork of this process: its process id, and the files of its output."""
 
     process: int
     out: Any
     err: Any
 
-    def finish(self, limit_s: float) -> Ended:
-        """Wait until it ends, or end it long after the limit."""
+    def finish(self, limit_s: float) -> CommandEnd:
+        """Wait until the command ends; kill it at `WAITING_FACTOR` times the limit [s]."""
         code = _wait(self.process, limit_s)
-        return Ended(code, self.said(self.out), self.said(self.err))
+        return CommandEnd(
+            code, self.output_text(self.out), self.output_text(self.err)
+        )
 
-    def said(self, stream: Any) -> str:
+    def output_text(self, stream: Any) -> str:
         """Return all text written to a stream so far, without moving the position that forks share."""
         size = os.fstat(stream.fileno()).st_size
         return os.pread(stream.fileno(), size, 0).decode("utf-8", "replace")
@@ -141,29 +143,32 @@ def start(
     folder: Path,
     limit_s: float,
     before: Callable[[], object] | None = None,
-) -> Running:
-    """Start the command line in a fork of this process, whose modules are there already.
+) -> RunningCommand:
+    """Start the command line in a fork of this process, whose modules are imported already.
 
     Parameters
     ----------
     words : sequence
-        Of the command line, without the program.
+        Arguments of the command line, without the program.
     folder : Path
-        Where it is started.
+        Working directory.
     limit_s : float
-        Of the time of the processor.
+        Limit of processor time [s].
     before : callable, optional
         Called in the fork, before the command.
     """
-    running = Running(0, *(tempfile.TemporaryFile() for _ in range(2)))  # noqa: SIM115
+    running = RunningCommand(0, *(tempfile.TemporaryFile() for _ in range(2)))  # noqa: SIM115
     sys.stdout.flush()
     if child := os.fork():
         return replace(running, process=child)
     files = running.out.fileno(), running.err.fileno()
     seconds = int(np.ceil(limit_s))
-    resource_limits = {resource.RLIMIT_AS: MOST_MEMORY, resource.RLIMIT_CORE: 0}
+    resource_limits = {
+        resource.RLIMIT_AS: MEMORY_LIMIT_BYTES,
+        resource.RLIMIT_CORE: 0,
+    }
     resource_limits[resource.RLIMIT_CPU] = seconds
-    _be_the_command(
+    _run_command_in_fork(
         [str(word) for word in words], folder, files, resource_limits, before
     )
     raise AssertionError("the fork has ended")
@@ -174,19 +179,19 @@ def run(
     folder: Path,
     limit_s: float,
     before: Callable[[], object] | None = None,
-) -> Ended:
-    """Run the command line as `start` does, to its end or the limit."""
+) -> CommandEnd:
+    """Run the command line to its end or the limit; for the arguments see `start`."""
     return start(words, folder, limit_s, before).finish(limit_s)
 
 
-def _be_the_command(
+def _run_command_in_fork(
     words: list[str],
     folder: Path,
     files: tuple[int, int],
     limits: Mapping[int, int],
     before: Callable[[], object] | None,
 ) -> None:
-    """Become the command; never returns."""
+    """Run the command line in this process, with limits by resource, and exit; never returns."""
     code = 1
     try:
         os.setpgid(0, 0)
@@ -202,8 +207,8 @@ def _be_the_command(
             "backslashreplace",
             line_buffering=True,
         )
-        for kind, most in limits.items():
-            resource.setrlimit(kind, (most, most + 1))
+        for kind, limit in limits.items():
+            resource.setrlimit(kind, (limit, limit + 1))
         if before is not None:
             before()
         sys.argv = ["collocation-sysid", *words]
@@ -227,8 +232,8 @@ def _be_the_command(
 
 
 def _wait(child: int, limit_s: float) -> int | None:
-    """Return the code of a process of ours, None after ending it at the limit."""
-    until = time.monotonic() + WAITING * limit_s
+    """Return the exit code of a child process; None if it was killed at the limit [s]."""
+    until = time.monotonic() + WAITING_FACTOR * limit_s
     while time.monotonic() < until:
         ended, status = os.waitpid(child, os.WNOHANG)
         if ended:
@@ -240,12 +245,12 @@ def _wait(child: int, limit_s: float) -> int | None:
 
 
 def in_fork(work: Callable[[], object]) -> None:
-    """Do work whose threads this process must not have when it forks.
+    """Call a function in a fork, so that its threads do not exist in this process.
 
     Raises
     ------
     RuntimeError
-        If it fails.
+        If the function fails.
     """
     child = os.fork()
     if child == 0:
@@ -263,30 +268,30 @@ def in_fork(work: Callable[[], object]) -> None:
 
 
 def damaged(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
-    """Return a content with one to four damages; `words` are what the format gives a meaning."""
+    """Return a content with one to four damages; `words` have a special meaning in its format."""
     for _ in range(rng.integers(1, 5)):
         content = DAMAGES[rng.integers(len(DAMAGES))](rng, content, words)
     return content
 
 
 def _place(rng: Rng, content: bytes) -> int:
-    """A place; every other one near the beginning, where headers are."""
+    """Return a random position; half of them are in the first 256 bytes, where headers are."""
     end = len(content) if rng.random() < 0.5 else min(len(content), 256)
     return int(rng.integers(end + 1))
 
 
-def _cut(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
+def _truncated(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
     return content[: int(rng.integers(len(content) + 1))]
 
 
 def _replaced(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
-    found = bytearray(content)
-    for _ in range(rng.integers(1, 9) if found else 0):
-        found[min(_place(rng, content), len(found) - 1)] = rng.integers(256)
-    return bytes(found)
+    mutated = bytearray(content)
+    for _ in range(rng.integers(1, 9) if mutated else 0):
+        mutated[min(_place(rng, content), len(mutated) - 1)] = rng.integers(256)
+    return bytes(mutated)
 
 
-def _left_out(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
+def _with_gap(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
     at = _place(rng, content)
     return content[:at] + content[at + int(rng.integers(1, 200)) :]
 
@@ -314,8 +319,8 @@ def _largest(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
     )
 
 
-def _put_in(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
-    """Put a word in, at a place or instead of another one."""
+def _with_word(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
+    """Insert a word at a position, or replace another word by it."""
     if not words:
         return _replaced(rng, content, words)
     word = words[int(rng.integers(len(words)))]
@@ -332,14 +337,14 @@ def _put_in(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
 
 
 DAMAGES = (
-    _cut,
+    _truncated,
     _replaced,
-    _left_out,
+    _with_gap,
     _repeated,
     _zeros,
     _largest,
-    _put_in,
-    _put_in,
+    _with_word,
+    _with_word,
 )
 
 
@@ -348,21 +353,22 @@ DAMAGES = (
 
 @dataclass(frozen=True)
 class FileKind:
-    """Files of one kind, and what reads them.
+    """Files of one kind, and the commands that read them.
 
     Attributes
     ----------
     name : str
-        Of the kind, in the table.
+        Name of the kind in the table.
     make : callable
-        Adds the files to a problem's folder.
+        Function that adds the files to the folder of a problem.
     file : str
-        A pattern of those that are damaged.
-    commands : tuple of command lines, one is drawn
+        Pattern of the file that is damaged.
+    commands : tuple of command lines
+        One of them is drawn for each case.
     words : tuple of bytes
-        What has a meaning in the format.
+        Words with a special meaning in the format.
     whole : tuple of bytes
-        Contents that are put in the place of the file now and then.
+        Contents that replace the complete file in 20 % of the cases.
     """
 
     name: str
@@ -370,10 +376,16 @@ class FileKind:
     file: str
     commands: tuple[tuple[str, ...], ...] = (("check", "problem.toml"),)
     words: tuple[bytes, ...] = ()
-    whole: tuple[bytes, ...] = ()
+    replacements: tuple[bytes, ...] = ()
 
-    def run(self, cases: Cases) -> Counter[str]:
-        """Count the outcomes; none where the package that reads the format is missing."""
+    def run(self, cases: CaseSettings) -> Counter[str]:
+        """Run all cases and count the outcomes; no case if the package that reads the format is missing.
+
+        Raises
+        ------
+        RuntimeError
+            If a command refuses the undamaged file.
+        """
         base = cases.folder / f"base_{self.name.replace(' ', '_')}"
         counts = Counter[str]()
         shutil.copytree(cases.problem, base)
@@ -389,19 +401,21 @@ class FileKind:
                     f"{self.name} is refused before it is damaged: {ended.err}"
                 )
         (file,) = base.glob(self.file)
-        whole = file.read_bytes()
+        replacements = file.read_bytes()
         for number in range(cases.count):
             rng = cases.rng(self.name, number)
             folder = cases.folder / "case"
             shutil.copytree(base, folder)
-            as_a_whole = self.whole and rng.random() < 0.2
+            is_replaced = self.replacements and rng.random() < 0.2
             content = (
-                self.whole[rng.integers(len(self.whole))]
-                if as_a_whole
+                self.replacements[rng.integers(len(self.replacements))]
+                if is_replaced
                 else None
             )
             target = folder / file.relative_to(base)
-            target.write_bytes(content or damaged(rng, whole, self.words))
+            target.write_bytes(
+                content or damaged(rng, replacements, self.words)
+            )
             before = problem_files.contents(folder)
             words = self.commands[rng.integers(len(self.commands))]
             ended = run(words, folder, cases.limit_s)
@@ -413,7 +427,7 @@ class FileKind:
 
 
 def _with_xdmf(folder: Path) -> None:
-    """State the body's mesh by an XDMF file, whose numbers are in it."""
+    """State the mesh of the body by an XDMF file that contains its numbers."""
     mesh = box_mesh(problem_files.SIZE_M, problem_files.DIVISIONS)
     points = " ".join(map(repr, mesh.points_m.ravel().tolist()))
     cells = " ".join(map(str, mesh.tetrahedra.ravel().tolist()))
@@ -435,7 +449,7 @@ def _state(folder: Path, old: str, new: str) -> None:
 
 
 def _with_bag(kind: str) -> Callable[[Path], object]:
-    """State poses and tracks by topics of a log, called trial with the ending of its kind."""
+    """Return a function that states poses and tracks by topics of a log of a kind (ros1, …)."""
 
     def make(folder: Path) -> None:
         poses = read_poses(folder / POSES)
@@ -453,7 +467,7 @@ def _with_bag(kind: str) -> Callable[[Path], object]:
 
 
 def _with_dataset(folder: Path) -> None:
-    """State the poses by joints of a dataset in Parquet and by a robot's description."""
+    """State the poses by joints of a dataset in Parquet, with the description of the robot."""
     joints = {"turn": 20 * [0.0], "slide": 20 * [0.0]}
     logs.dataset(folder / "robot", joints, episodes=1)
     at_rest = logs.URDF.replace("0 0 0.5", "0 0 0").replace("0.2 0 0", "0 0 0")
@@ -465,7 +479,7 @@ def _with_dataset(folder: Path) -> None:
 def _with_depth(
     file: str, write: Callable[[Path], object]
 ) -> Callable[[Path], object]:
-    """Add a camera that sees a plane: three images or clouds in a folder, or an .npz."""
+    """Return a function that adds a depth camera with images of a plane or clouds, or with an .npz."""
 
     def make(folder: Path) -> None:
         place = folder / file
@@ -521,7 +535,7 @@ def _pcd(file: Path) -> None:
 
 
 def _laughs(root: str, inner: str) -> bytes:
-    """An XML file of 3 kB that expands to 10⁹ words."""
+    """Return an XML file of 3 kB that expands to 10⁹ words."""
     levels = "".join(
         f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">\n'
         if k
@@ -533,20 +547,20 @@ def _laughs(root: str, inner: str) -> bytes:
 
 
 def _outside(root: str, inner: str) -> bytes:
-    """An XML file with an entity of another file."""
+    """Return an XML file with an entity that is another file."""
     entity = '<!DOCTYPE x [<!ENTITY a9 SYSTEM "file:///etc/passwd">]>'
     return f'<?xml version="1.0"?>\n{entity}\n<{root} name="arm">{inner}</{root}>'.encode()
 
 
 _LINK = '<link name="&a9;"/><link name="base"/><link name="tool"/>'
-_JOINED = "".join(
+_CYCLIC_JOINTS = "".join(
     f'<joint name="{n}" type="fixed"><parent link="{a}"/><child link="{b}"/></joint>'
     for n, a, b in (("turn", "base", "tool"), ("slide", "tool", "base"))
 )
 URDFS = (
     _laughs("robot", _LINK),
     _outside("robot", _LINK),
-    f'<robot name="arm"><link name="base"/><link name="tool"/>{_JOINED}</robot>'.encode(),
+    f'<robot name="arm"><link name="base"/><link name="tool"/>{_CYCLIC_JOINTS}</robot>'.encode(),
     b'<robot name="arm">' + b"<link>" * 20_000,
     b'<robot name="arm"/>',
 )
@@ -560,7 +574,7 @@ XDMFS = (
     b'<DataItem Format="HDF" Dimensions="1 4">/etc/passwd:/a</DataItem></Topology></Grid>'
     b"</Domain></Xdmf>",
 )
-# Definitions of messages stand as text in ROS 1 bags, and code is made of them.
+# Definitions of messages are text in ROS 1 bags, from which readers generate code.
 DEFINITIONS = (
     b"float64 a\nfloat64 a\n",
     b"geometry_msgs/PoseStamped again\n",
@@ -628,7 +642,9 @@ FILES = (
     FileKind("tracks, CSV", lambda _: None, MARKERS, words=(*CSV, *COUNTS)),
     FileKind("poses, CSV", lambda _: None, POSES, words=(*CSV, *COUNTS)),
     FileKind("mesh, VTU", lambda _: None, "body.vtu", words=XML),
-    FileKind("mesh, XDMF", _with_xdmf, "body.xdmf", words=XML, whole=XDMFS),
+    FileKind(
+        "mesh, XDMF", _with_xdmf, "body.xdmf", words=XML, replacements=XDMFS
+    ),
     FileKind(
         "bag, ROS 1",
         _with_bag("ros1"),
@@ -670,7 +686,9 @@ FILES = (
         _log_commands("robot"),
         (b"{", b"[", b"null", b'"', b"NaN", b"1e999", b"[" * 5000, *COUNTS),
     ),
-    FileKind("robot, URDF", _with_dataset, "arm.urdf", words=XML, whole=URDFS),
+    FileKind(
+        "robot, URDF", _with_dataset, "arm.urdf", words=XML, replacements=URDFS
+    ),
     FileKind(
         "depth, EXR",
         _with_depth("frames/0.exr", _exr),
@@ -702,20 +720,20 @@ FILES = (
 
 
 @dataclass(frozen=True)
-class Cases:
-    """Settings that all kinds of cases share.
+class CaseSettings:
+    """Settings of all kinds of cases.
 
     Attributes
     ----------
     folder : Path
-        For passing files.
+        Folder for temporary files.
     problem, solved : Path
         Folders of a small problem, and of the same with a run in it.
     count, seed : int
-        How many cases of a kind, and what they are drawn from.
+        Number of cases of a kind, and seed of the random damage.
     limit_s : float
     kept : Path or None
-        Where the input of cases is stored that are neither refused nor accepted.
+        Folder for the input of cases that are neither refused nor accepted.
     """
 
     folder: Path
@@ -724,25 +742,30 @@ class Cases:
     count: int
     seed: int
     limit_s: float
-    kept: Path | None = None
+    failure_folder: Path | None = None
 
     def rng(self, kind: str, number: int) -> Rng:
         """Return the random generator of a case, independent of the other cases that are run."""
         return np.random.default_rng([self.seed, number, *kind.encode()])
 
     def keep(
-        self, kind: str, number: int, folder: Path, outcome: str, ended: Ended
+        self,
+        kind: str,
+        number: int,
+        folder: Path,
+        outcome: str,
+        ended: CommandEnd,
     ) -> None:
-        """Report a case that failed, and store what it read."""
+        """Print a case that is neither refused nor accepted, and store its input and output."""
         if outcome in ("refused", "accepted"):
             return
-        said = (ended.err.strip().splitlines() or ["nothing said"])[-1]
+        output_text = (ended.err.strip().splitlines() or ["no output"])[-1]
         print(
-            f"{kind} {number}: {outcome}, code {ended.code}: {said[:300]}",
+            f"{kind} {number}: {outcome}, code {ended.code}: {output_text[:300]}",
             file=sys.stderr,
         )
-        if self.kept is not None:
-            place = self.kept / f"{kind.replace(' ', '_')}_{number}"
+        if self.failure_folder is not None:
+            place = self.failure_folder / f"{kind.replace(' ', '_')}_{number}"
             shutil.copytree(folder, place, symlinks=True, dirs_exist_ok=True)
             (place / "said.txt").write_text(
                 ended.out + ended.err, encoding="utf-8"
@@ -757,22 +780,22 @@ class OtherKind:
     ----------
     name : str
     case : callable
-        Runs a case in a folder of its own; returns its outcome and how the command ended.
+        Function of a random generator, a folder and a time limit [s]; returns outcome and end.
     share : float
-        Of the number of cases, for what takes long.
+        Share of the number of cases, for slow kinds.
     needs_root : bool
     solved : bool
         Whether the folder has a run.
     """
 
     name: str
-    case: Callable[[Rng, Path, float], tuple[str, Ended]]
+    case: Callable[[Rng, Path, float], tuple[str, CommandEnd]]
     share: float = 1.0
     needs_root: bool = False
     solved: bool = False
 
-    def run(self, cases: Cases) -> Counter[str]:
-        """Count the outcomes; none where root is needed and another user runs this."""
+    def run(self, cases: CaseSettings) -> Counter[str]:
+        """Run all cases and count the outcomes; no case if root is needed and the user is another one."""
         counts = Counter[str]()
         if self.needs_root and os.getuid() != 0:
             return counts
@@ -790,7 +813,7 @@ class OtherKind:
         return counts
 
 
-# Parts of names: of Markdown, HTML, XML, Python, terminals and paths.
+# Parts of names with a meaning in Markdown, HTML, XML, Python, terminals or paths.
 NAMES = (
     "<script>",
     "</script>",
@@ -835,16 +858,18 @@ NAMES += (
 )
 
 
-def _named(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
-    """Write reports and exports of a run whose names could be taken for other things."""
+def _hostile_names(
+    rng: Rng, folder: Path, limit_s: float
+) -> tuple[str, CommandEnd]:
+    """Write reports and exports of a run whose title has special characters of other formats."""
     name = "".join(rng.choice(NAMES, rng.integers(1, 8)))
     problem = folder / "run" / "problem.toml"
     result = folder / "run" / "result.json"
     problem.write_text(
         problem.read_text().replace('"A tiny foam bar"', _quoted(name))
     )
-    told = json.loads(result.read_text())
-    result.write_text(json.dumps({**told, "title": name}))
+    result_data = json.loads(result.read_text())
+    result.write_text(json.dumps({**result_data, "title": name}))
     commands = [
         ("report", "run", "--to", f"out/report{end}")
         for end in (".md", ".html")
@@ -863,7 +888,7 @@ def _named(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
 
 
 def _quoted(text: str) -> str:
-    """Text as a string of TOML."""
+    """Return a text as a string of TOML."""
     return (
         json.dumps(text, ensure_ascii=False)
         .replace("\x7f", "\\u007f")
@@ -872,7 +897,13 @@ def _quoted(text: str) -> str:
 
 
 def _require_well_formed(folder: Path) -> None:
-    """Read what was written as its format is read elsewhere; raise if it is not."""
+    """Read the written files by readers of their formats.
+
+    Raises
+    ------
+    Exception
+        If a file is malformed, or has control characters or a script.
+    """
     for file in folder.rglob("*"):
         if not file.is_file():
             continue
@@ -893,7 +924,7 @@ def _require_well_formed(folder: Path) -> None:
 
 
 def _without_privileges() -> None:
-    """Give up what root may do that others may not; the modules of root stay readable."""
+    """Drop the capabilities of root; files of root stay readable."""
 
     class Header(ctypes.Structure):
         _fields_ = [("version", ctypes.c_uint32), ("process", ctypes.c_int)]
@@ -904,8 +935,8 @@ def _without_privileges() -> None:
         raise OSError("the privileges cannot be given up")
 
 
-def _give(folder: Path) -> None:
-    """Make all in a folder another user's."""
+def _change_owner(folder: Path) -> None:
+    """Make another user the owner of a folder and its contents."""
     for each in (folder, *folder.rglob("*")):
         os.chown(each, NOBODY, NOBODY)
 
@@ -924,43 +955,54 @@ WRITING = (
 )
 
 
-def _read_only(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
-    """Write where a user may only read."""
+def _read_only(
+    rng: Rng, folder: Path, limit_s: float
+) -> tuple[str, CommandEnd]:
+    """Write into folders that the user may only read."""
     (folder / "out").mkdir()
-    _give(folder)
+    _change_owner(folder)
     before = problem_files.contents(folder)
     words = WRITING[rng.integers(len(WRITING))]
     ended = run(words, folder, limit_s, _without_privileges)
     return ended.outcome(problem_files.contents(folder) == before), ended
 
 
-def _full(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
-    """Write to a disk of 4 to 400 kB, which is mounted for the one process only."""
+def _full(rng: Rng, folder: Path, limit_s: float) -> tuple[str, CommandEnd]:
+    """Write to a disk of 4 to 400 kB, which is mounted only for this process."""
     words = list(WRITING[rng.integers(len(WRITING))])
     (folder / "out").mkdir()
-    if "run" in words:  # on a disk without more room
+    if "run" in words:  # the run fills the disk
         size = sum(
             f.stat().st_size + 4096
             for f in (folder / "run").rglob("*")
             if f.is_file()
         )
         size += int(rng.integers(4, 60)) * 1024
-        prepared = 'cp -r run out && cd out && cp ../*.csv ../*.toml ../*.vtu . 2>/dev/null; exec "$@"'
+        prepared_command = (
+            "cp -r run out && cd out && "
+            'cp ../*.csv ../*.toml ../*.vtu . 2>/dev/null; exec "$@"'
+        )
         size += sum(f.stat().st_size + 4096 for f in folder.glob("*.*"))
     else:
         size = int(rng.integers(4, 400)) * 1024
-        prepared = 'exec "$@"'
-    mounted = f"mount -t tmpfs -o size={size} tmpfs out && {prepared}"
+        prepared_command = 'exec "$@"'
+    mount_command = (
+        f"mount -t tmpfs -o size={size} tmpfs out && {prepared_command}"
+    )
     program = [sys.executable, "-c", PROGRAM, *words]
-    ended = _ended(
-        ["unshare", "-m", "sh", "-c", mounted, "sh", *program], folder, limit_s
+    ended = _run_program(
+        ["unshare", "-m", "sh", "-c", mount_command, "sh", *program],
+        folder,
+        limit_s,
     )
     return ended.outcome(), ended
 
 
-def _ended(words: Sequence[str], folder: Path, limit_s: float) -> Ended:
-    """Run a program to its end or the limit."""
-    done = subprocess.Popen(
+def _run_program(
+    words: Sequence[str], folder: Path, limit_s: float
+) -> CommandEnd:
+    """Run a program to its end; kill it at `WAITING_FACTOR` times the limit [s]."""
+    process = subprocess.Popen(
         words,
         cwd=folder,
         stdin=subprocess.DEVNULL,
@@ -969,28 +1011,28 @@ def _ended(words: Sequence[str], folder: Path, limit_s: float) -> Ended:
         start_new_session=True,
     )
     try:
-        out, err = done.communicate(timeout=WAITING * limit_s)
+        out, err = process.communicate(timeout=WAITING_FACTOR * limit_s)
     except subprocess.TimeoutExpired:
-        os.killpg(done.pid, signal.SIGKILL)
-        out, err = done.communicate()
-        return Ended(
+        os.killpg(process.pid, signal.SIGKILL)
+        out, err = process.communicate()
+        return CommandEnd(
             None, out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
         )
-    return Ended(
-        done.returncode,
+    return CommandEnd(
+        process.returncode,
         out.decode("utf-8", "replace"),
         err.decode("utf-8", "replace"),
     )
 
 
-def _kernels(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
+def _kernels(rng: Rng, folder: Path, limit_s: float) -> tuple[str, CommandEnd]:
     """Solve with compiled kernels that were damaged, exchanged, linked or made by another user."""
     cache = folder / "cache"
     words = ("solve", "problem.toml", *REDUCED, "-q", "--out", "out")
 
     def with_cache() -> None:
         os.environ["COLLOCATION_SYSID_CACHE"] = str(cache)
-        # A fork inherits the kernels in memory, for which it would neither write nor read a file.
+        # Kernels in memory, which a fork inherits, would be used without any file.
         jit.compile_function.cache_clear()
         _without_privileges()
 
@@ -1008,13 +1050,15 @@ def _kernels(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
         file.rename(folder / "elsewhere")
         file.symlink_to(folder / "elsewhere")
     else:
-        _give(cache)
+        _change_owner(cache)
     ended = run(words, folder, limit_s, with_cache)
     return ended.outcome(), ended
 
 
-def _two_solves(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
-    """Solve twice at a time into one folder; whoever comes last replaces it, whole."""
+def _two_solves(
+    rng: Rng, folder: Path, limit_s: float
+) -> tuple[str, CommandEnd]:
+    """Solve twice at a time into one folder; the last one must leave a complete run."""
     words = ("solve", "problem.toml", *REDUCED, "-q", "--out", "out")
     first = start(words, folder, limit_s)
     time.sleep(float(rng.exponential(0.3)))
@@ -1061,17 +1105,22 @@ JSON += (
 )
 
 
-def _datagrams(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
-    """Send frames to a port, most of them damaged, and then the empty one that ends it."""
+def _datagrams(
+    rng: Rng, folder: Path, limit_s: float
+) -> tuple[str, CommandEnd]:
+    """Send frames to a UDP port, most of them damaged, then the empty frame that ends the command."""
     running = start(("live", "problem.toml", "--udp", "0"), folder, limit_s)
-    until = time.monotonic() + WAITING * limit_s
-    while "port " not in running.said(running.err) and time.monotonic() < until:
+    until = time.monotonic() + WAITING_FACTOR * limit_s
+    while (
+        "port " not in running.output_text(running.err)
+        and time.monotonic() < until
+    ):
         if os.waitid(
             os.P_PID, running.process, os.WEXITED | os.WNOHANG | os.WNOWAIT
         ):
             break
         time.sleep(0.02)
-    _, found, rest = running.said(running.err).partition("port ")
+    _, found, rest = running.output_text(running.err).partition("port ")
     if not found:
         return "unclear", running.finish(0.1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -1080,7 +1129,7 @@ def _datagrams(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
             frame = FRAME % (0.01 * number)
             sent = frame if rng.random() < 0.3 else damaged(rng, frame, JSON)
             sender.sendto((sent or b" ")[:60_000], address)
-        for _ in range(100):  # one may be lost
+        for _ in range(100):  # a datagram may be lost
             sender.sendto(b"", address)
             time.sleep(0.05)
             if os.waitid(
@@ -1098,12 +1147,14 @@ def _datagrams(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
 SCRIPT = (
     "import sys\nfrom collocation_sysid.cli import main\nsys.exit(main())\n"
 )
-# From the start of Python to some time behind the end of the small problem's solve [s].
+# Interrupts come within this time after the start [s]; the small solve takes less.
 INTERRUPTED_WITHIN_S = 8.0
 
 
-def _interrupted(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
-    """Interrupt a solve, once or twice; it ends with 130, and nothing or a whole run is left."""
+def _interrupted(
+    rng: Rng, folder: Path, limit_s: float
+) -> tuple[str, CommandEnd]:
+    """Interrupt a solve once or twice; its exit code is 130, and it leaves no run or a complete one."""
     script = folder / "collocation-sysid"
     script.write_text(SCRIPT)
     words = [
@@ -1122,7 +1173,7 @@ def _interrupted(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
         )
     ]
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        running = Running(0, out, err)
+        running = RunningCommand(0, out, err)
         process = subprocess.Popen(
             words, cwd=folder, stdout=out, stderr=err, start_new_session=True
         )
@@ -1131,15 +1182,17 @@ def _interrupted(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
             process.send_signal(number)
             time.sleep(float(rng.uniform(0.0, 0.5)))
         try:
-            code = process.wait(WAITING * limit_s)
+            code = process.wait(WAITING_FACTOR * limit_s)
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             code = process.wait() and None
-        ended = Ended(code, running.said(out), running.said(err))
+        ended = CommandEnd(
+            code, running.output_text(out), running.output_text(err)
+        )
     outcome = ended.outcome()
     if (
         outcome == "crash" and -(code or 0) in signals
-    ):  # before there was anything to keep
+    ):  # before the signal handlers are installed
         outcome = "refused"
     if outcome == "unclear" and code == 130:
         outcome = "refused"
@@ -1155,7 +1208,7 @@ def _interrupted(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
 
 
 OTHERS = (
-    OtherKind("names in outputs", _named, solved=True),
+    OtherKind("names in outputs", _hostile_names, solved=True),
     OtherKind(
         "read-only folder", _read_only, share=0.5, needs_root=True, solved=True
     ),
@@ -1175,14 +1228,17 @@ def main() -> None:
         description=(__doc__ or "").partition("\n\n")[0]
     )
     parser.add_argument(
-        "--count", type=int, default=100, help="cases of a kind"
+        "--count", type=int, default=100, help="number of cases of each kind"
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--only", nargs="*", choices=list(KINDS), default=list(KINDS)
     )
     parser.add_argument(
-        "--limit-s", type=float, default=30.0, help="longer is a hang"
+        "--limit-s",
+        type=float,
+        default=30.0,
+        help="processor time after which a case counts as a hang [s]",
     )
     parser.add_argument(
         "--keep", type=Path, help="store the input of failures in this folder"
@@ -1204,11 +1260,14 @@ def table(
     seed: int,
     only: Sequence[str],
     limit_s: float,
-    kept: Path | None = None,
+    failure_folder: Path | None = None,
 ) -> str:
-    """Run the cases; a row of counts for each kind."""
+    """Run the cases, and return a table with the number of each outcome by kind.
+
+    For the arguments see the options of the command line.
+    """
     rows = []
-    os.environ["COLLOCATION_SYSID_THREADS"] = "1"  # a fork keeps no threads
+    os.environ["COLLOCATION_SYSID_THREADS"] = "1"  # forks have no threads
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         problem = folder / "problem"
@@ -1223,7 +1282,9 @@ def table(
                     f"the small problem is not solved: {ended.err}"
                 )
         with mock.patch.object(run_record, "write_pictures"):
-            cases = Cases(folder, problem, solved, count, seed, limit_s, kept)
+            cases = CaseSettings(
+                folder, problem, solved, count, seed, limit_s, failure_folder
+            )
             for name in only:
                 began = time.monotonic()
                 counts = KINDS[name].run(cases)
@@ -1231,7 +1292,7 @@ def table(
                 cells = (str(counts[outcome]) for outcome in OUTCOMES)
                 rows.append((name, str(counts.total()), *cells, took))
                 print(*rows[-1], sep=", ", file=sys.stderr, flush=True)
-    return markdown(("input", "cases", *OUTCOMES, "s"), rows)
+    return markdown(("input", "cases", *OUTCOMES, "time [s]"), rows)
 
 
 if __name__ == "__main__":

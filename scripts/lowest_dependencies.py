@@ -9,8 +9,14 @@ from pathlib import Path
 PROJECT = Path(__file__).parents[1] / "pyproject.toml"
 
 
-def lowest(requirements: list[str]) -> list[str]:
-    """A pin for each requirement of the form "name>=version", without its extras."""
+def lowest_pins(requirements: list[str]) -> list[str]:
+    """Return a pin for each requirement of the form "name>=version", without its extras.
+
+    Raises
+    ------
+    ValueError
+        If a requirement states no lowest version.
+    """
     pins = []
     for requirement in requirements:
         match = re.fullmatch(r"([\w.-]+)(?:\[.*\])?>=([\d.]+)", requirement)
@@ -20,7 +26,7 @@ def lowest(requirements: list[str]) -> list[str]:
     return pins
 
 
-def of_project() -> list[str]:
+def project_pins() -> list[str]:
     """Return the lowest versions of the dependencies of the package and its extras.
 
     Requirements of an extra on the package itself, and requirements for some platforms only, are
@@ -32,11 +38,11 @@ def of_project() -> list[str]:
         for extra in project["optional-dependencies"].values()
         for each in extra
     ]
-    stated = [
+    extra_requirements = [
         e for e in extras if ";" not in e and not e.startswith(project["name"])
     ]
-    return lowest([*project["dependencies"], *stated])
+    return lowest_pins([*project["dependencies"], *extra_requirements])
 
 
 if __name__ == "__main__":
-    print("\n".join(of_project()))
+    print("\n".join(project_pins()))

@@ -1,14 +1,14 @@
-"""Make problems/foam_cylinder: a foam cylinder held at one end and swung, 0.5 mm marker noise.
+"""Make problems/foam_cylinder: a foam cylinder, clamped at one end and swung, with 0.5 mm of noise.
 
-The data come from Newmark at 1 ms on the analytic motion, so neither the integrator nor the
-interpolation of the poses is the one the problem is solved with.
+The data are simulated by Newmark's scheme at 1 ms with the analytic motion: scheme and interpolation
+of the poses differ from those of the fit.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from synthetic import Swing, measure, unmeasured
+from synthetic import Swing, prepare_experiment, simulate_tracks
 
 from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.recording import write_markers_csv
@@ -20,6 +20,7 @@ TRUTH = {
     "gamma_r_s": 0.006,
     "gamma_m_1_s": 1.5,
 }
+# Standard deviation of each marker coordinate [m].
 NOISE_M = 0.0005
 SWING = Swing(
     duration_s=0.4,
@@ -31,6 +32,7 @@ SWING = Swing(
 # Cameras at 100 Hz; the robot logs its poses at 200 Hz.
 STEP_S = 0.01
 POSE_STEP_S = 0.005
+# Time step of the simulation [s].
 FINE_S = 0.001
 
 
@@ -38,10 +40,12 @@ def main() -> None:
     cylinder_mesh(radius_m=0.03, height_m=0.16, rings=1, layers=11).write(
         FOLDER / "foam_cylinder.vtu"
     )
-    experiment = unmeasured(
+    experiment = prepare_experiment(
         FOLDER / "problem.toml", "swing_poses.csv", SWING.poses(POSE_STEP_S)
     )
-    tracks = measure(experiment, SWING.poses(FINE_S), TRUTH, NOISE_M, seed=1)
+    tracks = simulate_tracks(
+        experiment, SWING.poses(FINE_S), TRUTH, NOISE_M, seed=1
+    )
     frames = slice(None, None, round(STEP_S / POSE_STEP_S))
     write_markers_csv(
         FOLDER / "swing_markers.csv",

@@ -2,9 +2,10 @@
 
     python scripts/make_phantom_mesh.py [FILE.vtu] [coarse | fine]
 
-Triangles of a radial section are turned about the axis, each into wedges of three tetrahedra. They
-are finer towards the edge that rolls onto the platen, and a diagonal ends there: a tetrahedron that
-spanned the edge alone would be flat when the side wall lies on the platen.
+Triangles of a radial section are rotated about the axis; between two angles each forms a wedge of
+three tetrahedra. The triangles are smaller near the edge that rolls onto the platen, and a diagonal
+ends there: otherwise one tetrahedron would have two faces at the edge, and it would become flat when
+the side wall lies on the platen.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ FILE = (
     / "phantom_compression"
     / "eighth.vtu"
 )
+# Number of wedges over the quarter circle.
 SECTORS = 2
-# Radii and heights above the middle of the specimen's nodes.
+# Radii of the nodes, and their heights above the mid-plane of the specimen, by name of the mesh.
 SECTIONS_MM = {
     "coarse": ((0, 13, 20, 25), (0, 8.5, 15)),
     "shipped": ((0, 10, 17, 21.5, 25), (0, 6.5, 11.5, 15)),
@@ -32,8 +34,11 @@ SECTIONS_MM = {
 }
 
 
-def section(radii: int, heights: int) -> list[tuple[int, int, int]]:
-    """Triangles of a grid: two a cell, on either side of the diagonal towards the edge."""
+def section_triangles(radii: int, heights: int) -> list[tuple[int, int, int]]:
+    """Return the triangles of a grid of nodes: two per cell, with the diagonal towards the outer edge.
+
+    Node (i, j) of the grid, at radius i and height j, has the index i · heights + j.
+    """
     cells = [
         (i * heights + j, heights)
         for i in range(radii - 1)
@@ -41,49 +46,61 @@ def section(radii: int, heights: int) -> list[tuple[int, int, int]]:
     ]
     return [
         triangle
-        for low, up in cells
+        for low, height_count in cells
         for triangle in (
-            (low, low + up, low + up + 1),
-            (low, low + 1, low + up + 1),
+            (low, low + height_count, low + height_count + 1),
+            (low, low + 1, low + height_count + 1),
         )
     ]
 
 
-def turned(
+def quarter_revolution(
     radii_mm: tuple[float, ...], heights_mm: tuple[float, ...]
 ) -> TetMesh:
-    """A quarter turn of a section, of the cylinder's volume."""
+    """Return the mesh of a section that is rotated by 90°, with the volume of the round cylinder.
+
+    The radii are enlarged so that the polygon has the area of the circle.
+    """
     radii_m = np.array(radii_mm) / 1e3
     heights_m = np.array(heights_mm) / 1e3
     angle = np.pi / 2 / SECTORS
     radii_m *= np.sqrt(angle / np.sin(angle))
-    whole = len(radii_m) * len(heights_m)
-    plane = np.stack(
+    section_count = len(radii_m) * len(heights_m)
+    section_m = np.stack(
         np.meshgrid(radii_m, heights_m, indexing="ij"), -1
     ).reshape(-1, 2)
     points = []
     tetrahedra = []
     for k in range(SECTORS + 1):
-        axis = np.round([np.cos(k * angle), np.sin(k * angle)], 15)
+        direction = np.round([np.cos(k * angle), np.sin(k * angle)], 15)
         points.append(
-            np.column_stack([np.outer(plane[:, 0], axis), plane[:, 1]])
+            np.column_stack(
+                [np.outer(section_m[:, 0], direction), section_m[:, 1]]
+            )
         )
-    # All turns share the axis, whose nodes come first.
-    number = np.arange((SECTORS + 1) * whole).reshape(SECTORS + 1, whole)
-    number[:, : len(heights_m)] = number[0, : len(heights_m)]
+    # The nodes on the axis, which come first, are common to all angles.
+    node_numbers = np.arange((SECTORS + 1) * section_count).reshape(
+        SECTORS + 1, section_count
+    )
+    node_numbers[:, : len(heights_m)] = node_numbers[0, : len(heights_m)]
     for k in range(SECTORS):
-        # Every second wedge is cut the other way, so that the mesh is not twisted.
+        # Wedges are divided alternately in both senses, so that the mesh has no twist.
         here, there = (
-            (number[k], number[k + 1])
+            (node_numbers[k], node_numbers[k + 1])
             if k % 2 == 0
-            else (number[k + 1], number[k])
+            else (node_numbers[k + 1], node_numbers[k])
         )
-        for a, b, c in section(len(radii_m), len(heights_m)):
-            A, B, C, a_, b_, c_ = *here[[a, b, c]], *there[[a, b, c]]
-            tetrahedra += [(A, B, C, c_), (A, B, b_, c_), (A, a_, b_, c_)]
-    kept = np.array([four for four in tetrahedra if len(set(four)) == 4])
-    used, tetrahedra = np.unique(kept, return_inverse=True)
-    points_m = np.concatenate(points)[used]
+        for a, b, c in section_triangles(len(radii_m), len(heights_m)):
+            a0, b0, c0 = here[[a, b, c]]
+            a1, b1, c1 = there[[a, b, c]]
+            tetrahedra += [
+                (a0, b0, c0, c1),
+                (a0, b0, b1, c1),
+                (a0, a1, b1, c1),
+            ]
+    volumetric = np.array([four for four in tetrahedra if len(set(four)) == 4])
+    used_nodes, tetrahedra = np.unique(volumetric, return_inverse=True)
+    points_m = np.concatenate(points)[used_nodes]
     return TetMesh(
         points_m, orient_elements(points_m, tetrahedra.reshape(-1, 4))[0]
     )
@@ -91,7 +108,9 @@ def turned(
 
 def main() -> None:
     file = Path(sys.argv[1]) if len(sys.argv) > 1 else FILE
-    mesh = turned(*SECTIONS_MM[sys.argv[2] if len(sys.argv) > 2 else "shipped"])
+    mesh = quarter_revolution(
+        *SECTIONS_MM[sys.argv[2] if len(sys.argv) > 2 else "shipped"]
+    )
     mesh.write(file)
     print(
         f"{file}: {len(mesh.points_m)} nodes, {len(mesh.tetrahedra)} tetrahedra"

@@ -1,14 +1,15 @@
-"""Make problems/table1: the paper's problem size and true parameters, without noise.
+"""Make problems/table1: size and true parameters of the problem in the paper, without noise.
 
-Two data sets of the same motion: `newmark_markers.csv` from Newmark at 1 ms on the analytic
-motion, and `scheme_markers.csv` from the paper's own scheme, backward Euler at 10 ms.
+There are two data sets of the same motion: `newmark_markers.csv` is simulated by Newmark's scheme at
+1 ms with the analytic motion, `scheme_markers.csv` by the scheme of the paper, backward Euler at
+10 ms.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from synthetic import Swing, measure, unmeasured
+from synthetic import Swing, prepare_experiment, simulate_tracks
 
 from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.program.simulation import simulate
@@ -28,6 +29,7 @@ SWING = Swing(
     frequency_hz=(0.9, 1.1, 1.3),
     rise_s=0.3,
 )
+# Sampling interval, and time step of Newmark's scheme [s].
 STEP_S = 0.01
 FINE_S = 0.001
 
@@ -36,11 +38,11 @@ def main() -> None:
     cylinder_mesh(radius_m=0.04, height_m=0.16, rings=2, layers=8).write(
         FOLDER / "cylinder.vtu"
     )
-    experiment = unmeasured(
+    experiment = prepare_experiment(
         FOLDER / "problem.toml", "poses.csv", SWING.poses(STEP_S)
     )
     tracks = {
-        "newmark": measure(
+        "newmark": simulate_tracks(
             experiment, SWING.poses(FINE_S), TRUTH, noise_m=0.0, seed=0
         ),
         "scheme": simulate(

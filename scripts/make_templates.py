@@ -27,41 +27,48 @@ from collocation_sysid.recording import (
     write_poses_csv,
 )
 
+# True Young's modulus of the bench tests, and shear modulus of the specimen [Pa].
 YOUNG_PA = 8e4
 SHEAR_MODULUS_PA = 1e5
-# Noise of the specimen's stress: one percent of the largest.
+# Standard deviation of the stress of the specimen [Pa]: one percent of the largest stress.
 STRESS_NOISE_PA = 1e3
+# True constants of the swung cylinder.
 SWUNG = {
     "young_pa": 8000.0,
     "poisson": 0.3,
     "gamma_r_s": 0.005,
     "gamma_m_1_s": 1.0,
 }
-# Seeds of the noise. With 1, the swing has a rare draw, 2.6 standard deviations off: of ten others
-# the standardised errors have a root mean square of 0.85 to 1.1, and the headline intervals contain
-# the truth. The example for new users is one of the ten, with the verdict "good".
+# Seeds of the noise. With seed 1, an estimate of the swing is 2.6 standard errors from the truth, which
+# is rare. With ten other seeds, the root mean square of errors over standard errors is 0.85 to 1.1,
+# and the combined intervals contain the truth. The example for new users is one of these ten, with
+# the verdict "good".
 SWING_SEED = 109
 BENCH_SEED = 1
 
 
 def swing(folder: Path) -> None:
-    """A foam cylinder that hangs from a gripper, which moves it to and fro."""
+    """Write the recording of a foam cylinder that hangs from a gripper and is moved to and fro."""
     mesh = cylinder_of_edge(0.05, 0.15, 0.025)
     body = Body(mesh, mass_kg=0.1)
     t_s = np.arange(81) * np.float64(0.01)
-    hanging = Rotation.from_euler("x", 180, degrees=True).as_quat()
+    hanging_quaternion = Rotation.from_euler("x", 180, degrees=True).as_quat()
     shift_m = 0.03 * np.outer(1 - np.cos(7 * t_s), [1, 0, 0]) + 0.02 * np.outer(
         np.sin(11 * t_s) ** 2, [0, 1, 0]
     )
-    poses = PoseSequence(t_s, shift_m, np.tile(hanging, (len(t_s), 1)))
+    poses = PoseSequence(
+        t_s, shift_m, np.tile(hanging_quaternion, (len(t_s), 1))
+    )
     places_m = (
         np.array([[25, 0, 60], [0, 25, 105], [25, 0, 150], [-25, 0, 150]])
         / 1000
     )
     markers = Markers(t_s, np.zeros((len(t_s), 4, 3)), 1e-3, places_m=places_m)
     grasp = Grasp(Box((-1, -1, -1e-3), (1, 1, 1e-3)), poses)
-    swung = Experiment(body, t_s, [grasp], markers, air_density_kg_m3="none")
-    tracks_m = simulate(swung, SWUNG).markers_m
+    experiment = Experiment(
+        body, t_s, [grasp], markers, air_density_kg_m3="none"
+    )
+    tracks_m = simulate(experiment, SWUNG).markers_m
     tracks_m = tracks_m + np.random.default_rng(SWING_SEED).normal(
         scale=1e-3, size=tracks_m.shape
     )
@@ -76,20 +83,20 @@ def swing(folder: Path) -> None:
 
 
 def compression(folder: Path) -> None:
-    """A cylinder pressed by a fifth, as a machine writes it: compression is positive."""
+    """Write the table of a cylinder that a machine compresses by 20 %; compression is positive."""
     t_s = np.arange(0.0, 60.5, 0.5)
-    names = "Time (s),Displacement (mm),Force (N)"
-    benched(folder, names, t_s, 0.1 * t_s, noise=0.1, scale=-4.0)
+    header = "Time (s),Displacement (mm),Force (N)"
+    write_bench_table(folder, header, t_s, 0.1 * t_s, noise=0.1, scale=-4.0)
 
 
 def tension(folder: Path) -> None:
-    """A bar pulled by a third, in strain and stress."""
+    """Write the table of a bar that is extended by 30 %, in strain and stress."""
     t_s = np.arange(0.0, 60.5, 0.5)
-    names = "Time (s),Strain (%),Stress (kPa)"
+    header = "Time (s),Strain (%),Stress (kPa)"
     area_m2 = 2.56e-4
-    benched(
+    write_bench_table(
         folder,
-        names,
+        header,
         t_s,
         0.5 * t_s,
         noise=0.02e-3 / area_m2,
@@ -97,30 +104,45 @@ def tension(folder: Path) -> None:
     )
 
 
-def benched(
+def write_bench_table(
     folder: Path,
-    names: str,
+    header: str,
     t_s: Array,
-    moved: Array,
+    displacement_column: Array,
     noise: float,
     scale: float,
 ) -> None:
-    """The table of a test bench: what the crosshead does, and what the model answers to it.
+    """Write the table of a test bench, with simulated forces or stresses.
 
-    The reaction of the part that is modelled is multiplied by `scale`.
+    Parameters
+    ----------
+    folder : Path
+        Folder of the problem.
+    header : str
+        Header of the table.
+    t_s : (T,) array
+        Times [s].
+    displacement_column : (T,) array
+        Column of displacements or strains.
+    noise : float
+        Standard deviation of the third column, in its unit.
+    scale : float
+        Value of the third column over the reaction of the modelled part [N].
     """
     file = folder / "run_1.csv"
 
     def write(measured: Array) -> None:
         rows = [
             f"{t:.1f},{m:.4f},{f:.4f}"
-            for t, m, f in zip(t_s, moved, measured, strict=True)
+            for t, m, f in zip(t_s, displacement_column, measured, strict=True)
         ]
-        write_text_file(file, "\n".join([names, *rows, ""]))
+        write_text_file(file, "\n".join([header, *rows, ""]))
 
     write(np.zeros(len(t_s)))
-    at_truth = [f"parameters.young_pa.guess={YOUNG_PA}"]
-    problem = Problem.read(folder / "problem.toml", at_truth, simulation=True)
+    truth_override = [f"parameters.young_pa.guess={YOUNG_PA}"]
+    problem = Problem.read(
+        folder / "problem.toml", truth_override, simulation=True
+    )
     (experiment,) = problem.experiments
     (reaction,) = simulate(experiment, problem.parameters).wrenches
     write(
@@ -130,9 +152,9 @@ def benched(
 
 
 def specimen(folder: Path) -> None:
-    """A rubber strip pulled to one and a half times its length: stretch and engineering stress."""
+    """Write the table of a rubber strip at stretches up to 1.5: stretch and engineering stress."""
     stretch = np.linspace(1.02, 1.5, 25)
-    # Of an incompressible neo-Hookean material.
+    # Stress of an incompressible neo-Hookean material.
     stress_pa = SHEAR_MODULUS_PA * (stretch - stretch**-2)
     stress_pa += np.random.default_rng(BENCH_SEED).normal(
         scale=STRESS_NOISE_PA, size=len(stretch)

@@ -1,15 +1,15 @@
-"""Do the tests notice? One small mistake in the package at a time, against the tests that run it.
+"""Mutation testing: one small fault in the package at a time, and the tests that do not detect it.
 
     nice -n 19 python scripts/mutants.py [--count 100] [--seed 1] [--under fem program/sweep.py]
 
-A mutant is one comparison, sign, operation, constant, `not` or `and` changed. The tests that it has
-to survive are those which ran its function, the quickest first, for which the suite runs once
-under a tracer (``--ran`` keeps what that found). All is done in a copy of the tree under
-``build/mutants``, with kernels compiled there; remove that folder to begin anew with other code.
-What was tried is kept a line each, so that the command goes on where it was stopped, and a larger
-``--budget`` tries survivors again. They are listed at the end.
+A mutant has one changed comparison, sign, operation, constant, `not` or `and`. It is tested by the
+tests that run its function, the fastest first. To find these, the suite runs once under a tracer;
+``--ran`` names the file of the result. Everything is done in a copy of the tree under
+``build/mutants``, with kernels compiled there; delete this folder when the code has changed. Each
+result is appended to a file, so that the command continues where it was stopped; with a larger
+``--budget`` survivors are tested again. The survivors are listed at the end.
 
-A survivor is either a mistake that no test would notice, or a change that makes none.
+A survivor is either a fault that no test detects, or a change without effect.
 """
 
 from __future__ import annotations
@@ -34,13 +34,17 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "collocation_sysid"
 OUT = ROOT / "build" / "mutants"
-# Tests of the copy are quick ones, and not of the repository itself.
-LEFT_OUT = ("test_architecture.py", "test_docs.py", "test_shipped_problems.py")
+# Excluded tests: slow ones, and those of the repository itself.
+EXCLUDED_TESTS = (
+    "test_architecture.py",
+    "test_docs.py",
+    "test_shipped_problems.py",
+)
 
 
-# What can be changed ------------------------------------------------------------------------------
+# Changes of expressions ------------------------------------------------------------------------------
 
-COMPARED = {
+COMPARISONS = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
     ast.Gt: ast.GtE,
@@ -52,20 +56,29 @@ COMPARED = {
     ast.In: ast.NotIn,
     ast.NotIn: ast.In,
 }
-OPERATED = {
+OPERATORS = {
     ast.Add: ast.Sub,
     ast.Sub: ast.Add,
     ast.Mult: ast.Div,
     ast.Div: ast.Mult,
 }
-JOINED = {ast.And: ast.Or, ast.Or: ast.And}
+CONNECTIVES = {ast.And: ast.Or, ast.Or: ast.And}
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change: where it starts and ends (lines from 1, columns in bytes), and what it is.
+    """One change of an expression.
 
-    ``function`` is the first line of the function around it, 0 at the top of a module or a class.
+    Attributes
+    ----------
+    path : str
+        File, relative to the tree.
+    line, column, end_line, end_column : int
+        Position of the expression: lines from 1, columns in bytes from 0.
+    before, after : str
+        Text of the expression before and after the change.
+    function : int
+        First line of the function that contains the expression; 0 outside of functions.
     """
 
     path: str
@@ -77,8 +90,8 @@ class Mutant:
     after: str
     function: int
 
-    def applied(self, source: str) -> str:
-        """The file with the change in it."""
+    def applied_to(self, source: str) -> str:
+        """Return the source of the file with the change."""
         lines = source.encode().splitlines(keepends=True)
         head = b"".join(
             [*lines[: self.line - 1], lines[self.line - 1][: self.column]]
@@ -95,17 +108,19 @@ class Mutant:
         return f"{self.path}:{self.line}:{self.column}  {self.before}  →  {self.after}"
 
 
-def changed(node: ast.expr) -> ast.expr | None:
+def mutated_expression(node: ast.expr) -> ast.expr | None:
     """Return the faulty expression that replaces `node`; None if this kind is not changed."""
     match node:
         case ast.Compare(left, [operator, *more], right) if (
-            type(operator) in COMPARED
+            type(operator) in COMPARISONS
         ):
-            return ast.Compare(left, [COMPARED[type(operator)](), *more], right)
-        case ast.BinOp(left, operator, right) if type(operator) in OPERATED:
-            return ast.BinOp(left, OPERATED[type(operator)](), right)
+            return ast.Compare(
+                left, [COMPARISONS[type(operator)](), *more], right
+            )
+        case ast.BinOp(left, operator, right) if type(operator) in OPERATORS:
+            return ast.BinOp(left, OPERATORS[type(operator)](), right)
         case ast.BoolOp(operator, values):
-            return ast.BoolOp(JOINED[type(operator)](), values)
+            return ast.BoolOp(CONNECTIVES[type(operator)](), values)
         case ast.UnaryOp(ast.Not() | ast.USub(), operand):
             return operand
         case ast.Constant(int() | float() as value) if type(value) is not bool:
@@ -115,26 +130,29 @@ def changed(node: ast.expr) -> ast.expr | None:
     return None
 
 
-def evaluated(
+def evaluated_expressions(
     node: ast.AST, function: int = 0
 ) -> Iterator[tuple[ast.expr, int]]:
-    """Expressions that are run, with their function: no annotations, no texts of errors."""
+    """Yield the expressions below a node that are evaluated, with the first line of their function.
+
+    Annotations, decorators and messages of errors are skipped.
+    """
     skipped: tuple[ast.AST, ...] = ()
     match node:
         case ast.FunctionDef():
-            # Where its code begins, as the interpreter sees it.
+            # First line of the code object, which includes decorators.
             function = min(
                 [node.lineno, *(each.lineno for each in node.decorator_list)]
             )
             arguments = node.args
-            every = [
+            all_arguments = [
                 *arguments.posonlyargs,
                 *arguments.args,
                 *arguments.kwonlyargs,
             ]
             skipped = (*node.decorator_list, *filter(None, [node.returns]))
             skipped += tuple(
-                each.annotation for each in every if each.annotation
+                each.annotation for each in all_arguments if each.annotation
             )
         case ast.AnnAssign():
             skipped = (node.annotation,)
@@ -144,16 +162,16 @@ def evaluated(
         yield node, function
     for child in ast.iter_child_nodes(node):
         if child not in skipped:
-            yield from evaluated(child, function)
+            yield from evaluated_expressions(child, function)
 
 
-def mutants_of(path: Path, root: Path) -> list[Mutant]:
-    """Every mutant of a file."""
+def mutants_of_file(path: Path, root: Path) -> list[Mutant]:
+    """Return all mutants of a file, with paths relative to `root`."""
     source = path.read_text(encoding="utf-8")
     tree = ast.parse(source)
-    made = []
-    for node, function in evaluated(tree):
-        other = changed(node)
+    mutants = []
+    for node, function in evaluated_expressions(tree):
+        other = mutated_expression(node)
         if (
             other is None
             or node.end_lineno is None
@@ -163,52 +181,49 @@ def mutants_of(path: Path, root: Path) -> list[Mutant]:
         after = ast.unparse(other)
         if isinstance(node, ast.UnaryOp):
             after = f"({after})"
-        ends = (
-            node.lineno,
-            node.col_offset,
-            node.end_lineno,
-            node.end_col_offset,
-        )
-        made.append(
+        mutants.append(
             Mutant(
                 str(path.relative_to(root)),
-                *ends,
-                ast.unparse(node),
-                after,
-                function,
+                line=node.lineno,
+                column=node.col_offset,
+                end_line=node.end_lineno,
+                end_column=node.end_col_offset,
+                before=ast.unparse(node),
+                after=after,
+                function=function,
             )
         )
-    return made
+    return mutants
 
 
-# Which tests run what -----------------------------------------------------------------------------
+# Functions that each test runs -----------------------------------------------------------------------------
 
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """Record the functions of the package that a passing test runs and its duration (pytest hook)."""
-    seen: set[tuple[str, int]] = set()
+    functions_run: set[tuple[str, int]] = set()
 
     def trace(frame, event: str, argument: object) -> None:
         code = frame.f_code
         if PACKAGE in code.co_filename:
-            seen.add((code.co_filename, code.co_firstlineno))
+            functions_run.add((code.co_filename, code.co_firstlineno))
 
     threading.settrace(trace)
     sys.settrace(trace)
     start = time.perf_counter()
-    failed = item.session.testsfailed
+    failures_before = item.session.testsfailed
     yield
     sys.settrace(None)
     threading.settrace(None)  # type: ignore[arg-type]
-    if item.session.testsfailed > failed:
+    if item.session.testsfailed > failures_before:
         return
     functions: dict[str, list[int]] = {}
-    for file, line in seen:
-        inside = Path(file).resolve()
-        if inside.is_relative_to(Path.cwd()):
+    for file, line in functions_run:
+        module_file = Path(file).resolve()
+        if module_file.is_relative_to(Path.cwd()):
             functions.setdefault(
-                str(inside.relative_to(Path.cwd())), []
+                str(module_file.relative_to(Path.cwd())), []
             ).append(line)
     row = {
         "test": item.nodeid,
@@ -220,15 +235,15 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Ran:
-    """A test, how long it took, and which functions of which files it ran."""
+class TestRecord:
+    """Duration of a test [s], and first lines of the functions that it ran, by file."""
 
     test: str
     s: float
     ran: dict[str, list[int]]
 
     def reaches(self, mutant: Mutant) -> bool:
-        """Whether it ran the mutant's function, or anything in its file if that has none."""
+        """Whether the test ran the function of the mutant, or its file if it is outside of functions."""
         functions = self.ran.get(mutant.path, ())
         return (
             mutant.function in functions if mutant.function else bool(functions)
@@ -236,8 +251,8 @@ class Ran:
 
 
 def importers(path: str, tree: Path) -> set[str]:
-    """Files of the package that import a file by its name."""
-    wanted = re.compile(
+    """Return the files of the package that import a module by its name."""
+    import_pattern = re.compile(
         rf"^\s*from .*\b{Path(path).stem} import |import .*\b{Path(path).stem}\b",
         re.M,
     )
@@ -245,29 +260,30 @@ def importers(path: str, tree: Path) -> set[str]:
     return {
         str(each.relative_to(tree))
         for each in files
-        if wanted.search(each.read_text("utf-8"))
+        if import_pattern.search(each.read_text("utf-8"))
     }
 
 
 def tests_against(
-    mutant: Mutant, table: list[Ran], tree: Path, budget_s: float
-) -> list[Ran]:
-    """The quickest tests that reach it, as many as the budget holds and at least one.
+    mutant: Mutant, table: list[TestRecord], tree: Path, budget_s: float
+) -> list[TestRecord]:
+    """Return the fastest tests that run a mutant, within the time budget [s], at least one.
 
-    Of what runs on import only, or once for all tests, they are those of the files that import it.
+    If no test was recorded, because the code runs only on import or once for all tests, these are
+    tests that run files which import the module. Empty if there are none.
     """
-    able = [each for each in table if each.reaches(mutant)]
-    if not able:
+    candidates = [each for each in table if each.reaches(mutant)]
+    if not candidates:
         files = importers(mutant.path, tree)
-        able = [each for each in table if files & each.ran.keys()]
-    chosen: list[Ran] = []
-    for each in sorted(able, key=lambda each: each.s):
+        candidates = [each for each in table if files & each.ran.keys()]
+    chosen: list[TestRecord] = []
+    for each in sorted(candidates, key=lambda each: each.s):
         if chosen and sum(one.s for one in chosen) + each.s > budget_s:
             break
         chosen.append(each)
     return sorted(
         chosen, key=lambda each: each.test
-    )  # a module's fixtures are made once
+    )  # fixtures of a module are then made once
 
 
 # In a copy of the tree ----------------------------------------------------------------------------
@@ -300,7 +316,7 @@ def run_pytest(
         "OMP_NUM_THREADS": "1",
         "MUTANTS_RAN": str(OUT / "ran.jsonl"),
     }
-    quiet = [
+    options = [
         "-q",
         "-p",
         "no:cacheprovider",
@@ -309,7 +325,7 @@ def run_pytest(
         "--no-header",
         "--tb=no",
     ]
-    command = [sys.executable, "-m", "pytest", *quiet, *arguments]
+    command = [sys.executable, "-m", "pytest", *options, *arguments]
     with (OUT / "pytest.log").open("w") as log:
         process = subprocess.Popen(
             command,
@@ -328,33 +344,31 @@ def run_pytest(
 
 
 def try_mutant(
-    mutant: Mutant, tree: Path, table: list[Ran], budget_s: float
+    mutant: Mutant, tree: Path, table: list[TestRecord], budget_s: float
 ) -> str:
     """Return "killed", "timeout", "survived", or "no test" if none runs it."""
-    against = tests_against(mutant, table, tree, budget_s)
-    if not against:
+    tests = tests_against(mutant, table, tree, budget_s)
+    if not tests:
         return "no test"
     file = tree / mutant.path
     source = file.read_text(encoding="utf-8")
-    # What emits code has no part in the key by which compiled code is kept.
+    # The key of compiled kernels does not depend on the code generator, which may be the mutant.
     kernels = "fem/kernels" in mutant.path
     cache = OUT / "spoiled" if kernels else OUT / "kernels"
     shutil.rmtree(OUT / "spoiled", ignore_errors=True)
     chosen = OUT / "chosen.txt"
-    chosen.write_text(
-        "\n".join(each.test for each in against), encoding="utf-8"
-    )
-    limit_s = 60 + (20 if kernels else 5) * sum(each.s for each in against)
+    chosen.write_text("\n".join(each.test for each in tests), encoding="utf-8")
+    limit_s = 60 + (20 if kernels else 5) * sum(each.s for each in tests)
     try:
-        _put(file, mutant.applied(source))
+        _write_module(file, mutant.applied_to(source))
         code = run_pytest(tree, cache, "-x", f"@{chosen}", timeout_s=limit_s)
     finally:
-        _put(file, source)
+        _write_module(file, source)
     return {0: "survived", None: "timeout"}.get(code, "killed")
 
 
-def _put(file: Path, source: str) -> None:
-    """Write a module, and nothing compiled of it: a change within a second would not be seen."""
+def _write_module(file: Path, source: str) -> None:
+    """Write a module and delete its bytecode, which Python would reuse if written in the same second."""
     file.write_text(source, encoding="utf-8")
     for compiled in (file.parent / "__pycache__").glob(f"{file.stem}.*.pyc"):
         compiled.unlink()
@@ -364,17 +378,18 @@ def _put(file: Path, source: str) -> None:
 
 
 def record_what_tests_run(tree: Path, ran: Path, tests: list[str]) -> None:
-    """Run the suite once under the tracer, unless that was done."""
+    """Run the suite once under the tracer, unless the file of its result exists."""
     if ran.exists():
         return
     part = OUT / "ran.jsonl"
     part.unlink(missing_ok=True)
-    left_out = [f"--ignore-glob=tests/*/{name}" for name in LEFT_OUT]
-    run_pytest(tree, OUT / "kernels", "-p", "mutants", *left_out, *tests)
+    exclusions = [f"--ignore-glob=tests/*/{name}" for name in EXCLUDED_TESTS]
+    run_pytest(tree, OUT / "kernels", "-p", "mutants", *exclusions, *tests)
     part.rename(ran)
 
 
 def read_rows(path: Path) -> list[dict]:
+    """Return the rows of a file with one JSON object per line."""
     return [
         json.loads(line)
         for line in path.read_text(encoding="utf-8").splitlines()
@@ -386,10 +401,16 @@ def main() -> None:
         description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument(
-        "--count", type=int, default=100, help="how many mutants (default: 100)"
+        "--count",
+        type=int,
+        default=100,
+        help="number of mutants (default: 100)",
     )
     parser.add_argument(
-        "--seed", type=int, default=1, help="which of them (default: 1)"
+        "--seed",
+        type=int,
+        default=1,
+        help="seed of their random choice (default: 1)",
     )
     parser.add_argument(
         "--under",
@@ -398,44 +419,50 @@ def main() -> None:
         help="folders or files of the package",
     )
     parser.add_argument(
-        "--tests", nargs="*", default=[], help="test files, of all"
+        "--tests", nargs="*", default=[], help="test files; all by default"
     )
     parser.add_argument(
-        "--budget", type=float, default=20.0, help="seconds of tests a mutant"
+        "--budget",
+        type=float,
+        default=20.0,
+        help="duration of the tests of a mutant [s]",
     )
     parser.add_argument(
-        "--ran", type=Path, default=OUT / "tests.jsonl", help="what tests run"
+        "--ran",
+        type=Path,
+        default=OUT / "tests.jsonl",
+        help="file of the functions that each test runs",
     )
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     tree = OUT / "tree"
     if not tree.exists():
         copy_tree(tree)
-    record_what_tests_run(tree, asked.ran, asked.tests)
-    table = [Ran(**row) for row in read_rows(asked.ran)]
-    every = [
+    record_what_tests_run(tree, arguments.ran, arguments.tests)
+    table = [TestRecord(**row) for row in read_rows(arguments.ran)]
+    all_mutants = [
         mutant
         for path in sorted((tree / PACKAGE).rglob("*.py"))
         if any(
-            str(path.relative_to(tree / PACKAGE)).startswith(under)
-            for under in asked.under
+            str(path.relative_to(tree / PACKAGE)).startswith(prefix)
+            for prefix in arguments.under
         )
-        for mutant in mutants_of(path, tree)
+        for mutant in mutants_of_file(path, tree)
     ]
-    chosen = random.Random(asked.seed).sample(
-        every, min(asked.count, len(every))
+    chosen = random.Random(arguments.seed).sample(
+        all_mutants, min(arguments.count, len(all_mutants))
     )
-    results = OUT / f"seed_{asked.seed}.jsonl"
+    results = OUT / f"seed_{arguments.seed}.jsonl"
     results.touch()
     done = {
         str(Mutant(**row["mutant"])): row["end"]
         for row in read_rows(results)
-        if row["end"] != "survived" or row["budget"] >= asked.budget
+        if row["end"] != "survived" or row["budget"] >= arguments.budget
     }
     for number, mutant in enumerate(chosen, 1):
         if str(mutant) not in done:
             done[str(mutant)] = end = try_mutant(
-                mutant, tree, table, asked.budget
+                mutant, tree, table, arguments.budget
             )
             with results.open("a", encoding="utf-8") as file:
                 file.write(
@@ -443,7 +470,7 @@ def main() -> None:
                         {
                             "mutant": asdict(mutant),
                             "end": end,
-                            "budget": asked.budget,
+                            "budget": arguments.budget,
                         }
                     )
                     + "\n"
@@ -451,8 +478,12 @@ def main() -> None:
         print(
             f"{number}/{len(chosen)} {done[str(mutant)]:9} {mutant}", flush=True
         )
-    ends = [done[str(mutant)] for mutant in chosen]
-    print(", ".join(f"{ends.count(end)} {end}" for end in sorted(set(ends))))
+    outcomes = [done[str(mutant)] for mutant in chosen]
+    print(
+        ", ".join(
+            f"{outcomes.count(end)} {end}" for end in sorted(set(outcomes))
+        )
+    )
     for mutant in chosen:
         if done[str(mutant)] in ("survived", "no test"):
             lines = (

@@ -38,7 +38,7 @@ NODE_MASS_KG = 0.06 / 95
 SAMPLE_S = 0.01
 SAMPLE_COUNT = 51
 # Nodes with markers, on the surface: three at the free end and three at mid-height.
-SEEN_NODES = (7, 11, 15, 45, 49, 53)
+MARKED_NODES = (7, 11, 15, 45, 49, 53)
 # Standard deviation of a marker coordinate, of a good motion-capture system.
 NOISE_M = 1e-4
 SEED = 0
@@ -69,14 +69,14 @@ def lame_constants(values: Mapping[str, float]) -> tuple[float, float]:
 
 
 def cylinder() -> cs.TetMesh:
-    """Return the mesh of the cylinder, whose top is held."""
+    """Return the mesh of the cylinder, whose top is grasped."""
     return cs.cylinder_mesh(
         radius_m=RADIUS_M, height_m=HEIGHT_M, rings=RINGS, layers=LAYERS
     )
 
 
-def held_nodes(mesh: cs.TetMesh) -> NDArray[np.intp]:
-    """Return the nodes at the top, which the hand holds."""
+def grasped_nodes(mesh: cs.TetMesh) -> NDArray[np.intp]:
+    """Return the nodes at the top, which the hand grasps."""
     return np.flatnonzero(mesh.points_m[:, 2] > HEIGHT_M - 1e-6)
 
 
@@ -94,14 +94,14 @@ def hand_motion(time_s: float) -> HandMotion:
 
 def hand_pose(time_s: float) -> Array:
     """Return the pose (4, 4) of the hand, which turns about the centre of the cylinder's top."""
-    along_m, angle = hand_motion(time_s).coordinates
+    shift_m, angle = hand_motion(time_s).coordinates
     pose = np.eye(4)
     cosine = np.cos(angle)
     sine = np.sin(angle)
     pose[:3, :3] = [[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]
     centre_m = np.array([0.0, 0.0, HEIGHT_M])
     pose[:3, 3] = centre_m - pose[:3, :3] @ centre_m
-    pose[0, 3] += along_m
+    pose[0, 3] += shift_m
     return pose
 
 
@@ -110,12 +110,12 @@ def hand_poses(times_s: NDArray[np.floating]) -> Array:
     return np.array([hand_pose(time_s) for time_s in times_s.tolist()])
 
 
-def held_positions(mesh: cs.TetMesh, times_s: NDArray[np.floating]) -> Array:
-    """Return the positions (k, held, 3) [m] of the held nodes at times (k,) [s]."""
+def grasped_positions(mesh: cs.TetMesh, times_s: NDArray[np.floating]) -> Array:
+    """Return the positions (k, g, 3) [m] of the grasped nodes at times (k,) [s]."""
     poses = hand_poses(times_s)
-    places_m = mesh.points_m[held_nodes(mesh)]
-    turned_m = np.einsum("tij,kj->tki", poses[:, :3, :3], places_m)
-    return turned_m + poses[:, None, :3, 3]
+    places_m = mesh.points_m[grasped_nodes(mesh)]
+    rotated_m = np.einsum("tij,kj->tki", poses[:, :3, :3], places_m)
+    return rotated_m + poses[:, None, :3, 3]
 
 
 def recording(mesh: cs.TetMesh, positions_m: Array) -> cs.Experiment:
@@ -125,35 +125,36 @@ def recording(mesh: cs.TetMesh, positions_m: Array) -> cs.Experiment:
     than NODE_MASS_KG, and point masses add what is missing.
     """
     t_s = SAMPLE_S * np.arange(SAMPLE_COUNT)
-    held = held_nodes(mesh)
-    free = np.setdiff1d(np.arange(len(mesh.points_m)), held)
+    grasped = grasped_nodes(mesh)
+    free_nodes = np.setdiff1d(np.arange(len(mesh.points_m)), grasped)
     volumes_m3 = cs.Body(mesh, density_kg_m3=1.0).node_mass
-    density = 0.999 * (NODE_MASS_KG / volumes_m3[free]).min()
+    density = 0.999 * (NODE_MASS_KG / volumes_m3[free_nodes]).min()
     body = cs.Body(
         mesh,
         "st-venant-kirchhoff",
         density_kg_m3=density,
         damping="material",
     )
-    added = [
-        cs.PointMass([n], float(NODE_MASS_KG - body.node_mass[n])) for n in free
+    point_masses = [
+        cs.PointMass([n], float(NODE_MASS_KG - body.node_mass[n]))
+        for n in free_nodes
     ]
-    seen = list(SEEN_NODES)
-    tracks_m = positions_m[:, seen]
+    marked = list(MARKED_NODES)
+    tracks_m = positions_m[:, marked]
     noise = np.random.default_rng(SEED).normal(size=tracks_m.shape)
     markers = cs.Markers(
         t_s,
         tracks_m + NOISE_M * noise,
         sigma_m=NOISE_M,
-        places_m=mesh.points_m[seen],
+        places_m=mesh.points_m[marked],
     )
     return cs.Experiment(
         body,
         t_s,
-        [cs.Grasp(held, hand_poses(t_s))],
+        [cs.Grasp(grasped, hand_poses(t_s))],
         markers,
         name="swung-cylinder",
-        masses=added,
+        masses=point_masses,
         nuisance=cs.Nuisance.none(),
         air_density_kg_m3="none",
     )

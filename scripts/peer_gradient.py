@@ -13,33 +13,33 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 from peer_case import (
+    MARKED_NODES,
     NODE_MASS_KG,
     NOISE_M,
     SAMPLE_COUNT,
     SAMPLE_S,
-    SEEN_NODES,
     cylinder,
-    held_nodes,
-    held_positions,
+    grasped_nodes,
+    grasped_positions,
 )
 
 Array = NDArray[np.float64]
 # Untyped: annotations of Warp's kernels are calls, which type checkers refuse.
 wp: Any = import_module("warp")
 if TYPE_CHECKING:
-    Number = Any
-    Numbers = Any
-    Integers = Any
-    IntegerRows = Any
-    Matrices = Any
-    Vectors = Any
+    Float = Any
+    FloatArray = Any
+    IntArray = Any
+    IntArray2d = Any
+    MatrixArray = Any
+    VectorArray2d = Any
 else:
-    Number = wp.float64
-    Numbers = wp.array(dtype=wp.float64)
-    Integers = wp.array(dtype=int)
-    IntegerRows = wp.array2d(dtype=int)
-    Matrices = wp.array(dtype=wp.mat33d)
-    Vectors = wp.array2d(dtype=wp.vec3d)
+    Float = wp.float64
+    FloatArray = wp.array(dtype=wp.float64)
+    IntArray = wp.array(dtype=int)
+    IntArray2d = wp.array2d(dtype=int)
+    MatrixArray = wp.array(dtype=wp.mat33d)
+    VectorArray2d = wp.array2d(dtype=wp.vec3d)
 
 # As MuJoCo's explicit steps: stable at the truth and the guess.
 STEP_S = 5e-5
@@ -53,8 +53,8 @@ FIRST_CHANGE = 0.2
 
 @wp.kernel
 def set_constants(
-    logarithms: Numbers,
-    constants: Numbers,
+    logarithms: FloatArray,
+    constants: FloatArray,
 ):
     """Set λ, μ and γ_r from the logarithms of E, ν and γ_r."""
     young = wp.exp(logarithms[0])
@@ -68,14 +68,14 @@ def set_constants(
 
 @wp.kernel
 def add_forces(
-    x: Vectors,
-    v: Vectors,
-    tetrahedra: IntegerRows,
-    inverses: Matrices,
-    volumes: Numbers,
-    constants: Numbers,
+    x: VectorArray2d,
+    v: VectorArray2d,
+    tetrahedra: IntArray2d,
+    inverses: MatrixArray,
+    volumes: FloatArray,
+    constants: FloatArray,
     step: int,
-    forces: Vectors,
+    forces: VectorArray2d,
 ):
     """Add the forces of elasticity and damping of each tetrahedron at a step."""
     k = wp.tid()
@@ -119,22 +119,24 @@ def add_forces(
 
 @wp.kernel
 def advance(
-    x: Vectors,
-    v: Vectors,
-    forces: Vectors,
-    held_row: Integers,
-    held_m: Vectors,
+    x: VectorArray2d,
+    v: VectorArray2d,
+    forces: VectorArray2d,
+    grasp_rows: IntArray,
+    grasp_positions_m: VectorArray2d,
     step: int,
-    step_s: Number,
-    mass_kg: Number,
-    drag_1_s: Number,
+    step_s: Float,
+    mass_kg: Float,
+    drag_1_s: Float,
 ):
-    """Set positions and velocities of the next step; held nodes (rows ≥ 0) are prescribed."""
+    """Set positions and velocities of the next step; grasped nodes (rows ≥ 0) are prescribed."""
     n = wp.tid()
-    row = held_row[n]
+    row = grasp_rows[n]
     if row >= 0:
-        x[step + 1, n] = held_m[step + 1, row]
-        v[step + 1, n] = (held_m[step + 1, row] - held_m[step, row]) / step_s
+        x[step + 1, n] = grasp_positions_m[step + 1, row]
+        v[step + 1, n] = (
+            grasp_positions_m[step + 1, row] - grasp_positions_m[step, row]
+        ) / step_s
     else:
         gravity = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(-9.81))
         acceleration = (
@@ -147,22 +149,22 @@ def advance(
 
 @wp.kernel
 def add_misfit(
-    x: Vectors,
-    nodes: Integers,
-    measured_m: Vectors,
+    x: VectorArray2d,
+    nodes: IntArray,
+    measured_m: VectorArray2d,
     first: int,
     stride: int,
-    scale: Number,
-    loss: Numbers,
+    scale: Float,
+    loss: FloatArray,
 ):
     """Add the squared distances of the markers of all samples, over the noise."""
     k = wp.tid()
     sample = k // nodes.shape[0]
     marker = k % nodes.shape[0]
-    away = (
+    residual = (
         x[first + sample * stride, nodes[marker]] - measured_m[sample, marker]
     ) * scale
-    wp.atomic_add(loss, 0, wp.dot(away, away))
+    wp.atomic_add(loss, 0, wp.dot(residual, residual))
 
 
 @dataclass(frozen=True)
@@ -192,11 +194,11 @@ class WarpCylinder:
         self.count = self.settling + (SAMPLE_COUNT - 1) * self.stride
         nodes = len(mesh.points_m)
         times_s = STEP_S * (np.arange(self.count + 1) - self.settling)
-        held_m = held_positions(mesh, np.maximum(times_s, 0.0))
-        held_row = np.full(nodes, -1)
-        held_row[held_nodes(mesh)] = np.arange(held_m.shape[1])
+        grasp_positions_m = grasped_positions(mesh, np.maximum(times_s, 0.0))
+        grasp_rows = np.full(nodes, -1)
+        grasp_rows[grasped_nodes(mesh)] = np.arange(grasp_positions_m.shape[1])
         shape = (self.count + 1, nodes)
-        x = np.zeros((*shape, 3))
+        x = np.zeros((self.count + 1, nodes, 3))
         x[0] = mesh.points_m
         self.x = wp.array(x, dtype=wp.vec3d, requires_grad=True)
         self.v = wp.zeros(shape, dtype=wp.vec3d, requires_grad=True)
@@ -206,9 +208,9 @@ class WarpCylinder:
         self.tetrahedra = wp.array(tetrahedra, dtype=int)
         self.inverses = wp.array(np.linalg.inv(edges_m), dtype=wp.mat33d)
         self.volumes = wp.array(np.linalg.det(edges_m) / 6, dtype=wp.float64)
-        self.held_row = wp.array(held_row, dtype=int)
-        self.held_m = wp.array(held_m, dtype=wp.vec3d)
-        self.seen = wp.array(list(SEEN_NODES), dtype=int)
+        self.grasp_rows = wp.array(grasp_rows, dtype=int)
+        self.grasp_positions_m = wp.array(grasp_positions_m, dtype=wp.vec3d)
+        self.marked_nodes = wp.array(list(MARKED_NODES), dtype=int)
         self.measured_m = wp.array(measured_m, dtype=wp.vec3d)
 
     def simulate(self, logarithms: Any) -> None:
@@ -232,13 +234,13 @@ class WarpCylinder:
             drag_1_s = SETTLING_DRAG_1_S if step < self.settling else 0.0
             wp.launch(
                 advance,
-                dim=len(self.held_row),
+                dim=len(self.grasp_rows),
                 inputs=[
                     self.x,
                     self.v,
                     self.forces,
-                    self.held_row,
-                    self.held_m,
+                    self.grasp_rows,
+                    self.grasp_positions_m,
                     step,
                     STEP_S,
                     NODE_MASS_KG,
@@ -261,10 +263,10 @@ class WarpCylinder:
             self.simulate(x)
             wp.launch(
                 add_misfit,
-                dim=SAMPLE_COUNT * len(SEEN_NODES),
+                dim=SAMPLE_COUNT * len(MARKED_NODES),
                 inputs=[
                     self.x,
-                    self.seen,
+                    self.marked_nodes,
                     self.measured_m,
                     self.settling,
                     self.stride,

@@ -16,8 +16,8 @@ from peer_case import (
     SAMPLE_S,
     STEPS_PER_SAMPLE,
     cylinder,
-    held_nodes,
-    held_positions,
+    grasped_nodes,
+    grasped_positions,
     lame_constants,
 )
 from scipy.sparse import diags_array
@@ -50,13 +50,15 @@ class ScikitFemCylinder:
         element = ElementVector(ElementTetP1())
         self.basis = Basis(mesh, element, intorder=1)
         self.mass_kg = np.full(self.rest_m.size, NODE_MASS_KG)
-        nodes = held_nodes(case)
+        nodes = grasped_nodes(case)
         self.prescribed = (3 * nodes[:, None] + np.arange(3)).ravel()
         self.free = np.setdiff1d(np.arange(self.rest_m.size), self.prescribed)
         self.step_s = SAMPLE_S / STEPS_PER_SAMPLE
         count = (SAMPLE_COUNT - 1) * STEPS_PER_SAMPLE + 1
-        held_m = held_positions(case, self.step_s * np.arange(count))
-        self.prescribed_m = held_m.reshape(count, -1)
+        grasp_positions_m = grasped_positions(
+            case, self.step_s * np.arange(count)
+        )
+        self.prescribed_m = grasp_positions_m.reshape(count, -1)
         self.order = _node_major_order(self.basis, self.rest_m)
 
     def simulate(self, values: Mapping[str, float]) -> Array:

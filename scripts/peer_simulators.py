@@ -21,9 +21,9 @@ from peer_case import (
     SAMPLE_S,
     STEPS_PER_SAMPLE,
     cylinder,
+    grasped_nodes,
+    grasped_positions,
     hand_motion,
-    held_nodes,
-    held_positions,
 )
 
 import collocation_sysid as cs
@@ -123,10 +123,10 @@ def _has_failed(mujoco: Any, data: Any) -> bool:
 def _flex_description(mesh: cs.TetMesh, values: Mapping[str, float]) -> str:
     """Return MuJoCo's description of the hand and the cylinder.
 
-    Each free node is a body of its own in the world, so that the mass matrix is diagonal; the held
+    Each free node is a separate body in the world, so that the mass matrix is diagonal; the grasped
     nodes belong to the hand, whose two joints come first.
     """
-    held = set(held_nodes(mesh).tolist())
+    grasped = set(grasped_nodes(mesh).tolist())
     nodes = range(len(mesh.points_m))
     axes = ("1 0 0", "0 1 0", "0 0 1")
     joints = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in axes)
@@ -135,11 +135,11 @@ def _flex_description(mesh: cs.TetMesh, values: Mapping[str, float]) -> str:
         f'<inertial pos="0 0 0" mass="{NODE_MASS_KG}" '
         f'diaginertia="1e-9 1e-9 1e-9"/>{joints}</body>'
         for n in nodes
-        if n not in held
+        if n not in grasped
     )
-    names = " ".join("hand" if n in held else f"node{n}" for n in nodes)
-    is_held = np.isin(np.arange(len(mesh.points_m)), list(held))
-    local_m = np.where(is_held[:, None], mesh.points_m, 0.0)
+    names = " ".join("hand" if n in grasped else f"node{n}" for n in nodes)
+    is_grasped = np.isin(np.arange(len(mesh.points_m)), list(grasped))
+    local_m = np.where(is_grasped[:, None], mesh.points_m, 0.0)
     top_m = mesh.points_m[:, 2].max()
     return f"""
 <mujoco>
@@ -208,7 +208,7 @@ def simulate_with_calculix(
     mesh = cylinder()
     deck = _calculix_deck(mesh, values, is_damped=is_damped)
     (folder / f"{JOB}.inp").write_text(deck, encoding="ascii")
-    done = subprocess.run(
+    process = subprocess.run(
         ["ccx", "-i", JOB],
         cwd=folder,
         capture_output=True,
@@ -216,8 +216,8 @@ def simulate_with_calculix(
         check=False,
     )
     blocks = (folder / f"{JOB}.dat").read_text().split("displacements")[1:]
-    if done.returncode or len(blocks) != SAMPLE_COUNT:
-        raise UnstableSimulationError(f"CalculiX: {done.stdout[-300:]}")
+    if process.returncode or len(blocks) != SAMPLE_COUNT:
+        raise UnstableSimulationError(f"CalculiX: {process.stdout[-300:]}")
     displacements_m = [_displacements(block) for block in blocks]
     return np.array(displacements_m) + mesh.points_m
 
@@ -233,8 +233,8 @@ def _calculix_deck(
     mesh: cs.TetMesh, values: Mapping[str, float], *, is_damped: bool
 ) -> str:
     """Return CalculiX's input: a static step under gravity, then the motion of the hand."""
-    held = held_nodes(mesh)
-    free = np.setdiff1d(np.arange(len(mesh.points_m)), held)
+    grasped = grasped_nodes(mesh)
+    free = np.setdiff1d(np.arange(len(mesh.points_m)), grasped)
     elements = np.asarray(mesh.tetrahedra) + 1
     lumps = [[len(elements) + 1 + k, n + 1] for k, n in enumerate(free)]
     weight_n = NODE_MASS_KG * GRAVITY_M_S2[2]
@@ -242,7 +242,7 @@ def _calculix_deck(
     damping = f"*DAMPING,ALPHA=0.,BETA={values['gamma_r_s']:.12e}"
     step_s = SAMPLE_S / STEPS_PER_SAMPLE
     times_s = step_s * np.arange((SAMPLE_COUNT - 1) * STEPS_PER_SAMPLE + 1)
-    moved_m = held_positions(mesh, times_s) - mesh.points_m[held]
+    displacements_m = grasped_positions(mesh, times_s) - mesh.points_m[grasped]
     return f"""*NODE,NSET=ALL
 {_rows(enumerate(mesh.points_m, start=1))}
 *ELEMENT,TYPE=C3D4,ELSET=BODY
@@ -258,12 +258,12 @@ def _calculix_deck(
 {NO_DENSITY_KG_M3}
 {damping if is_damped else "**"}
 *SOLID SECTION,ELSET=BODY,MATERIAL=FOAM
-{_amplitudes(held, times_s, moved_m)}
+{_amplitudes(grasped, times_s, displacements_m)}
 *STEP,NLGEOM,INC=1000
 *STATIC
 0.25,1.
 *BOUNDARY
-{_rows((n + 1, (1, 3, 0.0)) for n in held)}
+{_rows((n + 1, (1, 3, 0.0)) for n in grasped)}
 *CLOAD
 {loads}
 *NODE PRINT,NSET=ALL,FREQUENCY=1000
@@ -274,7 +274,7 @@ ELSE
 *STEP,NLGEOM,INC=100000
 *DYNAMIC,DIRECT,ALPHA=0.
 {step_s:.12e},{times_s[-1]:.12e}
-{_moved_boundaries(held)}
+{_boundary_conditions(grasped)}
 *CLOAD
 {loads}
 *NODE PRINT,NSET=ALL,FREQUENCY={STEPS_PER_SAMPLE}
@@ -284,23 +284,25 @@ U
 
 
 def _amplitudes(
-    held: NDArray[np.intp], times_s: NDArray[np.floating], moved_m: Array
+    grasped: NDArray[np.intp],
+    times_s: NDArray[np.floating],
+    displacements_m: Array,
 ) -> str:
-    """Return CalculiX's tables of the displacements (k, held, 3) [m] of the held nodes."""
+    """Return CalculiX's tables of the displacements (k, g, 3) [m] of the grasped nodes."""
     tables = []
-    for k, node in enumerate(held):
+    for k, node in enumerate(grasped):
         for axis in range(3):
-            rows = np.column_stack([times_s, moved_m[:, k, axis]])
+            rows = np.column_stack([times_s, displacements_m[:, k, axis]])
             lines = "\n".join(f"{t:.12e},{u:.12e}" for t, u in rows)
             tables.append(f"*AMPLITUDE,NAME=A{node}_{axis}\n{lines}")
     return "\n".join(tables)
 
 
-def _moved_boundaries(held: NDArray[np.intp]) -> str:
-    """Return CalculiX's conditions that the held nodes follow their tables."""
+def _boundary_conditions(grasped: NDArray[np.intp]) -> str:
+    """Return CalculiX's conditions that the grasped nodes follow their tables."""
     return "\n".join(
         f"*BOUNDARY,AMPLITUDE=A{n}_{axis}\n{n + 1},{axis + 1},{axis + 1},1."
-        for n in held
+        for n in grasped
         for axis in range(3)
     )
 
@@ -314,6 +316,6 @@ def _rows(rows: Iterable[tuple[int, Any]]) -> str:
 
 
 def _number(value: float) -> str:
-    """Return a whole number as it is, and another one with 13 digits."""
-    is_whole = isinstance(value, (int, np.integer))
-    return str(value) if is_whole else f"{value:.12e}"
+    """Return an integer without decimals, and another number with 13 digits."""
+    is_integer = isinstance(value, (int, np.integer))
+    return str(value) if is_integer else f"{value:.12e}"

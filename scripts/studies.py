@@ -1,4 +1,4 @@
-"""Shared by the studies: methods with options, run in processes of their own, and tables."""
+"""Runs of methods with options in separate processes, and Markdown tables; shared by the studies."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TRUTH = {
     "gamma_r_s": 0.009,
     "gamma_m_1_s": 1.0,
 }
-HEADS = ("λ", "μ", "γ_r", "γ_m")
+PARAMETER_SYMBOLS = ("λ", "μ", "γ_r", "γ_m")
 
 # A run that does not end by its own time limit is killed this much later [s].
 GRACE_S = 60.0
@@ -37,15 +37,16 @@ GRACE_S = 60.0
 
 @dataclass(frozen=True)
 class Variant:
-    """A method with options of its own.
+    """Method with options.
 
     Attributes
     ----------
-    name : str, in tables
+    name : str
+        Name in tables.
     method : str
     options : mapping, as in the method's table of a problem file
     share : float
-        Of the starts that it is run from; the first ones, for a method that takes long.
+        Share of the initial guesses from which the method is run, for methods that are slow.
     """
 
     name: str
@@ -55,14 +56,14 @@ class Variant:
 
     @property
     def overrides(self) -> list[str]:
-        """The options for the command line's --set."""
+        """Arguments of the option --set of the command line."""
         return [
             f"solver.{self.method}.{key}={value}"
             for key, value in self.options.items()
         ]
 
     def limited(self, time_s: float) -> Variant:
-        """With a time limit, unless it has one of its own; reduced-space knows none."""
+        """Return the variant with a time limit [s], unless it has one or its method has no such option."""
         if self.method in ("reduced-space", "continuation"):
             return self
         return replace(self, options={"max_time_s": time_s, **self.options})
@@ -79,7 +80,7 @@ def run_variants(
     time_s: float = 60.0,
     workers: int = 2,
 ) -> dict[str, list[Row]]:
-    """Rows of every variant by its name.
+    """Run all variants, and return the rows of each by its name.
 
     Parameters
     ----------
@@ -87,12 +88,12 @@ def run_variants(
         A problem file.
     variants : sequence of Variant
     folder : Path
-        For the records; runs that are there already are not repeated.
+        Folder of the records; runs that are finished there are not repeated.
     starts : int
-        Guesses, log-uniform within a factor `spread` of the truth, the same for all variants;
-        with 0 the file's own guess alone.
+        Number of initial guesses, log-uniform within a factor `spread` of the truth and equal for
+        all variants; 0 means only the guess of the file.
     time_s : float
-        A run ends by itself after this, or is killed a little later.
+        Time limit of a run [s]; a run that does not end is killed `GRACE_S` later.
     """
     store = RunStore(folder / "runs")
     limits = RunOptions(workers=workers, time_limit_s=time_s + GRACE_S)
@@ -101,9 +102,9 @@ def run_variants(
         overrides = variant.limited(time_s).overrides
         problem = Problem.read(path, overrides)
         count = max(1, round(starts * variant.share)) + 1 if starts else 1
-        drawn = Starts(count, spread, seed)
+        guesses = Starts(count, spread, seed)
         runs = plan_comparison(
-            problem, [variant.method], overrides, drawn, TRUTH
+            problem, [variant.method], overrides, guesses, TRUTH
         )
         planned[variant.name] = runs[1:] if starts else runs
     remaining = [
@@ -117,29 +118,29 @@ def run_variants(
         remaining,
         store,
         limits,
-        lambda record, _: _tell(names[record["key"]], record),
+        lambda record, _: _print_progress(names[record["key"]], record),
     )
-    yardstick = SuccessCriterion(TRUTH)
+    criterion = SuccessCriterion(TRUTH)
     return {
-        name: [run_row(run, store.load(run.key), yardstick) for run in runs]
+        name: [run_row(run, store.load(run.key), criterion) for run in runs]
         for name, runs in planned.items()
     }
 
 
-def _tell(name: str, record: Mapping[str, Any]) -> None:
+def _print_progress(name: str, record: Mapping[str, Any]) -> None:
     message = str(record["message"])[:100]
     line = f"{name}, start {record['start']}: {record['outcome']}, {record['wall_s']:.1f} s: "
     print(line + message, file=sys.stderr, flush=True)
 
 
 def worst_error(row: Row) -> float:
-    """Largest relative error of a parameter; infinite without an answer."""
+    """Return the largest relative error of a parameter; infinite if a run has no answer."""
     errors = [row[f"error_{name}"] for name in TRUTH]
     return max(float("inf") if error is None else error for error in errors)
 
 
 def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table, names to the left and numbers to the right."""
+    """Return a Markdown table with the first column aligned left and the others right."""
     rule = ("---", *("---:" for _ in heads[1:]))
     return "\n".join(
         "| " + " | ".join(line) + " |" for line in (heads, rule, *rows)
@@ -147,12 +148,12 @@ def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def number(value: float | None, scale: float = 1.0, digits: int = 3) -> str:
-    """A number for a table."""
+    """Return `scale` times a number for a table; a dash for None."""
     return "–" if value is None else f"{scale * value:.{digits}g}"
 
 
 def save(folder: Path, name: str, text: str) -> None:
-    """Print a table and keep it."""
+    """Print a table, and write it to a file `name`.md."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.md").write_text(text + "\n", encoding="utf-8")
     print(text)

@@ -1,11 +1,11 @@
-"""Coverage and width of γ_m's combined interval where air drags at the body.
+"""Coverage and width of the combined interval of γ_m of a light body with air drag.
 
 Twins of a foam cylinder of 30 kg/m³ that hangs from a swung hand in air of 1.2 kg/m³, with white
 noise on its markers. Drag, added mass and buoyancy of each twin differ from those of the model by
 shares drawn from their standard deviations in `statistics.budget.systematic_effects`; the fit has the air
 of the model, the default nuisance parameters, and a budget of these three rows (or of all
-assumptions that `study_faults` draws, with --all). With --vacuum the fit leaves the air out, as a
-user does who says that there is none.
+assumptions that `study_faults` draws, with --all). With --vacuum the fit
+neglects the air, like a problem file that states a vacuum.
 """
 
 from __future__ import annotations
@@ -17,7 +17,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import binom
 from study_coverage import truth
-from study_faults import ASSUMED, ROWS, drawn, fitted, measured
+from study_faults import (
+    ASSUMED,
+    ROWS,
+    draw_assumption_errors,
+    exact_recording,
+    fit_from_truth,
+)
 
 from collocation_sysid.program.simulation import with_markers
 
@@ -25,7 +31,7 @@ GAMMA_M = "gamma_m_1_s"
 
 
 @dataclass(frozen=True)
-class Twin:
+class DampingEstimate:
     """Estimate of γ_m and its intervals for one twin [1/s]."""
 
     estimate: float
@@ -63,42 +69,56 @@ def main() -> None:
 
 def one_twin(
     seed: tuple[int, int], everything: bool, in_vacuum: bool
-) -> Twin | None:
+) -> DampingEstimate | None:
     """Draw a twin and fit it; None if the fit does not converge."""
     rng = np.random.default_rng(seed)
     fault = "assumed: all of these" if everything else "assumed: air"
-    actual, stated = drawn(ASSUMED[fault])(measured(), rng)
-    tracks = actual.markers.positions_m
-    tracks = tracks + actual.markers.sigma_m[:, None] * rng.standard_normal(
-        tracks.shape
+    true_recording, described = draw_assumption_errors(ASSUMED[fault])(
+        exact_recording(), rng
     )
+    tracks = true_recording.markers.positions_m
+    tracks = tracks + true_recording.markers.sigma_m[
+        :, None
+    ] * rng.standard_normal(tracks.shape)
     if in_vacuum:
-        stated = replace(stated, air_density_kg_m3="none")
-    fit = fitted(with_markers(stated, tracks), ROWS[fault])
+        described = replace(described, air_density_kg_m3="none")
+    fit = fit_from_truth(with_markers(described, tracks), ROWS[fault])
     line = fit.lines.get(GAMMA_M)
     interval = fit.uncertainty.estimates[GAMMA_M].statistical95
     if not fit.converged or line is None or interval is None:
         return None
-    return Twin(
+    return DampingEstimate(
         fit.uncertainty.estimates[GAMMA_M].value, interval, line.combined95
     )
 
 
-def summary(twins: list[Twin], count: int) -> str:
+def summary(twins: list[DampingEstimate], count: int) -> str:
     """Return the table of coverage and median half widths, in percent of the true γ_m."""
-    true = truth()[GAMMA_M]
+    true_value = truth()[GAMMA_M]
     low, high = binom.interval(0.95, len(twins), 0.95)
     rows = [
         f"{len(twins)} of {count} twins have an interval of γ_m; of {len(twins)} exact intervals "
         f"{low:.0f} to {high:.0f} contain the truth with a probability of 95 %",
-        f"γ_m: truth {true:g} 1/s, median {np.median([t.estimate for t in twins]):.4g} 1/s",
+        f"γ_m: truth {true_value:g} 1/s, median {np.median([t.estimate for t in twins]):.4g} 1/s",
         "| interval | contains the truth | median half width, % of γ_m |",
         "|---|---|---|",
     ]
     for kind in ("statistical", "combined"):
-        ends = np.array([getattr(twin, kind) for twin in twins])
-        contained = int(((ends[:, 0] <= true) & (true <= ends[:, 1])).sum())
-        width = 100 * float(np.median(ends[:, 1] - ends[:, 0])) / 2 / true
+        interval_ends_1_s = np.array([getattr(twin, kind) for twin in twins])
+        contained = int(
+            (
+                (interval_ends_1_s[:, 0] <= true_value)
+                & (true_value <= interval_ends_1_s[:, 1])
+            ).sum()
+        )
+        width = (
+            100
+            * float(
+                np.median(interval_ends_1_s[:, 1] - interval_ends_1_s[:, 0])
+            )
+            / 2
+            / true_value
+        )
         share = f"{contained} ({100 * contained / len(twins):.1f} %)"
         rows.append(f"| {kind} | {share} | {width:.1f} |")
     return "\n".join(rows)

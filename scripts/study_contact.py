@@ -1,11 +1,12 @@
-"""Contact against Hertz: a sphere and a long cylinder that press a block; and twins of a poked one.
+"""Contact compared with Hertz: a sphere and a long cylinder press a block; twins of an indentation.
 
     python scripts/study_contact.py [sphere] [cylinder] [poked]
 
-Meshes have ever more elements to the half-width of the contact. What is compared is the force with
-that which Hertz has for the width that is found, from the second moment of the pressures: neither
-depends on how far away the block ends. Of problems/poked_block a hundred twins are solved, each
-with noise and beginnings of contact of its own, and so is Hertz' formula with the same forces.
+The meshes have more and more elements per half-width of the contact. The computed force is compared
+with the force that Hertz's theory gives for the computed width of the contact, from the second moment
+of the pressures; this ratio does not depend on the size of the block. For `poked`, a hundred twins of
+problems/poked_block, each with its own noise and onsets of contact, are identified with finite
+elements and with Hertz's formula from the same forces.
 """
 
 from __future__ import annotations
@@ -36,11 +37,12 @@ LAW = {
     "gamma_m_1_s": 1.0,
 }
 CONTACT_PA = YOUNG_PA / (1 - POISSON**2)
-# Lengths in half-widths of the contact: a fiftieth of the radius strains little.
+# Radius of the obstacles, in half-widths of the contact (1 m): so large that strains are small.
 RADIUS_M = 50.0
+# Extent of the fine part of the mesh, in half-widths of the contact.
 FINE_M = 1.4
 UP = np.array([0.0, 0.0, 1.0])
-# Blocks from which the force on a half-space is extrapolated.
+# Edges of the two blocks from which the force on a half-space is extrapolated.
 SIZES_M = (30.0, 90.0)
 
 
@@ -48,22 +50,24 @@ def ticks(
     cells: int, fine_m: float, size_m: float, growth: float
 ) -> np.ndarray:
     """Return coordinates of nodes: equal cells up to `fine_m`, then growing cells up to `size_m` [m]."""
-    found = list(np.linspace(0, fine_m, cells + 1))
+    coordinates_m = list(np.linspace(0, fine_m, cells + 1))
     step = fine_m / cells
-    while found[-1] < size_m:
+    while coordinates_m[-1] < size_m:
         step *= growth
-        found.append(found[-1] + step)
-    outer = np.array(found[cells:])
-    outer = fine_m + (outer - fine_m) * (size_m - fine_m) / (outer[-1] - fine_m)
-    return np.concatenate([found[:cells], outer])
+        coordinates_m.append(coordinates_m[-1] + step)
+    outer_m = np.array(coordinates_m[cells:])
+    outer_m = fine_m + (outer_m - fine_m) * (size_m - fine_m) / (
+        outer_m[-1] - fine_m
+    )
+    return np.concatenate([coordinates_m[:cells], outer_m])
 
 
-def block(*edges: np.ndarray) -> cs.Body:
-    """Between these places along x, y and z."""
+def graded_block(*edges: np.ndarray) -> cs.Body:
+    """Return the block whose mesh has these coordinates (ascending) along x, y and z [m]."""
     return cs.Body(gel.graded(*edges), density_kg_m3=1.0, element="tet10")
 
 
-def pressed(
+def press(
     body: cs.Body,
     shape: Solid,
     depth_m: float,
@@ -71,32 +75,45 @@ def pressed(
     kappa: float | None,
     delta: float | None,
 ) -> tuple[float, float]:
-    """The force [N], and the mean square of the distances from the middle of the contact [m²].
+    """Return the force [N], and the mean square distance of the pressure from the contact centre [m²].
 
-    Where κ or δ is None, the obstacle has the default, and may touch all faces.
+    Parameters
+    ----------
+    body : Body
+        Quarter of a block, with planes of symmetry x = 0 and y = 0 and its surface at z = 0.
+    shape : Solid
+        Obstacle that touches the surface at the origin.
+    depth_m : float
+        Displacement of the obstacle into the body [m].
+    edge_m : float
+        Edge of the elements at the contact [m].
+    kappa : float or None
+        Contact stiffness in units of E over the edge; None for the default, and contact on all faces.
+    delta : float or None
+        Width of the smooth onset of pressure in units of the edge; None for the default.
     """
     low = body.nodes_m.min(axis=0)
-    where = [
+    symmetry_nodes = [
         np.flatnonzero(np.abs(body.nodes_m[:, k] - low[k]) < 1e-9)
         for k in range(3)
     ]
     fixed = cs.PoseSequence.fixed()
     sliding = [
-        cs.Grasp(where[0], fixed, axes="x"),
-        cs.Grasp(where[1], fixed, axes="y"),
-        cs.Grasp(where[2], fixed, axes="z"),
+        cs.Grasp(symmetry_nodes[0], fixed, axes="x"),
+        cs.Grasp(symmetry_nodes[1], fixed, axes="y"),
+        cs.Grasp(symmetry_nodes[2], fixed, axes="z"),
     ]
     if np.ptp(body.nodes_m[:, 1]) < 10:
         # A slice of a long block.
-        far = np.abs(body.nodes_m[:, 1] - body.nodes_m[:, 1].max()) < 1e-9
-        sliding.append(cs.Grasp(np.flatnonzero(far), fixed, axes="y"))
+        far_nodes = np.abs(body.nodes_m[:, 1] - body.nodes_m[:, 1].max()) < 1e-9
+        sliding.append(cs.Grasp(np.flatnonzero(far_nodes), fixed, axes="y"))
     down = cs.PoseSequence(
         np.arange(2.0),
         np.tile(-depth_m * UP, (2, 1)),
         np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)),
     )
     top = cs.Box((-1.0, -1.0, -1e-9), (3.0, 3.0, 1e-9))
-    touched = cs.Obstacle(
+    obstacle = cs.Obstacle(
         poses=down,
         shape=shape,
         faces=None if kappa is None else top,
@@ -107,42 +124,50 @@ def pressed(
     experiment = cs.Experiment(
         body,
         np.zeros(1),
-        [*sliding, touched],
+        [*sliding, obstacle],
         kind="static",
         gravity_m_s2=np.zeros(3),
         air_density_kg_m3=0.0,
         nuisance=cs.Nuisance.none(),
     )
-    seen = cs.simulate(experiment, LAW)
+    equilibrium = cs.simulate(experiment, LAW)
     (term,) = contact_terms(experiment)
-    x = seen.positions_m.reshape(1, -1)
-    place = term.points.vectors(x)[:, 0]
+    x = equilibrium.positions_m.reshape(1, -1)
+    points = term.points.vectors(x)[:, 0]
     gap_m = term.law_of_contact.gap_function.evaluate(
-        place[:, None], np.zeros((0, 1, place.shape[1]))
+        points[:, None], np.zeros((0, 1, points.shape[1]))
     )[0, 0]
     law = term.law_of_contact
-    near = np.maximum(law.widths_m - gap_m, 0)
-    within = np.maximum(-gap_m, 0)
-    push = (
-        law.surface.area_m2 * law.data[3] * (near**2 - within**2) / law.widths_m
+    approach_m = np.maximum(law.widths_m - gap_m, 0)
+    penetration_m = np.maximum(-gap_m, 0)
+    forces_n = (
+        law.surface.area_m2
+        * law.data[3]
+        * (approach_m**2 - penetration_m**2)
+        / law.widths_m
     )
-    x_m, y_m, _ = place[:3] + term.law_of_contact.body.frame_nodes_m[0][:, None]
+    x_m, y_m, _ = (
+        points[:3] + term.law_of_contact.body.frame_nodes_m[0][:, None]
+    )
     r2_m2 = x_m**2 + (y_m**2 if isinstance(shape, cs.Sphere) else 0.0)
-    return -float(seen.wrenches[0][0, 2]), float(
-        (push * r2_m2).sum() / push.sum()
+    return -float(equilibrium.wrenches[0][0, 2]), float(
+        (forces_n * r2_m2).sum() / forces_n.sum()
     )
 
 
 def sphere(
     cells: float, kappa: float = 100.0, delta: float = 0.002
 ) -> tuple[float, int]:
-    """Force over Hertz' for its radius, and nodes, at so many elements to the radius."""
+    """Return the force over that of Hertz for the same contact radius, and the number of nodes.
+
+    `cells` is the number of elements per contact radius; for `kappa` and `delta` see `press`.
+    """
     edge_m = 1 / cells
-    wide = ticks(round(FINE_M * cells), FINE_M, 30.0, 3.0)
-    deep = ticks(max(1, round(FINE_M * cells / 2)), FINE_M / 2, 30.0, 3.0)
-    body = block(wide, wide, -deep)
+    across_m = ticks(round(FINE_M * cells), FINE_M, 30.0, 3.0)
+    downward_m = ticks(max(1, round(FINE_M * cells / 2)), FINE_M / 2, 30.0, 3.0)
+    body = graded_block(across_m, across_m, -downward_m)
     shape = cs.Sphere(RADIUS_M, RADIUS_M * UP)
-    force_n, r2_m2 = pressed(body, shape, 1 / RADIUS_M, edge_m, kappa, delta)
+    force_n, r2_m2 = press(body, shape, 1 / RADIUS_M, edge_m, kappa, delta)
     # The mean of r² under √(1 − r²/a²) is 2a²/5; a quarter of the sphere is there.
     radius_m = np.sqrt(2.5 * r2_m2)
     return 4 * force_n / (4 / 3 * CONTACT_PA * radius_m**3 / RADIUS_M), len(
@@ -163,12 +188,14 @@ def sphere_at_depth(cells: int, size_m: float) -> tuple[float, int]:
     size_m : float
         Edge of the block, in radii of the contact.
     """
-    wide = ticks(round(FINE_M * cells), FINE_M, size_m, 2.0)
-    deep = ticks(max(1, round(FINE_M * cells / 2)), FINE_M / 2, size_m, 2.0)
-    body = block(wide, wide, -deep)
+    across_m = ticks(round(FINE_M * cells), FINE_M, size_m, 2.0)
+    downward_m = ticks(
+        max(1, round(FINE_M * cells / 2)), FINE_M / 2, size_m, 2.0
+    )
+    body = graded_block(across_m, across_m, -downward_m)
     shape = cs.Sphere(RADIUS_M, RADIUS_M * UP)
     depth_m = 1 / RADIUS_M
-    force_n, _ = pressed(body, shape, depth_m, 1 / cells, None, None)
+    force_n, _ = press(body, shape, depth_m, 1 / cells, None, None)
     hertz_n = 4 / 3 * CONTACT_PA * np.sqrt(RADIUS_M) * depth_m**1.5
     return 4 * force_n / hertz_n, len(body.nodes_m)
 
@@ -187,33 +214,33 @@ def cylinder(
 ) -> tuple[float, int]:
     """Return force ratio and number of nodes, as `sphere` does, for half of a long cylinder."""
     edge_m = 1 / cells
-    wide = ticks(round(FINE_M * cells), FINE_M, 30.0, 2.0)
-    deep = ticks(max(1, round(FINE_M * cells / 2)), FINE_M / 2, 30.0, 2.0)
-    body = block(wide, np.array([0.0, edge_m]), -deep)
+    across_m = ticks(round(FINE_M * cells), FINE_M, 30.0, 2.0)
+    downward_m = ticks(max(1, round(FINE_M * cells / 2)), FINE_M / 2, 30.0, 2.0)
+    body = graded_block(across_m, np.array([0.0, edge_m]), -downward_m)
     ends = np.array([(0.0, -5.0, RADIUS_M), (0.0, 5.0, RADIUS_M)])
-    # So deep that the half-width is about one; the block gives as a whole, too.
+    # At this depth the half-width is about 1 m, although the block also deforms as a whole.
     shape = cs.Cylinder(RADIUS_M, ends)
-    force_n, x2_m2 = pressed(body, shape, 2.1 / RADIUS_M, edge_m, kappa, delta)
+    force_n, x2_m2 = press(body, shape, 2.1 / RADIUS_M, edge_m, kappa, delta)
     # b² = 4 F R / (π E* L), and the mean of x² is b²/4.
     length_force = np.pi * CONTACT_PA * x2_m2 / RADIUS_M
     return 2 * force_n / edge_m / length_force, len(body.nodes_m)
 
 
 @dataclass(frozen=True)
-class Twin:
+class IndentationEstimates:
     """Young's modulus of one twin with its interval, by finite elements and by Hertz's formula.
 
     Attributes
     ----------
     model_pa, hertz_pa : (3,)
-        E, and where its 95 % interval begins and ends.
+        E, and the lower and upper end of its 95 % interval [Pa].
     places_held : int
-        Beginnings of contact that are within two standard errors of the truth.
+        Number of onsets of contact within two standard errors of the truth.
     """
 
     model_pa: np.ndarray
     hertz_pa: np.ndarray
-    places_held: int
+    covered_onsets: int
 
 
 def hertz_pa(depths_m: np.ndarray, force_n: np.ndarray) -> float:
@@ -221,21 +248,23 @@ def hertz_pa(depths_m: np.ndarray, force_n: np.ndarray) -> float:
     radius_m = 0.0032
     poisson = gel.TRUTH["poisson"]
 
-    def missed(unknown: np.ndarray) -> np.ndarray:
-        deep_m = np.maximum(depths_m - 1e-3 * unknown[1], 0)
-        stiff = 4 / 3 * 1e4 * unknown[0] / (1 - poisson**2) * np.sqrt(radius_m)
-        return (stiff * deep_m**1.5 - force_n) / gel.NOISE_N
+    def residuals(unknown: np.ndarray) -> np.ndarray:
+        indentation_m = np.maximum(depths_m - 1e-3 * unknown[1], 0)
+        stiffness_n_m15 = (
+            4 / 3 * 1e4 * unknown[0] / (1 - poisson**2) * np.sqrt(radius_m)
+        )
+        return (stiffness_n_m15 * indentation_m**1.5 - force_n) / gel.NOISE_N
 
-    return 1e4 * float(least_squares(missed, [1.0, 0.0]).x[0])
+    return 1e4 * float(least_squares(residuals, [1.0, 0.0]).x[0])
 
 
-def twins(count: int) -> Iterator[Twin]:
+def twins(count: int) -> Iterator[IndentationEstimates]:
     """Yield the results of twins of the shipped problem; each solve starts from the previous answer."""
     guess = f"parameters.young_pa.guess={gel.TRUTH['young_pa']}"
     problem = cs.Problem.read(gel.FOLDER / "problem.toml", [guess])
-    reach_m = np.arange(-5e-4, 2.5e-3, 2e-5)
+    table_depths_m = np.arange(-5e-4, 2.5e-3, 2e-5)
     exact_n = CubicSpline(
-        reach_m, gel.forces_n(problem.experiments[0], reach_m)
+        table_depths_m, gel.forces_n(problem.experiments[0], table_depths_m)
     )
     spread = student.ppf(0.975, gel.PLACES - 1)
     z = None
@@ -244,57 +273,69 @@ def twins(count: int) -> Iterator[Twin]:
         onset_m = gel.ONSET_M * rng.normal(size=gel.PLACES)
         force_n = exact_n(gel.DEPTHS_M - onset_m[:, None])
         force_n += gel.NOISE_N * rng.normal(size=force_n.shape)
-        measured = []
+        measured_experiments = []
         for experiment, own_n in zip(problem.experiments, force_n, strict=True):
-            *held, tip = experiment.grasps
+            *grasps, tip = experiment.grasps
             assert tip.wrench is not None
             values = np.full(tip.wrench.values.shape, np.nan)
             values[:, 2] = -own_n / gel.QUARTERS
-            read = replace(tip, wrench=replace(tip.wrench, values=values))
-            measured.append(replace(experiment, grasps=[*held, read]))
-        twin = replace(problem, experiments=measured).collocation()
+            measured_tip = replace(
+                tip, wrench=replace(tip.wrench, values=values)
+            )
+            measured_experiments.append(
+                replace(experiment, grasps=[*grasps, measured_tip])
+            )
+        twin = replace(problem, experiments=measured_experiments).collocation()
         solution = ReducedSpace()(twin, start=z)
         z = solution.z
-        told = uncertainty_at(solution.collocation, solution.z)
-        places = [
+        uncertainty = uncertainty_at(solution.collocation, solution.z)
+        onsets = [
             part.phi[0] for part in solution.collocation.iterates(solution.z)
         ]
-        off = np.abs(np.array(places) - onset_m / gel.ONSET_M) / list(
-            told.nuisance.values()
+        onset_errors = np.abs(np.array(onsets) - onset_m / gel.ONSET_M) / list(
+            uncertainty.nuisance.values()
         )
-        simple = np.array([hertz_pa(gel.DEPTHS_M, own_n) for own_n in force_n])
-        half = spread * sem(simple) * np.array([0, -1, 1])
-        found = told.estimates["young_pa"]
-        assert found.statistical95 is not None
-        yield Twin(
-            np.array([found.value, *found.statistical95]),
-            simple.mean() + half,
-            int(sum(off < 1.96)),
+        hertz_estimates_pa = np.array(
+            [hertz_pa(gel.DEPTHS_M, own_n) for own_n in force_n]
+        )
+        hertz_interval_pa = (
+            spread * sem(hertz_estimates_pa) * np.array([0, -1, 1])
+        )
+        estimate = uncertainty.estimates["young_pa"]
+        assert estimate.statistical95 is not None
+        yield IndentationEstimates(
+            np.array([estimate.value, *estimate.statistical95]),
+            hertz_estimates_pa.mean() + hertz_interval_pa,
+            int(sum(onset_errors < 1.96)),
         )
 
 
-def poked(count: int = 100) -> None:
-    """Print how often the truth is in the intervals, and how far off estimates are."""
-    found = list(twins(count))
+def print_coverage(count: int = 100) -> None:
+    """Print the coverage of the intervals of E, the errors of the estimates, and the coverage of onsets."""
+    estimates = list(twins(count))
     for name in ("model_pa", "hertz_pa"):
         value, low, high = (
-            np.array([getattr(each, name) for each in found]).T
+            np.array([getattr(each, name) for each in estimates]).T
             / gel.TRUTH["young_pa"]
         )
-        inside = int(((low < 1) & (high > 1)).sum())
+        covered = int(((low < 1) & (high > 1)).sum())
         print(
-            name,
-            f"held by {inside} of {count}: {value.mean():.4f} ± {value.std(ddof=1):.4f}",
+            name.removesuffix("_pa"),
+            f"{covered} of {count} intervals contain the true E; "
+            f"E over its true value {value.mean():.4f} ± {value.std(ddof=1):.4f}",
         )
-        print(f"  half width of an interval {np.mean(high - low) / 2:.4f}")
+        print(
+            f"  mean half-width of an interval over the true E {np.mean(high - low) / 2:.4f}"
+        )
     print(
-        f"beginnings held: {sum(each.places_held for each in found)} of {count * gel.PLACES}"
+        "onsets within two standard errors of the truth: "
+        f"{sum(each.covered_onsets for each in estimates)} of {count * gel.PLACES}"
     )
 
 
 if __name__ == "__main__":
     if "poked" in sys.argv:
-        poked()
+        print_coverage()
         sys.argv.remove("poked")
     for name in sys.argv[1:]:
         law = {"sphere": sphere, "cylinder": cylinder}[name]

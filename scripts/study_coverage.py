@@ -45,55 +45,70 @@ from collocation_sysid.statistics.uncertainty import (
 Array = NDArray[np.float64]
 
 SCHEME = "midpoint"
+# Layers of elements of the cylinder, and time steps of the recording: small, for thousands of solves.
 LAYERS = 5
 STEPS = 60
-OFFSET_M = 0.002
-SHIFT_S = 0.003
-PHI = 0.85
+# Standard deviations of the priors of the marker offsets [m] and of the clock delay [s].
+MARKER_OFFSET_M = 0.002
+CLOCK_DELAY_S = 0.003
+# Correlation of the autoregressive noise from one sample to the next.
+AR_COEFFICIENT = 0.85
 QUANTITIES = (*TRUTH, "young_pa", "poisson")
-COLUMNS = ("λ", "μ", "γ_r", "γ_m", "E", "ν", "own")
-KINDS = (
+# Heads of the table: the four constants, E, ν, and all nuisance parameters together.
+COLUMNS = ("λ", "μ", "γ_r", "γ_m", "E", "ν", "nuisance")
+ERROR_MODELS = (
     ErrorModel("given"),
     ErrorModel("estimated"),
     ErrorModel("given", "independent"),
     ErrorModel("estimated", "independent"),
     ErrorModel(),
 )
-ACCEPTED = (0.91, 0.98)
+# A coverage outside this range is marked with a star.
+ACCEPTED_COVERAGE = (0.91, 0.98)
 
 
 @dataclass(frozen=True)
-class Case:
-    """Kind of twins: correlation of the noise, and the nuisance parameters that are estimated."""
+class TwinKind:
+    """Kind of twins: coefficient `phi` of autoregressive noise, and the estimated nuisance parameters."""
 
     name: str
     phi: float
     nuisance: Nuisance
 
 
-OWN = Nuisance.none(marker_offset_m=OFFSET_M, time_shift_s=SHIFT_S)
+NUISANCE = Nuisance.none(
+    marker_offset_m=MARKER_OFFSET_M, time_shift_s=CLOCK_DELAY_S
+)
 CASES = (
-    Case("white", 0.0, Nuisance.none()),
-    Case("white, nuisance parameters", 0.0, OWN),
-    Case(f"AR(1) {PHI}", PHI, Nuisance.none()),
-    Case(f"AR(1) {PHI}, nuisance parameters", PHI, OWN),
+    TwinKind("white", 0.0, Nuisance.none()),
+    TwinKind("white, nuisance parameters", 0.0, NUISANCE),
+    TwinKind(f"AR(1) {AR_COEFFICIENT}", AR_COEFFICIENT, Nuisance.none()),
+    TwinKind(
+        f"AR(1) {AR_COEFFICIENT}, nuisance parameters", AR_COEFFICIENT, NUISANCE
+    ),
 )
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
-    """One twin.
+class CoverageOutcome:
+    """Results of one twin, by error model (K of `ERROR_MODELS`).
 
     Attributes
     ----------
-    held : (kinds, 7) share of intervals that hold the truth, by `COLUMNS`; NaN without interval
-    scores : (kinds, 4) errors of the logarithms over their standard deviations
-    correlated : (kinds,) whether error bars for correlated errors were given
-    identified : (kinds, 6) whether a standard error was
+    converged : bool
+        Whether the solve converged.
+    contains_truth : (K, 7)
+        Share of the intervals that contain the true value, by `COLUMNS`; NaN without interval.
+    scores : (K, 4)
+        Errors of the logarithms, divided by their standard errors.
+    correlated : (K,) bool
+        Whether the standard errors are those of correlated errors.
+    identified : (K, 6) bool
+        Whether there is a standard error.
     """
 
     converged: bool
-    held: Array
+    contains_truth: Array
     scores: Array
     correlated: Array
     identified: Array
@@ -111,7 +126,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     began = time.perf_counter()
-    # Workers start afresh and find one thread each.
+    # Worker processes read these variables when they start: one thread each.
     os.environ |= {
         "OPENBLAS_NUM_THREADS": "1",
         "COLLOCATION_SYSID_THREADS": "1",
@@ -139,8 +154,17 @@ def main() -> None:
 # One twin -------------------------------------------------------------------------------------
 
 
-def run(case: Case, sigma_m: float, seed: Sequence[int]) -> Outcome:
-    """Draw a twin, identify it, and compare with the truth."""
+def run(case: TwinKind, sigma_m: float, seed: Sequence[int]) -> CoverageOutcome:
+    """Draw a twin, identify it, and compare the answer with the truth.
+
+    Parameters
+    ----------
+    case : TwinKind
+    sigma_m : float
+        Standard deviation of the noise [m].
+    seed : sequence of int
+        Seed of the noise and of the nuisance parameters.
+    """
     experiment, x = reference(sigma_m)
     rng = np.random.default_rng(seed)
     collocation, phi = twin(experiment, x, case, sigma_m, rng)
@@ -148,26 +172,37 @@ def run(case: Case, sigma_m: float, seed: Sequence[int]) -> Outcome:
     collocation = solution.collocation
     q = solution.z[: collocation.nq]
     fit = linearise_fit(collocation, solution.z)
-    found = [
+    uncertainties = [
         uncertainty_from_fit(fit, collocation.parameters, q, kind)
-        for kind in KINDS
+        for kind in ERROR_MODELS
     ]
-    wrong = collocation.parameters_from(solution.z)[collocation.nq :] - phi
-    return Outcome(
+    nuisance_errors = (
+        collocation.parameters_from(solution.z)[collocation.nq :] - phi
+    )
+    return CoverageOutcome(
         solution.status.converged,
-        np.array([[*held(each), held_own(each, wrong)] for each in found]),
-        np.array([scores(each, q) for each in found]),
-        np.array([each.errors == "autocorrelated" for each in found]),
-        np.array([identified(each) for each in found]),
+        np.array(
+            [
+                [
+                    *intervals_with_truth(each),
+                    nuisance_coverage(each, nuisance_errors),
+                ]
+                for each in uncertainties
+            ]
+        ),
+        np.array([scores(each, q) for each in uncertainties]),
+        np.array([each.errors == "autocorrelated" for each in uncertainties]),
+        np.array([has_standard_errors(each) for each in uncertainties]),
     )
 
 
 @cache
 def reference(sigma_m: float) -> tuple[Experiment, Array]:
-    """The experiment without noise, and its node positions (T, 3n)."""
+    """Return the experiment without markers measured yet, and its exact node positions (T, 3n) [m]."""
     experiment = hanging_cylinder(LAYERS, STEPS, SCHEME)
     (grasp,) = experiment.grasps
-    # Faster than there: it tells λ five times as well, and errors stay in proportion to the noise.
+    # Faster than in `study_starts`: the standard error of λ is five times smaller, so that errors stay
+    # proportional to the noise.
     poses = swing(
         experiment.t_s,
         amplitude_m=(0.05, 0.04, 0.03),
@@ -189,18 +224,21 @@ def reference(sigma_m: float) -> tuple[Experiment, Array]:
 def twin(
     experiment: Experiment,
     x: Array,
-    case: Case,
+    case: TwinKind,
     sigma_m: float,
     rng: np.random.Generator,
 ) -> tuple[Collocation, Array]:
-    """The identification of one twin, from the truth, and its nuisance parameters φ."""
+    """Return the program of one twin, which starts from the truth, and its true nuisance parameters φ.
+
+    `x` are the exact node positions (T, 3n) [m] from `reference`.
+    """
     experiment = replace(experiment, nuisance=case.nuisance)
     collocation = collocation_of(experiment)
-    drawn = rng.standard_normal(collocation.nphi)
-    followed, p = collocation.follow_estimates(
-        np.append(collocation.parameters.guess_q, drawn)
+    drawn_phi = rng.standard_normal(collocation.nphi)
+    simulated, p = collocation.follow_estimates(
+        np.append(collocation.parameters.guess_q, drawn_phi)
     )
-    (segment,) = followed.transcriptions
+    (segment,) = simulated.transcriptions
     phi = p[collocation.nq :]
     tracks = segment.markers.predict_positions(x, phi)
     noise = sigma_m * noise_of(rng, tracks.shape, case.phi)
@@ -216,48 +254,53 @@ def collocation_of(experiment: Experiment) -> Collocation:
 def noise_of(
     rng: np.random.Generator, shape: tuple[int, ...], phi: float
 ) -> Array:
-    """Noise of unit variance, stationary and autoregressive along the first axis."""
+    """Return stationary noise of unit variance, autoregressive (coefficient `phi`) along the first axis."""
     white = rng.standard_normal(shape)
     white[1:] *= np.sqrt(1 - phi**2)
     return np.asarray(lfilter([1.0], [1.0, -phi], white, axis=0))
 
 
 def truth() -> dict[str, float]:
+    """Return the true values of the four constants, E [Pa] and ν."""
     young_pa, poisson = engineering_constants(
         TRUTH["lambda_pa"], TRUTH["mu_pa"]
     )
     return {**TRUTH, "young_pa": young_pa, "poisson": poisson}
 
 
-def held(uncertainty: Uncertainty) -> list[float]:
-    """One where an interval holds the truth, zero where not, NaN where there is none."""
+def intervals_with_truth(uncertainty: Uncertainty) -> list[float]:
+    """Return for each quantity 1 if the interval contains the truth, 0 if not, NaN without interval."""
     estimates = {**uncertainty.estimates, **uncertainty.derived}
-    found = []
+    contained = []
     for name, value in truth().items():
         interval = estimates[name].statistical95
-        found.append(
+        contained.append(
             np.nan
             if interval is None
             else float(interval[0] <= value <= interval[1])
         )
-    return found
+    return contained
 
 
-def held_own(uncertainty: Uncertainty, wrong: Array) -> float:
-    """Share of the nuisance parameters, off by `wrong`, that are within their intervals."""
-    if not len(wrong):
+def nuisance_coverage(
+    uncertainty: Uncertainty, nuisance_errors: Array
+) -> float:
+    """Return the share of nuisance parameters whose errors are within their intervals; NaN without any."""
+    if not len(nuisance_errors):
         return np.nan
     half = norm.ppf(0.975) * np.array(list(uncertainty.nuisance.values()))
-    return float(np.mean(np.abs(wrong) <= half))
+    return float(np.mean(np.abs(nuisance_errors) <= half))
 
 
 def scores(uncertainty: Uncertainty, q: Array) -> Array:
+    """Return the errors (4,) of the logarithms `q`, divided by their standard errors."""
     return (q - np.log(list(TRUTH.values()))) / np.sqrt(
         np.diag(uncertainty.covariance)
     )
 
 
-def identified(uncertainty: Uncertainty) -> list[bool]:
+def has_standard_errors(uncertainty: Uncertainty) -> list[bool]:
+    """Return for each quantity whether it has a standard error."""
     estimates = {**uncertainty.estimates, **uncertainty.derived}
     return [
         estimates[name].statistical_std_error is not None for name in QUANTITIES
@@ -273,59 +316,66 @@ def header(sigma_m: float, twins: int) -> str:
     return (
         f"{len(experiment.body.nodes_m)} nodes x {len(experiment.t_s)} steps, "
         f"{len(experiment.markers.names)} markers, sigma {1e3 * sigma_m:g} mm; {twins} twins of "
-        f"each case, of which chance keeps a share of {100 * low / twins:.1f}-"
-        f"{100 * high / twins:.1f} % with 95 % probability"
+        f"each case; the coverage of exact intervals is {100 * low / twins:.1f}-"
+        f"{100 * high / twins:.1f} % with a probability of 95 %"
     )
 
 
-def coverage_table(by_case: list[list[Outcome]]) -> str:
-    """Percent of the intervals that hold the truth."""
-    lines = [_line("held [%]", COLUMNS) + "  correlated"]
-    for k, kind in enumerate(KINDS):
+def coverage_table(by_case: list[list[CoverageOutcome]]) -> str:
+    """Return the table of the percentages of intervals that contain the truth, by case and error model."""
+    lines = [_line("coverage [%]", COLUMNS, 9) + "  correlated errors"]
+    for k, kind in enumerate(ERROR_MODELS):
         for case, outcomes in zip(CASES, by_case, strict=True):
             share = shares(outcomes, k)
-            chosen = np.mean([outcome.correlated[k] for outcome in outcomes])
+            correlated_share = np.mean(
+                [outcome.correlated[k] for outcome in outcomes]
+            )
             name = f"{case.name}: {kind.noise}, {kind.errors}"
             lines.append(
-                _line(name, [_marked(s) for s in share])
-                + f"{100 * chosen:10.0f} %"
+                _line(name, [_starred(s) for s in share], 9)
+                + f"{100 * correlated_share:10.0f} %"
             )
     lines.append("")
     for case, outcomes in zip(CASES, by_case, strict=True):
-        lost = sum(not outcome.converged for outcome in outcomes)
-        without = int(
-            np.isnan([outcome.held[0, :-1] for outcome in outcomes]).sum()
+        failures = sum(not outcome.converged for outcome in outcomes)
+        missing_intervals = int(
+            np.isnan(
+                [outcome.contains_truth[0, :-1] for outcome in outcomes]
+            ).sum()
         )
-        vague = 1 - np.mean(
+        not_identified_shares = 1 - np.mean(
             [outcome.identified[0] for outcome in outcomes], axis=0
         )
         lines.append(
-            f"{case.name}: {lost} did not converge, {without} quantities without interval; "
-            "called not identified: "
+            f"{case.name}: {failures} solves did not converge, {missing_intervals} intervals missing; "
+            "without standard error: "
             + ", ".join(
                 f"{c} {100 * v:.0f} %"
-                for c, v in zip(COLUMNS, vague, strict=False)
+                for c, v in zip(COLUMNS, not_identified_shares, strict=False)
             )
         )
     return "\n".join(lines)
 
 
-def shares(outcomes: list[Outcome], kind: int) -> Array:
-    """(7,) share of intervals that hold the truth, by `COLUMNS`; NaN where there are none."""
-    rows = np.array([outcome.held[kind] for outcome in outcomes])
-    there = np.isfinite(rows)
-    counts = there.sum(axis=0)
+def shares(outcomes: list[CoverageOutcome], kind: int) -> Array:
+    """Return the shares (7,) of intervals that contain the truth, by `COLUMNS`; NaN without intervals.
+
+    `kind` is an index of `ERROR_MODELS`.
+    """
+    rows = np.array([outcome.contains_truth[kind] for outcome in outcomes])
+    has_interval = np.isfinite(rows)
+    counts = has_interval.sum(axis=0)
     return np.where(
         counts > 0,
-        np.where(there, rows, 0).sum(axis=0) / np.maximum(counts, 1),
+        np.where(has_interval, rows, 0).sum(axis=0) / np.maximum(counts, 1),
         np.nan,
     )
 
 
-def score_table(by_case: list[list[Outcome]]) -> str:
-    """Mean and standard deviation of the scores."""
-    lines = [_line("scores", COLUMNS[:4], 14)]
-    for k, kind in enumerate(KINDS):
+def score_table(by_case: list[list[CoverageOutcome]]) -> str:
+    """Return the table of mean ± standard deviation of the scores, by case and error model."""
+    lines = [_line("error / standard error", COLUMNS[:4], 14)]
+    for k, kind in enumerate(ERROR_MODELS):
         for case, outcomes in zip(CASES, by_case, strict=True):
             rows = np.array([outcome.scores[k] for outcome in outcomes])
             mean = np.nanmean(rows, axis=0)
@@ -340,10 +390,10 @@ def score_table(by_case: list[list[Outcome]]) -> str:
     return "\n".join(lines)
 
 
-def _marked(share: float) -> str:
+def _starred(share: float) -> str:
     if np.isnan(share):
         return "-"
-    return f"{100 * share:.1f}{' ' if ACCEPTED[0] <= share <= ACCEPTED[1] else '*'}"
+    return f"{100 * share:.1f}{' ' if ACCEPTED_COVERAGE[0] <= share <= ACCEPTED_COVERAGE[1] else '*'}"
 
 
 def _line(name: str, cells: Sequence[str], width: int = 7) -> str:

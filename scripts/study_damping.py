@@ -29,6 +29,7 @@ from collocation_sysid.recording import (
     PoseSequence,
 )
 
+# Edges [m], numbers of elements and density of the foam bar.
 SIZE_M = (0.03, 0.03, 0.15)
 DIVISIONS = (1, 1, 5)
 DENSITY_KG_M3 = 100.0
@@ -39,9 +40,12 @@ TRUTH = {
     "gamma_m_1_s": 0.5,
 }
 GUESS = {name: Unknown(guess=1.5 * value) for name, value in TRUTH.items()}
+# Sampling interval and duration of the recording [s].
 STEP_S = 0.005
 TIME_S = 1.5
+# Standard deviation of each marker coordinate [m].
 NOISE_M = 3e-4
+# Frequency of the rotation [Hz].
 TURN_HZ = 1.5
 LAWS = ("kelvin-voigt", "rayleigh")
 
@@ -58,16 +62,19 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     for speed in arguments.speeds:
-        measured = swung(speed, arguments.seed)
+        measured = swung_recording(speed, arguments.seed)
         for law in LAWS:
             print(
-                f"{speed:4.1f} rad/s, fitted with {law}: {fitted(measured, law)}",
+                f"{speed:4.1f} rad/s, fitted with {law}: {fit_report(measured, law)}",
                 flush=True,
             )
 
 
-def swung(speed_rad_s: float, seed: int) -> Experiment:
-    """The bar, held at one end, turned to and fro about two axes at this speed at most."""
+def swung_recording(speed_rad_s: float, seed: int) -> Experiment:
+    """Return a noisy recording of a bar, clamped at one end and turned to and fro about two axes.
+
+    `speed_rad_s` is the largest angular speed about the first axis.
+    """
     t_s = STEP_S * np.arange(round(TIME_S / STEP_S) + 1, dtype=np.float64)
     angle = (
         speed_rad_s
@@ -75,20 +82,20 @@ def swung(speed_rad_s: float, seed: int) -> Experiment:
         * (1 - np.cos(2 * np.pi * TURN_HZ * t_s))
     )
     tilt = 0.5 * np.sin(2 * np.pi * 1.1 * t_s) ** 2
-    turns = Rotation.from_rotvec(
+    rotations = Rotation.from_rotvec(
         np.outer(angle, [1, 0, 0]) + np.outer(tilt, [0, 1, 0])
     )
     body = bar("kelvin-voigt")
-    held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
+    clamped_nodes = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
     places = body.nodes_m[body.nodes_m[:, 2] > 0.05][::3]
     markers = Markers(
         t_s, np.zeros((len(t_s), len(places), 3)), NOISE_M, places_m=places
     )
-    poses = PoseSequence(t_s, np.zeros((len(t_s), 3)), turns.as_quat())
+    poses = PoseSequence(t_s, np.zeros((len(t_s), 3)), rotations.as_quat())
     experiment = Experiment(
         body,
         t_s,
-        [Grasp(held, poses)],
+        [Grasp(clamped_nodes, poses)],
         markers,
         name="swing",
         nuisance=Nuisance.none(),
@@ -99,35 +106,35 @@ def swung(speed_rad_s: float, seed: int) -> Experiment:
 
 
 def bar(law: str) -> Body:
-    """A foam bar under a damping law."""
+    """Return a foam bar with a damping law."""
     return Body(
         box_mesh(SIZE_M, DIVISIONS), density_kg_m3=DENSITY_KG_M3, damping=law
     )
 
 
-def fitted(measured: Experiment, law: str) -> str:
+def fit_report(measured: Experiment, law: str) -> str:
     """Fit a recording with a damping law, and return its errors in one line, then the verdict."""
     body = bar(law)
     markers = replace(measured.markers, placement=None)
-    found = run(
+    answer = run(
         Problem(
             [replace(measured, body=body, markers=markers)], GUESS, substeps=1
         )
     )
-    said = []
+    errors = []
     for name, truth in TRUTH.items():
-        estimate = found.estimates[name]
-        said.append(f"{name} {100 * (estimate.value / truth - 1):+.1f} %")
+        estimate = answer.estimates[name]
+        errors.append(f"{name} {100 * (estimate.value / truth - 1):+.1f} %")
         if estimate.statistical_std_error:
-            said[-1] += (
+            errors[-1] += (
                 f" ({(estimate.value - truth) / estimate.statistical_std_error:+.1f} σ)"
             )
     lines = [
-        ", ".join(said),
-        f"verdict {found.trust.verdict}",
-        *found.trust.reasons,
+        ", ".join(errors),
+        f"verdict {answer.trust.verdict}",
+        *answer.trust.reasons,
     ]
-    return "\n    ".join([*lines, *found.all_notes])
+    return "\n    ".join([*lines, *answer.all_notes])
 
 
 if __name__ == "__main__":

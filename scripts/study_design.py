@@ -1,11 +1,12 @@
-"""Does a designed motion tell what it is predicted to? The shipped swing against designed ones.
+"""Standard errors of designed motions: predictions, and the spread of the estimates of twins.
 
     python scripts/study_design.py [--twins 100] [--duration 0.4] [--limits FILE] [--for NAMES]
 
-The foam cylinder's own swing, at the truth, against a motion designed at equal duration, within
-the swing's own ranges, speeds and accelerations or within those of a file. Then twins: the designed
-motion is simulated, gets noise (and nuisance parameters drawn from their priors, where there are
-any) and is identified; the spread of the answers is compared with the prediction.
+The swing of the shipped foam cylinder is compared, at the true parameters, with a motion that is
+designed for the same duration, within the ranges, speeds and accelerations of this swing or of a
+file. For twins the designed motion is simulated with noise (and with nuisance parameters drawn from
+their priors, if there are any) and identified; the spread of the estimates is compared with the
+prediction.
 """
 
 from __future__ import annotations
@@ -29,9 +30,10 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import Nuisance
+from collocation_sysid.recording import Experiment, Nuisance
 from collocation_sysid.statistics.linearised import DerivedModuli
 
+# Time step for the numerical derivatives of the swing [s].
 FINE_S = 1e-4
 
 
@@ -52,28 +54,36 @@ def main() -> None:
         "--nuisance", choices=("none", "default"), default="none"
     )
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    problem = cylinder(given.duration, given.nuisance, given.substeps)
-    limits = Limits.read(given.limits) if given.limits else own_limits()
-    names = tuple(given.names.split(",")) if given.names else ()
-    options = DesignOptions(
-        given.evaluations, pairs=0, waves=given.waves, seed=given.seed
+    arguments = parser.parse_args()
+    problem = cylinder(
+        arguments.duration, arguments.nuisance, arguments.substeps
     )
-    found = design_motion(
+    limits = Limits.read(arguments.limits) if arguments.limits else own_limits()
+    names = tuple(arguments.names.split(",")) if arguments.names else ()
+    options = DesignOptions(
+        arguments.evaluations,
+        pairs=0,
+        waves=arguments.waves,
+        seed=arguments.seed,
+    )
+    design = design_motion(
         problem,
         limits,
-        given.duration,
+        arguments.duration,
         DesignCriterion("worst", names),
         options,
         say=print,
     )
-    print(table(found), features(found), sep="\n\n", flush=True)
-    if given.twins:
-        print("", spread(found, given.twins, given.seed), sep="\n")
+    print(table(design), features(design), sep="\n\n", flush=True)
+    if arguments.twins:
+        print("", spread(design, arguments.twins, arguments.seed), sep="\n")
 
 
 def cylinder(duration_s: float, nuisance: str, substeps: int) -> Problem:
-    """The shipped problem at the truth, moved by its swing for so long."""
+    """Return the shipped problem with the truth as guess, and with its swing for `duration_s` [s].
+
+    `nuisance` is "default" or "none".
+    """
     guesses = [
         f"parameters.{name}.guess={value}" for name, value in TRUTH.items()
     ]
@@ -83,27 +93,30 @@ def cylinder(duration_s: float, nuisance: str, substeps: int) -> Problem:
     (grasp,) = experiment.grasps
     step_s = experiment.timestep_s
     t_s = np.arange(round(duration_s / step_s) + 1) * step_s
-    swung = replace(SWING, duration_s=duration_s).poses(step_s / 4)
-    unseen = np.zeros((len(t_s), len(experiment.markers.names), 3))
-    longer = replace(
+    swing_poses = replace(SWING, duration_s=duration_s).poses(step_s / 4)
+    no_tracks = np.zeros((len(t_s), len(experiment.markers.names), 3))
+    longer_experiment = replace(
         experiment,
         t_s=t_s,
-        grasps=(replace(grasp, poses=swung),),
-        markers=replace(experiment.markers, t_s=t_s, positions_m=unseen),
+        grasps=(replace(grasp, poses=swing_poses),),
+        markers=replace(experiment.markers, t_s=t_s, positions_m=no_tracks),
         nuisance=Nuisance() if nuisance == "default" else Nuisance.none(),
     )
     return Problem(
-        [longer], shipped.parameters, scheme=shipped.scheme, substeps=substeps
+        [longer_experiment],
+        shipped.parameters,
+        scheme=shipped.scheme,
+        substeps=substeps,
     )
 
 
 def own_limits() -> Limits:
-    """Ranges, speeds and accelerations of the shipped swing. Its hand is the body's origin."""
+    """Return the ranges, speeds and accelerations of the shipped swing, of the origin of the body."""
     poses = SWING.poses(FINE_S)
-    place = poses.positions_m
-    turns = Rotation.from_quat(poses.quaternions_xyzw)
-    speed = np.gradient(place, FINE_S, axis=0)
-    angular = (turns[1:] * turns[:-1].inv()).as_rotvec() / FINE_S
+    positions_m = poses.positions_m
+    rotations = Rotation.from_quat(poses.quaternions_xyzw)
+    speed = np.gradient(positions_m, FINE_S, axis=0)
+    angular = (rotations[1:] * rotations[:-1].inv()).as_rotvec() / FINE_S
 
     def largest(vectors: np.ndarray) -> float:
         return float(np.linalg.norm(vectors[2:-2], axis=1).max())
@@ -112,14 +125,17 @@ def own_limits() -> Limits:
         return float(np.degrees(largest(vectors)))
 
     low, high = (
-        tuple(side.tolist()) for side in (place.min(axis=0), place.max(axis=0))
+        tuple(side.tolist())
+        for side in (positions_m.min(axis=0), positions_m.max(axis=0))
     )
     return Limits.model_validate(
         {
             "workspace_m": (low, high),
             "speed_m_s": largest(speed),
             "acceleration_m_s2": largest(np.gradient(speed, FINE_S, axis=0)),
-            "rotation_deg": in_degrees((turns * turns[0].inv()).as_rotvec()),
+            "rotation_deg": in_degrees(
+                (rotations * rotations[0].inv()).as_rotvec()
+            ),
             "angular_speed_deg_s": in_degrees(angular),
             "angular_acceleration_deg_s2": in_degrees(
                 np.gradient(angular, FINE_S, axis=0)
@@ -128,19 +144,22 @@ def own_limits() -> Limits:
     )
 
 
-def table(found: Design) -> str:
-    """Relative error bars of both motions."""
-    assert found.before is not None
-    lines = [f"limits {found.limits!r}", f"shares used {found.shares}"]
-    lines.append("|  | swing % | designed % | ratio |\n|---|---|---|---|")
-    for name, after in found.after.relative.items():
-        before = found.before.relative[name]
+def table(design: Design) -> str:
+    """Return the table of the relative standard errors with the swing and with the designed motion."""
+    assert design.before is not None
+    lines = [f"limits {design.limits!r}", f"shares used {design.shares}"]
+    lines.append(
+        "| standard error of | with the swing, % | with the designed motion, % | ratio |\n|---|---|---|---|"
+    )
+    for name, after in design.after.compute_relative().items():
+        before = design.before.compute_relative()[name]
         lines.append(
             f"| {name} | {100 * before:.3g} | {100 * after:.3g} | {before / after:.2f} |"
         )
-    free = [item.name for item in found.recording.problem.parameters.free]
+    free = [item.name for item in design.recording.problem.parameters.free]
     before, after = (
-        max(b.relative[n] for n in free) for b in (found.before, found.after)
+        max(b.compute_relative()[n] for n in free)
+        for b in (design.before, design.after)
     )
     lines.append(
         f"| worst | {100 * before:.3g} | {100 * after:.3g} | {before / after:.2f} |"
@@ -148,31 +167,33 @@ def table(found: Design) -> str:
     return "\n".join(lines)
 
 
-def features(found: Design) -> str:
+def features(design: Design) -> str:
     """Return a table of the RMS acceleration along each coordinate, and its mean frequency.
 
     Rotations and shifts are in the axes of the body at the start: along the cylinder, and across.
     """
-    motion = found.motion
-    (rotation, _) = found.recording.start_pose
+    motion = design.motion
+    (rotation, _) = design.recording.start_pose
     place, rate, growth = motion.derivatives(motion.grid_s)
     lines = [
-        "|  | RMS | RMS acceleration | frequency Hz |",
+        "| motion | RMS | RMS acceleration | mean frequency, Hz |",
         "|---|---|---|---|",
     ]
     for kind, columns, unit in (
         ("shift", slice(3), "m"),
         ("turn", slice(3, 6), "rad"),
     ):
-        own = [each[:, columns] @ rotation for each in (place, rate, growth)]
+        body_axes = [
+            each[:, columns] @ rotation for each in (place, rate, growth)
+        ]
         for name, axes in (("along", [2]), ("across", [0, 1])):
-            size, speed, most = (
+            size, speed, acceleration = (
                 float(np.sqrt(np.mean(np.sum(e[:, axes] ** 2, axis=1))))
-                for e in own
+                for e in body_axes
             )
             lines.append(
-                f"| {kind} {name} | {size:.4f} {unit} | {most:.3g} {unit}/s² | "
-                f"{most / max(speed, 1e-300) / (2 * np.pi):.2f} |"
+                f"| {kind} {name} | {size:.4f} {unit} | {acceleration:.3g} {unit}/s² | "
+                f"{acceleration / max(speed, 1e-300) / (2 * np.pi):.2f} |"
             )
     return "\n".join(
         [*lines, f"window {motion.active_s:.3g} of {motion.duration_s:.3g} s"]
@@ -182,19 +203,20 @@ def features(found: Design) -> str:
 # Twins --------------------------------------------------------------------------------------------
 
 
-def spread(found: Design, twins: int, seed: int) -> str:
-    """Standard deviations of the twins' answers over the predicted ones."""
+def spread(design: Design, twins: int, seed: int) -> str:
+    """Return the table of the standard deviations of the estimates of twins over the predicted ones."""
     rng = np.random.default_rng(seed)
-    answers = [twin(found, rng) for _ in range(twins)]
-    good = [each for each in answers if each is not None]
-    lines = [f"{twins - len(good)} of {twins} twins did not converge"]
+    answers = [twin(design, rng) for _ in range(twins)]
+    converged = [each for each in answers if each is not None]
+    lines = [f"{twins - len(converged)} of {twins} twins did not converge"]
     lines.append(
-        "|  | predicted % | spread % | ratio | bias % |\n|---|---|---|---|---|"
+        "| parameter | predicted standard error, % | standard deviation of estimates, % "
+        "| ratio | bias, % |\n|---|---|---|---|---|"
     )
-    for name, predicted in found.after.relative.items():
-        logarithms = np.log([each[name] for each in good])
+    for name, predicted in design.after.compute_relative().items():
+        logarithms = np.log([each[name] for each in converged])
         deviation = logarithms.std(ddof=1)
-        bias = logarithms.mean() - np.log(found.after.values[name])
+        bias = logarithms.mean() - np.log(design.after.values[name])
         lines.append(
             f"| {name} | {100 * predicted:.3g} | {100 * deviation:.3g} | "
             f"{deviation / predicted:.3f} | {100 * bias:.2g} |"
@@ -202,27 +224,33 @@ def spread(found: Design, twins: int, seed: int) -> str:
     return "\n".join(lines)
 
 
-def twin(found: Design, rng: np.random.Generator) -> dict[str, float] | None:
-    """The answer for one recording of the designed motion; None where there is none."""
-    problem = found.recording.problem
-    experiment = found.experiment
-    options = (
-        problem.parameters,
-        problem.scheme,
-        problem.choose_first_substeps(),
-    )
-    (segment,) = Collocation([experiment], *options).transcriptions
+def twin(design: Design, rng: np.random.Generator) -> dict[str, float] | None:
+    """Return the estimates from one twin of the designed motion; None if the solve does not converge."""
+    problem = design.recording.problem
+    experiment = design.experiment
+
+    def collocation_of(recording: Experiment) -> Collocation:
+        return Collocation(
+            [recording],
+            problem.parameters,
+            problem.scheme,
+            problem.choose_first_substeps(),
+        )
+
+    (segment,) = collocation_of(experiment).transcriptions
     phi = segment.compute_guess_phi() + rng.normal(size=segment.nuisance.size)
     values = problem.parameters.guesses
-    _, scheme, substeps = options
-    actual = simulate(
-        segment.corrected_experiment(phi), values, scheme, substeps=substeps
+    motion = simulate(
+        segment.corrected_experiment(phi),
+        values,
+        problem.scheme,
+        substeps=problem.choose_first_substeps(),
     )
-    tracks = segment.markers.predict_samples(actual.positions_m, phi)
+    tracks = segment.markers.predict_samples(motion.positions_m, phi)
     noise = experiment.markers.sigma_m[:, None] * rng.normal(size=tracks.shape)
-    seen = with_markers(experiment, tracks + noise)
+    noisy_recording = with_markers(experiment, tracks + noise)
     solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(
-        Collocation([seen], *options)
+        collocation_of(noisy_recording)
     )
     if not solution.status.converged:
         return None

@@ -22,12 +22,18 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from assumed_twins import wrong
+from assumed_twins import with_wrong_assumptions
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
-from study_coverage import QUANTITIES, SCHEME, held, reference, truth
+from study_coverage import (
+    QUANTITIES,
+    SCHEME,
+    intervals_with_truth,
+    reference,
+    truth,
+)
 from study_starts import TRUTH, parameters
 
 from collocation_sysid import Problem
@@ -57,37 +63,44 @@ from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_at
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator
-# The truth with its tracks, before noise, and what the user states.
-Pair = tuple[Experiment, Experiment]
+# The true recording with its exact tracks, and the recording as the problem describes it.
+TrueAndStated = tuple[Experiment, Experiment]
 
+# Standard deviation of each marker coordinate [m].
 SIGMA_M = 1e-3
 COLUMNS = ("λ", "μ", "γ_r", "γ_m", "E", "ν")
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
-    """One twin.
+class FaultOutcome:
+    """Results of one twin, by quantity (`QUANTITIES`).
 
     Attributes
     ----------
-    held : (6,) one where an interval holds the truth, zero where not, NaN without one
-    whole : (6,) the same of the whole interval
-    relative : (6,) standard errors over the true values, NaN where there is none
-    without : (6,) standard errors without nuisance parameters over the true values, or NaN
+    converged : bool
+        Whether the solve converged.
+    contains_truth : (6,)
+        1 if the statistical interval contains the truth, 0 if not, NaN without interval.
+    combined_contains_truth : (6,)
+        As `contains_truth`, for the combined interval.
+    relative : (6,)
+        Standard errors over the true values; NaN without standard error.
+    without : (6,)
+        As `relative`, of a fit without nuisance parameters; NaN in twins with an error.
     correlated : bool
-        Whether error bars are for correlated errors.
+        Whether the standard errors are those of correlated errors.
     """
 
     converged: bool
-    held: Array
-    whole: Array
+    contains_truth: Array
+    combined_contains_truth: Array
     relative: Array
     without: Array
     correlated: bool
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class BudgetedFit:
     """Error bars and budget of one twin's fit, and whether the fit converged."""
 
     uncertainty: Uncertainty
@@ -104,7 +117,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1, help="processes")
     arguments = parser.parse_args()
-    # Workers start afresh and find one thread each.
+    # Worker processes read these variables when they start: one thread each.
     os.environ |= {
         "OPENBLAS_NUM_THREADS": "1",
         "COLLOCATION_SYSID_THREADS": "1",
@@ -131,34 +144,36 @@ def main() -> None:
 # One twin -----------------------------------------------------------------------------------------
 
 
-def run(fault: str, seed: Sequence[int]) -> Outcome:
-    """Draw a twin, identify it, and compare with the truth."""
+def run(fault: str, seed: Sequence[int]) -> FaultOutcome:
+    """Draw a twin with a fault (a key of `FAULTS`), identify it, and compare the answer with the truth."""
     rng = np.random.default_rng(seed)
-    actual, stated = FAULTS[fault](measured(), rng)
-    tracks = actual.markers.positions_m
-    tracks = tracks + actual.markers.sigma_m[:, None] * rng.standard_normal(
-        tracks.shape
+    true_recording, described = FAULTS[fault](exact_recording(), rng)
+    tracks = true_recording.markers.positions_m
+    tracks = tracks + true_recording.markers.sigma_m[
+        :, None
+    ] * rng.standard_normal(tracks.shape)
+    uncertainty, combined_contains_truth, converged = identified(
+        with_markers(described, tracks), ROWS.get(fault, ())
     )
-    found, whole, converged = identified(
-        with_markers(stated, tracks), ROWS.get(fault, ())
-    )
-    without = np.full(len(QUANTITIES), np.nan)
-    if actual is stated:
-        ideal = replace(with_markers(stated, tracks), nuisance=Nuisance.none())
-        without = relative_errors(identified(ideal)[0])
-    return Outcome(
+    errors_without_nuisance = np.full(len(QUANTITIES), np.nan)
+    if true_recording is described:
+        ideal = replace(
+            with_markers(described, tracks), nuisance=Nuisance.none()
+        )
+        errors_without_nuisance = relative_errors(identified(ideal)[0])
+    return FaultOutcome(
         converged,
-        np.array(held(found)),
-        whole,
-        relative_errors(found),
-        without,
-        found.errors == "autocorrelated",
+        np.array(intervals_with_truth(uncertainty)),
+        combined_contains_truth,
+        relative_errors(uncertainty),
+        errors_without_nuisance,
+        uncertainty.errors == "autocorrelated",
     )
 
 
 @cache
-def measured() -> Experiment:
-    """The experiment with its tracks, without noise, and with the default nuisance parameters."""
+def exact_recording() -> Experiment:
+    """Return the experiment with exact tracks and with the default nuisance parameters."""
     experiment = replace(reference(SIGMA_M)[0], nuisance=Nuisance())
     return with_markers(
         experiment, experiment.markers.predict_positions(positions_m())
@@ -166,7 +181,7 @@ def measured() -> Experiment:
 
 
 def positions_m() -> Array:
-    """(T, n, 3) of its nodes."""
+    """Return the exact node positions (T, n, 3) of the experiment [m]."""
     _, x = reference(SIGMA_M)
     return x.reshape(len(x), -1, 3)
 
@@ -174,20 +189,36 @@ def positions_m() -> Array:
 def identified(
     experiment: Experiment, assumed: Sequence[Assumption] = ()
 ) -> tuple[Uncertainty, Array, bool]:
-    """With every option left to its default, from the truth."""
-    fit = fitted(experiment, assumed)
+    """Identify an experiment with default options, starting from the truth.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    assumed : sequence of Assumption
+        Rows of the uncertainty budget.
+
+    Returns
+    -------
+    uncertainty : Uncertainty
+    combined_contains_truth : (6,) array
+        1 if the combined interval contains the truth, 0 if not, NaN without interval.
+    converged : bool
+    """
+    fit = fit_from_truth(experiment, assumed)
     true = truth()
     lines = fit.lines
-    whole = [
+    combined_contains_truth = [
         float(lines[n].combined95[0] <= true[n] <= lines[n].combined95[1])
         if n in lines
         else np.nan
         for n in QUANTITIES
     ]
-    return fit.uncertainty, np.array(whole), fit.converged
+    return fit.uncertainty, np.array(combined_contains_truth), fit.converged
 
 
-def fitted(experiment: Experiment, assumed: Sequence[Assumption]) -> Fit:
+def fit_from_truth(
+    experiment: Experiment, assumed: Sequence[Assumption]
+) -> BudgetedFit:
     """Return the fit of an experiment from the truth, with a budget of some assumptions."""
     problem = Problem([experiment], parameters(np.array(list(TRUTH.values()))))
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
@@ -201,11 +232,12 @@ def fitted(experiment: Experiment, assumed: Sequence[Assumption]) -> Fit:
         fit, changes, collocation.parameters, solution.q, found
     )
     lines = budget(sources, found, {}, problem.parameters)
-    return Fit(found, lines, solution.status.converged)
+    return BudgetedFit(found, lines, solution.status.converged)
 
 
-def relative_errors(found: Uncertainty) -> Array:
-    estimates = {**found.estimates, **found.derived}
+def relative_errors(uncertainty: Uncertainty) -> Array:
+    """Return the standard errors (6,) over the true values; NaN without standard error."""
+    estimates = {**uncertainty.estimates, **uncertainty.derived}
     true = truth()
     errors = [estimates[name].statistical_std_error for name in QUANTITIES]
     return np.array([np.nan if e is None else e for e in errors]) / [
@@ -213,43 +245,43 @@ def relative_errors(found: Uncertainty) -> Array:
     ]
 
 
-# Faults -------------------------------------------------------------------------------------------
+# Faults: each returns the true recording, and the recording as the problem describes it -----------
 
 
-def faultless(experiment: Experiment, rng: Generator) -> Pair:
+def without_fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
     return experiment, experiment
 
 
-def late(late_s: float) -> Callable[..., Pair]:
-    """The markers' clock is late; the body rests before the start."""
+def late(late_s: float) -> Callable[..., TrueAndStated]:
+    """Return a fault by which the marker clock is late by `late_s` [s]; before the start the body rests."""
 
-    def fault(experiment: Experiment, rng: Generator) -> Pair:
+    def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
         tracks = CubicSpline(experiment.t_s, experiment.markers.positions_m)
-        seen = tracks(np.maximum(experiment.t_s - late_s, 0.0))
-        return with_markers(experiment, seen), experiment
+        delayed_tracks_m = tracks(np.maximum(experiment.t_s - late_s, 0.0))
+        return with_markers(experiment, delayed_tracks_m), experiment
 
     return fault
 
 
 def noisy_poses(
-    size_m: float, degrees: float, stated: bool
-) -> Callable[..., Pair]:
-    """Every pose has noise of its own."""
+    size_m: float, degrees: float, is_stated: bool
+) -> Callable[..., TrueAndStated]:
+    """Return a fault by which poses have independent noise, which the problem states or not."""
     size_rad = np.radians(degrees)
 
-    def fault(experiment: Experiment, rng: Generator) -> Pair:
+    def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
         (grasp,) = experiment.grasps
         poses = grasp.poses
-        turns = Rotation.from_rotvec(
+        rotations = Rotation.from_rotvec(
             size_rad * rng.standard_normal((len(poses.t_s), 3))
         )
         noisy = PoseSequence(
             poses.t_s,
             poses.positions_m
             + size_m * rng.standard_normal(poses.positions_m.shape),
-            (turns * Rotation.from_quat(poses.quaternions_xyzw)).as_quat(),
+            (rotations * Rotation.from_quat(poses.quaternions_xyzw)).as_quat(),
         )
-        sigmas = {"sigma_m": size_m, "sigma_rad": size_rad} if stated else {}
+        sigmas = {"sigma_m": size_m, "sigma_rad": size_rad} if is_stated else {}
         return experiment, replace(
             experiment, grasps=(Grasp(grasp.nodes, noisy, **sigmas),)
         )
@@ -257,46 +289,51 @@ def noisy_poses(
     return fault
 
 
-def tilted(experiment: Experiment, rng: Generator) -> Pair:
-    """Gravity is off by 1° about both axes."""
+def tilted(experiment: Experiment, rng: Generator) -> TrueAndStated:
+    """Return a recording whose gravity is tilted by random angles of about 1° about x and y."""
     angles = np.radians(rng.standard_normal(2))
     down = np.array([*angles, -1.0])
     gravity_m_s2 = 9.81 * down / np.linalg.norm(down)
-    tilt = replace(experiment, gravity_m_s2=tuple(gravity_m_s2.tolist()))
-    return simulated(tilt), experiment
+    tilted_gravity = replace(
+        experiment, gravity_m_s2=tuple(gravity_m_s2.tolist())
+    )
+    return simulated(tilted_gravity), experiment
 
 
-def off_in_gripper(experiment: Experiment, rng: Generator) -> Pair:
-    """The body is off in the gripper by 1 mm and 0.5° an axis."""
+def misplaced_in_gripper(
+    experiment: Experiment, rng: Generator
+) -> TrueAndStated:
+    """Return a recording of a body that is misplaced in the gripper by 1 mm and 0.5° per axis."""
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_rotvec(
         np.radians(0.5) * rng.standard_normal(3)
     ).as_matrix()
     matrix[:3, 3] = 1e-3 * rng.standard_normal(3)
     (grasp,) = experiment.grasps
-    moved = Grasp(grasp.nodes, grasp.poses.after(matrix))
-    return simulated(replace(experiment, grasps=(moved,))), experiment
+    shifted_grasp = Grasp(grasp.nodes, grasp.poses.after(matrix))
+    return simulated(replace(experiment, grasps=(shifted_grasp,))), experiment
 
 
 def simulated(experiment: Experiment) -> Experiment:
+    """Return the experiment with exact simulated tracks."""
     return with_markers(
         experiment, simulate(experiment, TRUTH, SCHEME, substeps=1).markers_m
     )
 
 
-def claiming(factor: float) -> Callable[..., Pair]:
-    """sigma_m is stated as this many times the truth."""
+def with_stated_sigma(factor: float) -> Callable[..., TrueAndStated]:
+    """Return a fault by which the stated sigma_m is `factor` times the truth."""
 
-    def fault(experiment: Experiment, rng: Generator) -> Pair:
+    def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
         markers = experiment.markers
-        claimed = replace(markers, sigma_m=factor * markers.sigma_m)
-        return experiment, replace(experiment, markers=claimed)
+        stated_markers = replace(markers, sigma_m=factor * markers.sigma_m)
+        return experiment, replace(experiment, markers=stated_markers)
 
     return fault
 
 
-def loose(experiment: Experiment, rng: Generator) -> Pair:
-    """The first marker is three times as noisy."""
+def with_noisy_marker(experiment: Experiment, rng: Generator) -> TrueAndStated:
+    """Return a recording whose first marker has three times the stated noise."""
     sigma_m = experiment.markers.sigma_m.copy()
     sigma_m[0] *= 3
     return replace(
@@ -304,24 +341,25 @@ def loose(experiment: Experiment, rng: Generator) -> Pair:
     ), experiment
 
 
-def misplaced(experiment: Experiment, rng: Generator) -> Pair:
-    """Every marker sits 1 mm an axis off its place."""
+def misplaced(experiment: Experiment, rng: Generator) -> TrueAndStated:
+    """Return a recording whose markers are misplaced on the body by 1 mm per axis."""
     places_m = experiment.markers.predict_positions(experiment.body.nodes_m)
-    moved = at_places(
+    with_true_places = at_places(
         experiment, places_m + 1e-3 * rng.standard_normal(places_m.shape)
     )
     return with_markers(
-        experiment, moved.markers.predict_positions(positions_m())
+        experiment, with_true_places.markers.predict_positions(positions_m())
     ), experiment
 
 
-def unplaced(experiment: Experiment, rng: Generator) -> Pair:
-    """Nobody knows where the markers sit."""
+def unplaced(experiment: Experiment, rng: Generator) -> TrueAndStated:
+    """Return a description in which the places of the markers are unknown."""
     places_m = np.full((len(experiment.markers.names), 3), np.nan)
     return experiment, at_places(experiment, places_m)
 
 
 def at_places(experiment: Experiment, places_m: Array) -> Experiment:
+    """Return the experiment with markers at other places (M, 3) on the body [m]; NaN if unknown."""
     markers = replace(
         experiment.markers,
         placement=None,
@@ -332,21 +370,23 @@ def at_places(experiment: Experiment, places_m: Array) -> Experiment:
     return replace(experiment, markers=markers)
 
 
-def drawn(names: Sequence[str]) -> Callable[..., Pair]:
+def draw_assumption_errors(
+    names: Sequence[str],
+) -> Callable[..., TrueAndStated]:
     """Return a fault that draws deviations from the named assumptions, each at its standard deviation."""
 
-    def fault(experiment: Experiment, rng: Generator) -> Pair:
-        off = {}
+    def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
+        errors = {}
         for row in (row for row in ASSUMPTIONS if row.name in names):
-            for name in row.list_components():
-                size = (row.sigma or 0.0) * rng.standard_normal()
-                # No coefficient of the air is below zero.
-                off[name] = max(size, -0.99) if row.name in AIR else size
+            for name in row.components:
+                error = (row.sigma or 0.0) * rng.standard_normal()
+                # Coefficients of the air are not negative.
+                errors[name] = max(error, -0.99) if row.name in AIR else error
         values = {
             name: truth()[name]
             for name in ("young_pa", "poisson", *list(TRUTH)[2:])
         }
-        return wrong(experiment, values, off), experiment
+        return with_wrong_assumptions(experiment, values, errors), experiment
 
     return fault
 
@@ -363,7 +403,7 @@ SINGLE = (
     ),
     *AIR,
 )
-# What a budget has of each fault.
+# Names of the assumptions that are wrong in each fault, and the rows of the budget for them.
 ASSUMED = {f"assumed: {name}": (name,) for name in SINGLE}
 ASSUMED |= {"assumed: air": AIR, "assumed: all of these": SINGLE}
 ROWS = {
@@ -371,80 +411,94 @@ ROWS = {
     for f, names in ASSUMED.items()
 }
 
-FAULTS: dict[str, Callable[[Experiment, Generator], Pair]] = {
-    "none": faultless,
+FAULTS: dict[str, Callable[[Experiment, Generator], TrueAndStated]] = {
+    "none": without_fault,
     "clock 2 ms late": late(0.002),
-    "poses 0.5 mm, 0.3°, given": noisy_poses(5e-4, 0.3, stated=True),
-    "poses 0.5 mm, 0.3°, judged": noisy_poses(5e-4, 0.3, stated=False),
-    "poses 0.1 mm, 0.06°, given": noisy_poses(1e-4, 0.06, stated=True),
-    "poses 0.1 mm, 0.06°, judged": noisy_poses(1e-4, 0.06, stated=False),
+    "poses 0.5 mm, 0.3°, given": noisy_poses(5e-4, 0.3, is_stated=True),
+    "poses 0.5 mm, 0.3°, judged": noisy_poses(5e-4, 0.3, is_stated=False),
+    "poses 0.1 mm, 0.06°, given": noisy_poses(1e-4, 0.06, is_stated=True),
+    "poses 0.1 mm, 0.06°, judged": noisy_poses(1e-4, 0.06, is_stated=False),
     "gravity 1°": tilted,
-    "in the gripper 1 mm, 0.5°": off_in_gripper,
-    "sigma_m 0.3 of the truth": claiming(0.3),
-    "one marker 3 times as noisy": loose,
+    "in the gripper 1 mm, 0.5°": misplaced_in_gripper,
+    "sigma_m 0.3 of the truth": with_stated_sigma(0.3),
+    "one marker 3 times as noisy": with_noisy_marker,
     "places 1 mm": misplaced,
     "places not known": unplaced,
-} | {fault: drawn(names) for fault, names in ASSUMED.items()}
+} | {fault: draw_assumption_errors(names) for fault, names in ASSUMED.items()}
 
 
 # Table --------------------------------------------------------------------------------------------
 
 
 def header(twins: int) -> str:
-    experiment = measured()
+    experiment = exact_recording()
     low, high = binom.interval(0.95, twins, 0.95)
     return (
         f"{len(experiment.body.nodes_m)} nodes x {len(experiment.t_s)} steps, "
         f"{len(experiment.markers.names)} markers, sigma {1e3 * SIGMA_M:g} mm; {twins} twins of "
-        f"each fault, of which chance keeps a share of {100 * low / twins:.1f}-"
-        f"{100 * high / twins:.1f} % with 95 % probability (* is beyond)"
+        f"each fault; the coverage of exact intervals is {100 * low / twins:.1f}-"
+        f"{100 * high / twins:.1f} % with a probability of 95 % (* is outside)"
     )
 
 
 def table_head() -> str:
     columns = [
-        f"{c} {what} %" for what in ("held", "whole", "error") for c in COLUMNS
+        f"{c} {kind}, %"
+        for kind in ("coverage", "combined coverage", "standard error")
+        for c in COLUMNS
     ]
-    cells = ["fault", *columns, "correlated %", "lost"]
+    cells = ["fault", *columns, "correlated errors, %", "not converged"]
     return _line(cells) + "\n" + _line(["---"] * len(cells))
 
 
-def table_row(fault: str, outcomes: Sequence[Outcome]) -> str:
-    """Shares that are held, and median standard errors over the true values."""
-    good = [outcome for outcome in outcomes if outcome.converged]
-    columns = np.array([[*outcome.held, *outcome.whole] for outcome in good]).T
-    errors = 100 * np.nanmedian([outcome.relative for outcome in good], axis=0)
-    correlated = 100 * np.mean([outcome.correlated for outcome in good])
-    lost = len(outcomes) - len(good)
+def table_row(fault: str, outcomes: Sequence[FaultOutcome]) -> str:
+    """Return a row of the table: coverages, and median standard errors over the true values."""
+    converged_outcomes = [outcome for outcome in outcomes if outcome.converged]
+    columns = np.array(
+        [
+            [*outcome.contains_truth, *outcome.combined_contains_truth]
+            for outcome in converged_outcomes
+        ]
+    ).T
+    errors = 100 * np.nanmedian(
+        [outcome.relative for outcome in converged_outcomes], axis=0
+    )
+    correlated = 100 * np.mean(
+        [outcome.correlated for outcome in converged_outcomes]
+    )
+    failures = len(outcomes) - len(converged_outcomes)
     return _line(
         [
             fault,
-            *map(_share, columns),
+            *map(_coverage_cell, columns),
             *map("{:.2g}".format, errors),
             f"{correlated:.0f}",
-            f"{lost}",
+            f"{failures}",
         ]
     )
 
 
-def _share(held: Array) -> str:
-    """Percent of the intervals that there are, starred beyond what chance does to them."""
-    held = held[np.isfinite(held)]
-    if not len(held):
+def _coverage_cell(contained: Array) -> str:
+    """Return the coverage in percent, with a star if exact intervals would have it in less than 5 % of cases.
+
+    `contained` has 1, 0 or NaN for each twin; NaN (no interval) does not count.
+    """
+    contained = contained[np.isfinite(contained)]
+    if not len(contained):
         return "-"
-    low, high = binom.interval(0.95, len(held), 0.95)
-    return f"{100 * held.mean():.3g}{'' if low <= held.sum() <= high else '*'}"
+    low, high = binom.interval(0.95, len(contained), 0.95)
+    return f"{100 * contained.mean():.3g}{'' if low <= contained.sum() <= high else '*'}"
 
 
-def loss_of_precision(outcomes: Sequence[Outcome]) -> str:
+def loss_of_precision(outcomes: Sequence[FaultOutcome]) -> str:
     """Return the ratios of standard errors with and without nuisance parameters, without errors."""
     ratios = np.nanmedian(
         [outcome.relative / outcome.without for outcome in outcomes], axis=0
     )
-    listed = ", ".join(
+    shown_ratios = ", ".join(
         f"{c} {ratio:.2f}" for c, ratio in zip(COLUMNS, ratios, strict=True)
     )
-    return f"Faultless, standard errors over those without nuisance parameters: {listed}"
+    return f"Without faults: standard errors with nuisance parameters over those without: {shown_ratios}"
 
 
 def _line(cells: Sequence[str]) -> str:

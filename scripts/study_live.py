@@ -25,116 +25,140 @@ from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
+# Number of samples at intervals of 10 ms.
 SAMPLES = 101
-# Frames come from 0 s on; the motion rises from there.
-LOOKED_AT_S = (0.25, 0.5, 1.0)
+# Times at which intervals and verdicts are counted [s]; the motion rises from 0 s on.
+EVALUATED_S = (0.25, 0.5, 1.0)
+# Time at which the errors of the estimates are counted [s], and the relative error that is small enough.
 EARLY_S = 0.3
-NEAR = 0.1
-SHOWN_EVERY = 10
+CLOSE_SHARE = 0.1
+# Number of twins after which the counts are printed.
+TWINS_PER_PRINT = 10
 
 
-class Tally:
+class LiveCounts:
     """Counts of intervals that contain the true value, verdicts, errors and latencies of all twins."""
 
     def __init__(self) -> None:
-        self.held: Counter[tuple[float, str]] = Counter()
-        self.told: Counter[tuple[float, str]] = Counter()
+        self.contains_truth: Counter[tuple[float, str]] = Counter()
+        self.has_interval: Counter[tuple[float, str]] = Counter()
         self.verdicts: Counter[tuple[float, str]] = Counter()
         self.errors: list[list[float]] = []
-        self.apart: list[float] = []
+        self.batch_differences: list[float] = []
         self.latency_s: list[float] = []
 
     def stream(self, problem: Problem, rows: int, batch: bool) -> None:
-        """Stream a twin to a new estimator, and add its results to the counts."""
+        """Stream a twin to a new estimator, and add its results to the counts.
+
+        Parameters
+        ----------
+        problem : Problem
+            The twin.
+        rows : int
+            Rows that are linearised again with each frame.
+        batch : bool
+            Whether the twin is also solved as a whole, to compare the last live estimate.
+        """
         live = LiveEstimator(problem, LiveOptions(rows=rows), time.thread_time)
         for frame in frames_of_recording(problem.experiments[0], live.model):
             update = live.process_frame(frame)
             self.latency_s.append(update.latency_s)
-            for at_s in LOOKED_AT_S:
-                if abs(frame.t_s - at_s) < 1e-6:
-                    self._count(at_s, update)
+            for time_s in EVALUATED_S:
+                if abs(frame.t_s - time_s) < 1e-6:
+                    self._count(time_s, update)
             if abs(frame.t_s - EARLY_S) < 1e-6:
-                found = update.estimates
+                estimates = update.estimates
                 self.errors.append(
-                    [abs(found[n].value / SOFT[n] - 1) for n in SOFT]
+                    [abs(estimates[n].value / SOFT[n] - 1) for n in SOFT]
                 )
         if batch:
             solution = solve(problem, ReducedSpace())
-            known = uncertainty_at(solution.collocation, solution.z).estimates
-            self.apart += [
-                abs(update.estimates[n].value - known[n].value)
-                / (known[n].statistical_std_error or np.inf)
+            batch_estimates = uncertainty_at(
+                solution.collocation, solution.z
+            ).estimates
+            self.batch_differences += [
+                abs(update.estimates[n].value - batch_estimates[n].value)
+                / (batch_estimates[n].statistical_std_error or np.inf)
                 for n in SOFT
             ]
 
-    def _count(self, at_s: float, update: LiveUpdate) -> None:
-        self.verdicts[at_s, update.trust.verdict] += 1
+    def _count(self, time_s: float, update: LiveUpdate) -> None:
+        self.verdicts[time_s, update.trust.verdict] += 1
         for name, estimate in update.estimates.items():
             if estimate.statistical95 is not None:
                 low, high = estimate.statistical95
-                self.told[at_s, name] += 1
-                self.held[at_s, name] += low <= SOFT[name] <= high
+                self.has_interval[time_s, name] += 1
+                self.contains_truth[time_s, name] += low <= SOFT[name] <= high
 
     def show(self) -> None:
         """Print the coverage at each time, errors and latencies."""
         print(f"{len(self.errors)} twins")
-        for at_s in LOOKED_AT_S:
+        for time_s in EVALUATED_S:
             shares = (
-                f"{n} {self.held[at_s, n] / max(1, self.told[at_s, n]):.3f}"
+                f"{n} {self.contains_truth[time_s, n] / max(1, self.has_interval[time_s, n]):.3f}"
                 for n in SOFT
             )
-            held, told = (
-                sum(each[at_s, n] for n in SOFT)
-                for each in (self.held, self.told)
+            covered, intervals = (
+                sum(each[time_s, n] for n in SOFT)
+                for each in (self.contains_truth, self.has_interval)
             )
             print(
-                f"t = {at_s:g} s: {', '.join(shares)}; all {held / max(1, told):.3f} of {told}"
+                f"coverage at {time_s:g} s: {', '.join(shares)}; "
+                f"all parameters {covered / max(1, intervals):.3f} of {intervals} intervals"
             )
-            said = (
-                f"{v} {self.verdicts[at_s, v]}"
+            verdict_counts = (
+                f"{v} {self.verdicts[time_s, v]}"
                 for v in ("good", "check", "doubtful")
             )
-            print(f"    verdicts: {', '.join(said)}")
-        near = np.mean(np.array(self.errors) <= NEAR, axis=0)
+            print(f"    verdicts: {', '.join(verdict_counts)}")
+        close_shares = np.mean(np.array(self.errors) <= CLOSE_SHARE, axis=0)
         shares = (
-            f"{n} {share:.2f}" for n, share in zip(SOFT, near, strict=True)
+            f"{n} {share:.2f}"
+            for n, share in zip(SOFT, close_shares, strict=True)
         )
         print(
-            f"within {NEAR:.0%} of the truth after {EARLY_S:g} s: {', '.join(shares)}"
+            f"share of twins with an error of at most {CLOSE_SHARE:.0%} at {EARLY_S:g} s: {', '.join(shares)}"
         )
-        median, late = 1e3 * np.percentile(self.latency_s, [50, 99])
+        median, upper = 1e3 * np.percentile(self.latency_s, [50, 99])
         print(
-            f"processor time of a frame: median {median:.2f} ms, 99 % below {late:.2f} ms"
+            f"processor time per frame: median {median:.2f} ms, 99 % below {upper:.2f} ms"
         )
-        if self.apart:
+        if self.batch_differences:
             print(
-                f"from the batch's answer in its standard errors: largest {max(self.apart):.3f}"
+                "largest difference from the batch solution, in standard errors: "
+                f"{max(self.batch_differences):.3f}"
             )
 
 
 def main() -> None:
-    """Stream the twins and print a table now and then."""
+    """Stream the twins, and print the counts after every ten twins."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=200)
     parser.add_argument(
-        "--first", type=int, default=0, help="seed of the first"
+        "--first", type=int, default=0, help="seed of the first twin"
     )
     parser.add_argument("--body", default="block")
     parser.add_argument(
-        "--rows", type=int, default=6, help="passed again with each frame"
+        "--rows",
+        type=int,
+        default=6,
+        help="rows that are linearised again with each frame",
     )
     parser.add_argument(
-        "--batch", type=int, default=0, help="so many are solved as a whole too"
+        "--batch",
+        type=int,
+        default=0,
+        help="number of twins that are also solved as a whole",
     )
     arguments = parser.parse_args()
-    tally = Tally()
+    counts = LiveCounts()
     for number in range(arguments.twins):
         problem = twin(
             arguments.body, SOFT, arguments.first + number, SAMPLES, "midpoint"
         )
-        tally.stream(problem, arguments.rows, number < arguments.batch)
-        if (number + 1) % SHOWN_EVERY == 0 or number + 1 == arguments.twins:
-            tally.show()
+        counts.stream(problem, arguments.rows, number < arguments.batch)
+        if (number + 1) % TWINS_PER_PRINT == 0 or number + 1 == arguments.twins:
+            counts.show()
 
 
 if __name__ == "__main__":

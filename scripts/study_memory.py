@@ -34,12 +34,15 @@ from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
+# Edges [m] and numbers of elements of the block.
 SIZE_M = (0.1, 0.03, 0.03)
 DIVISIONS = (4, 1, 1)
+# Standard deviation of each marker coordinate [m].
 NOISE_M = 2e-4
+# Number and length [s] of the time steps, and duration of the motion [s], after which the hand rests.
 STEPS = 120
 STEP_S = 0.01
-MOVED_S = 0.4
+MOTION_S = 0.4
 TRUTH = {
     "young_pa": 2e4,
     "poisson": 0.3,
@@ -63,69 +66,75 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     for branches in arguments.branches:
-        report(branches, arguments.twins, arguments.seed)
+        print_coverage(branches, arguments.twins, arguments.seed)
 
 
-def report(branches: int, twins: int, seed: int) -> None:
-    """Find the truth without noise, then count."""
-    exact = recording(branches)
+def print_coverage(branches: int, twins: int, seed: int) -> None:
+    """Print the error of the estimates without noise, then the coverage over twins with noise.
+
+    `branches` is the number of Prony terms, `twins` that of recordings.
+    """
+    exact_recording = recording(branches)
     parameters = unknowns(branches)
-    solution = ReducedSpace()(Collocation([exact], parameters))
-    true = truth(branches)
-    worst = max(
+    solution = ReducedSpace()(Collocation([exact_recording], parameters))
+    true_values = truth(branches)
+    largest_error = max(
         abs(solution.parameters[name] / value - 1)
-        for name, value in true.items()
+        for name, value in true_values.items()
     )
     print(
-        f"{branches} branches; without noise all parameters are right to {worst:.1e}"
+        f"{branches} Prony terms; largest relative error without noise {largest_error:.1e}"
     )
     rng = np.random.default_rng(seed)
-    at_once = true["young_pa"] * (
-        1 + sum(v for n, v in true.items() if n.endswith("share"))
+    instantaneous_pa = true_values["young_pa"] * (
+        1 + sum(v for n, v in true_values.items() if n.endswith("share"))
     )
-    true |= {"instantaneous_young_pa": at_once}
-    held = {name: 0 for name in true}
-    wide = dict.fromkeys(true, 0)
+    true_values |= {"instantaneous_young_pa": instantaneous_pa}
+    contains_truth = {name: 0 for name in true_values}
+    intervals = dict.fromkeys(true_values, 0)
     for _ in range(twins):
-        tracks = exact.markers.positions_m
+        tracks = exact_recording.markers.positions_m
         noisy = with_markers(
-            exact, tracks + rng.normal(scale=NOISE_M, size=tracks.shape)
+            exact_recording,
+            tracks + rng.normal(scale=NOISE_M, size=tracks.shape),
         )
         collocation = Collocation([noisy], parameters)
-        found = ReducedSpace()(collocation)
-        fit = linearise_fit(collocation, found.z)
-        uncertainty = uncertainty_from_fit(fit, parameters, found.q)
+        answer = ReducedSpace()(collocation)
+        fit = linearise_fit(collocation, answer.z)
+        uncertainty = uncertainty_from_fit(fit, parameters, answer.q)
         for name, estimate in {
             **uncertainty.estimates,
             **uncertainty.derived,
         }.items():
-            if name in true and estimate.statistical95 is not None:
-                held[name] += (
+            if name in true_values and estimate.statistical95 is not None:
+                contains_truth[name] += (
                     estimate.statistical95[0]
-                    <= true[name]
+                    <= true_values[name]
                     <= estimate.statistical95[1]
                 )
-                wide[name] += 1
+                intervals[name] += 1
     low, high = binom.interval(0.95, twins, 0.95)
     print(
-        f"  {twins} twins; by chance {100 * low / twins:.1f} to {100 * high / twins:.1f} %"
+        f"  {twins} twins; the coverage of exact intervals is {100 * low / twins:.1f} to "
+        f"{100 * high / twins:.1f} % with a probability of 95 %"
     )
-    for name, count in held.items():
-        share = 100 * count / max(1, wide[name])
+    for name, count in contains_truth.items():
+        share = 100 * count / max(1, intervals[name])
         print(
-            f"  {name:24}{share:6.1f} % of {wide[name]} intervals", flush=True
+            f"  {name:24} coverage {share:6.1f} % of {intervals[name]} intervals",
+            flush=True,
         )
 
 
 def truth(branches: int) -> dict[str, float]:
-    """All parameters with so many branches."""
+    """Return the true parameters of a material with this number of Prony terms."""
     return TRUTH | {
         name: v for branch in BRANCHES[:branches] for name, v in branch.items()
     }
 
 
 def unknowns(branches: int) -> Parameters:
-    """All to be estimated, from guesses near the truth."""
+    """Return all parameters as unknowns, with guesses 10 % above the truth."""
     return Parameters.from_mapping(
         {n: Unknown(guess=1.1 * v) for n, v in truth(branches).items()}
     )
@@ -133,24 +142,30 @@ def unknowns(branches: int) -> Parameters:
 
 @cache
 def recording(branches: int) -> Experiment:
-    """The block with the tracks that the truth gives it."""
+    """Return the recording of the block with exact tracks."""
     names = [f"prony_{k + 1}" for k in range(branches)]
     body = Body(box_mesh(SIZE_M, DIVISIONS), density_kg_m3=200.0, prony=names)
     t_s = np.asarray(STEP_S * np.arange(STEPS + 1), dtype=np.float64)
-    moving = np.minimum(t_s, MOVED_S)
-    share = 1 - np.cos(4 * np.pi * moving / MOVED_S)
-    turn = np.sin(np.pi * moving / (2 * MOVED_S)) ** 2
-    half = np.outer(turn, [0.0, 0.6, 0.3])
-    quaternions = np.column_stack([half, np.sqrt(1 - np.sum(half**2, axis=1))])
-    poses = PoseSequence(t_s, np.outer(share, [0.0, 0.01, 0.015]), quaternions)
-    held = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
-    seen = np.flatnonzero(body.nodes_m[:, 0] > 0.049)
-    nowhere = np.zeros((len(t_s), len(seen), 3))
-    markers = Markers(t_s, nowhere, NOISE_M, places_m=body.nodes_m[seen])
+    motion_time_s = np.minimum(t_s, MOTION_S)
+    shift_share = 1 - np.cos(4 * np.pi * motion_time_s / MOTION_S)
+    rotation_share = np.sin(np.pi * motion_time_s / (2 * MOTION_S)) ** 2
+    half_axis = np.outer(rotation_share, [0.0, 0.6, 0.3])
+    quaternions = np.column_stack(
+        [half_axis, np.sqrt(1 - np.sum(half_axis**2, axis=1))]
+    )
+    poses = PoseSequence(
+        t_s, np.outer(shift_share, [0.0, 0.01, 0.015]), quaternions
+    )
+    clamped_nodes = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
+    marked_nodes = np.flatnonzero(body.nodes_m[:, 0] > 0.049)
+    no_tracks = np.zeros((len(t_s), len(marked_nodes), 3))
+    markers = Markers(
+        t_s, no_tracks, NOISE_M, places_m=body.nodes_m[marked_nodes]
+    )
     experiment = Experiment(
         body,
         t_s,
-        [Grasp(held, poses)],
+        [Grasp(clamped_nodes, poses)],
         markers,
         name="block",
         nuisance=Nuisance.none(),

@@ -35,18 +35,22 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.recording import write_poses_csv
 from collocation_sysid.result.synthesis import Recipe, write_data
 
-WITHIN = 0.01
+# Largest relative error of a parameter in a successful run.
+SUCCESS_SHARE = 0.01
+# Radius and height of the cylinder [m].
 RADIUS_M = 0.04
 HEIGHT_M = 0.16
 
+# Options of methods: inner Levenberg–Marquardt solver.
 LM = {"inner": "levenberg-marquardt"}
-# Not from a coarse solution by reduced space.
-ALONE = {"initial": "simulation"}
-SHOOT = {"stage.method": "shooting"}
+# Initial trajectories are simulated at the guess, not taken from a coarse solution by reduced space.
+FROM_SIMULATION = {"initial": "simulation"}
+# A growing horizon whose stages are solved by shooting.
+SHOOTING_STAGES = {"stage.method": "shooting"}
 VARIANTS = (
     Variant("reduced-space", "reduced-space"),
     Variant("shooting", "shooting"),
-    Variant("shooting, growing horizon", "continuation", SHOOT),
+    Variant("shooting, growing horizon", "continuation", SHOOTING_STAGES),
     Variant("penalty, LM", "penalty", LM),
     Variant(
         "augmented-lagrangian, LM, first ρ = 1e2",
@@ -59,7 +63,7 @@ VARIANTS = (
         "augmented-lagrangian",
         share=0.5,
     ),
-    Variant("interior-point", "interior-point", ALONE, share=0.25),
+    Variant("interior-point", "interior-point", FROM_SIMULATION, share=0.25),
     Variant("penalty, CG", "penalty", {"max_time_s": 15}, share=0.25),
 )
 
@@ -100,20 +104,21 @@ integrator = "scheme"
 
 
 @dataclass(frozen=True)
-class Score:
+class MethodScore:
     """Successes and times of a method.
 
     Attributes
     ----------
-    runs, hits, converged, misled : int
+    runs, successes, converged, misled : int
         Numbers of runs, of successes, of runs that report convergence, and of runs that report
-        convergence at other parameters.
-    time_s : float, median over all runs, those that were stopped included
+        convergence at wrong parameters.
+    time_s : float
+        Median time of all runs, including those that were stopped [s].
     """
 
     name: str
     runs: int
-    hits: int
+    successes: int
     converged: int
     misled: int
     time_s: float
@@ -121,7 +126,7 @@ class Score:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % interval of the success rate."""
-        return wilson_interval(self.hits, self.runs)
+        return wilson_interval(self.successes, self.runs)
 
 
 def main() -> None:
@@ -173,7 +178,18 @@ def main() -> None:
 
 
 def write_problem(folder: Path, layers: int, steps: int, step_s: float) -> Path:
-    """A cylinder held at one end, hanging and swung, with exact tracks of the midpoint rule."""
+    """Write the problem of a swung cylinder with exact tracks of the midpoint rule; return its path.
+
+    Parameters
+    ----------
+    folder : Path
+    layers : int
+        Layers of elements.
+    steps : int
+        Number of samples.
+    step_s : float
+        Sampling interval [s].
+    """
     folder.mkdir(parents=True, exist_ok=True)
     mesh = cylinder_mesh(RADIUS_M, HEIGHT_M, rings=1, layers=layers)
     mesh.write(folder / "cylinder.vtu")
@@ -183,61 +199,63 @@ def write_problem(folder: Path, layers: int, steps: int, step_s: float) -> Path:
         amplitude_rad=(0.1, 0.1, 0.6),
         frequency_hz=(0.9, 1.1, 1.3),
         rise_s=0.3,
-        start=Rotation.from_rotvec([np.pi, 0, 0]),  # it hangs
+        start=Rotation.from_rotvec([np.pi, 0, 0]),  # the cylinder hangs
     )
     write_poses_csv(folder / "motion.csv", poses)
     on_side = np.linalg.norm(mesh.points_m[:, :2], axis=1) > RADIUS_M / 2
-    marked = mesh.points_m[on_side & (mesh.points_m[:, 2] > 0.2 * HEIGHT_M)][
-        ::5
-    ]
+    marker_places_m = mesh.points_m[
+        on_side & (mesh.points_m[:, 2] > 0.2 * HEIGHT_M)
+    ][::5]
     places = ", ".join(
-        f"m{k} = {point.tolist()}" for k, point in enumerate(marked)
+        f"m{k} = {point.tolist()}" for k, point in enumerate(marker_places_m)
     )
     path = folder / "problem.toml"
     path.write_text(
         PROBLEM.replace("REFERENCES", f"{{ {places} }}"), encoding="utf-8"
     )
-    at_truth = [
+    truth_overrides = [
         f"parameters.{name}.guess={value}" for name, value in TRUTH.items()
     ]
     (folder / "swing_markers.csv").unlink(missing_ok=True)
     write_data(
-        Problem.read(path, at_truth, simulation=True),
+        Problem.read(path, truth_overrides, simulation=True),
         folder,
         Recipe("midpoint"),
     )
     return path
 
 
-def score(name: str, rows: Sequence[Row]) -> Score:
+def score(name: str, rows: Sequence[Row]) -> MethodScore:
     """Return the counts and the median time of the runs of one variant of a method."""
-    near = [worst_error(row) <= WITHIN for row in rows]
+    has_succeeded = [worst_error(row) <= SUCCESS_SHARE for row in rows]
     converged = [bool(row["converged"]) for row in rows]
     times = [
         row["total_s"] if row["total_s"] is not None else row["wall_s"]
         for row in rows
     ]
-    misled = sum(c and not n for c, n in zip(converged, near, strict=True))
-    return Score(
+    misled = sum(
+        c and not n for c, n in zip(converged, has_succeeded, strict=True)
+    )
+    return MethodScore(
         name,
         len(rows),
-        sum(near),
+        sum(has_succeeded),
         sum(converged),
         misled,
         float(np.median(times)),
     )
 
 
-def table(scores: Sequence[Score]) -> str:
+def table(scores: Sequence[MethodScore]) -> str:
     """Return a Markdown table of the success rates."""
     heads = (
         "method",
-        "found",
-        "rate [%]",
-        "95 % interval",
-        "converged",
-        "elsewhere",
-        "median [s]",
+        "runs that found the truth",
+        "success rate [%]",
+        "its 95 % interval",
+        "runs that converged",
+        "converged at wrong parameters",
+        "median time [s]",
     )
     lines = []
     for each in scores:
@@ -245,8 +263,8 @@ def table(scores: Sequence[Score]) -> str:
         lines.append(
             (
                 each.name,
-                f"{each.hits} of {each.runs}",
-                f"{100 * each.hits / each.runs:.0f}",
+                f"{each.successes} of {each.runs}",
+                f"{100 * each.successes / each.runs:.0f}",
                 f"{100 * low:.0f}–{100 * high:.0f}",
                 str(each.converged),
                 str(each.misled),

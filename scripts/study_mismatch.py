@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from studies import HEADS, TRUTH, markdown, save
+from studies import PARAMETER_SYMBOLS, TRUTH, markdown, save
 from study_starts import BOUNDS, hanging_cylinder
 from synthetic import Swing
 
@@ -31,20 +31,32 @@ from collocation_sysid.recording import Experiment, Grasp
 Array = NDArray[np.float64]
 
 SCHEMES = ("backward-euler", "midpoint", "bdf2")
+# Sampling interval [s].
 SAMPLE_S = 0.02
+# Initial guesses of λ [Pa], μ [Pa], γ_r [s] and γ_m [1/s].
 GUESS = (400.0, 150.0, 0.02, 0.5)
-# Within this of its bound an estimate is at it.
-AT_BOUND = 1e-3
+# An estimate is at a bound if their logarithms differ by less than this.
+AT_BOUND_LOG = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
-    """One identification.
+class SchemeFit:
+    """Identification with one scheme and one time step.
 
     Attributes
     ----------
-    errors : (4,) relative to the truth
-    at_bound : (4,)
+    scheme : str
+    step_s : float
+        Time step [s].
+    converged : bool
+    errors : (4,)
+        Relative errors of the estimates.
+    at_bound : (4,) bool
+        Whether an estimate is at a bound.
+    rms_m : float
+        Root mean square of the marker residuals [m].
+    time_s : float
+        Time of the solve [s].
     """
 
     scheme: str
@@ -78,7 +90,9 @@ def main() -> None:
         "--out", type=Path, default=Path("results/study_mismatch")
     )
     arguments = parser.parse_args()
-    experiment = measured(arguments.layers, arguments.samples, arguments.fine_s)
+    experiment = exact_recording(
+        arguments.layers, arguments.samples, arguments.fine_s
+    )
     fits = [
         identify(experiment, scheme, substeps)
         for scheme in arguments.schemes
@@ -89,8 +103,11 @@ def main() -> None:
     )
 
 
-def measured(layers: int, samples: int, fine_s: float) -> Experiment:
-    """The cylinder with Newmark's tracks; poses are known at Newmark's own step."""
+def exact_recording(layers: int, samples: int, fine_s: float) -> Experiment:
+    """Return the cylinder with tracks of Newmark's scheme.
+
+    The poses are known at each time step `fine_s` [s] of this scheme.
+    """
     experiment = hanging_cylinder(layers, samples, "midpoint")
     t_s = SAMPLE_S * np.arange(samples, dtype=np.float64)
     motion = Swing(
@@ -108,8 +125,8 @@ def measured(layers: int, samples: int, fine_s: float) -> Experiment:
     )
 
 
-def identify(experiment: Experiment, scheme: str, substeps: int) -> Fit:
-    """The parameters that a scheme takes for the truth."""
+def identify(experiment: Experiment, scheme: str, substeps: int) -> SchemeFit:
+    """Identify the parameters with a scheme and a number of time steps per sample."""
     parameters = Parameters(
         tuple(
             Parameter(name, guess, *BOUNDS[name])
@@ -120,37 +137,42 @@ def identify(experiment: Experiment, scheme: str, substeps: int) -> Fit:
     solution = ReducedSpace()(
         Collocation([experiment], parameters, scheme, substeps)
     )
-    found = solution.theta
-    walls = np.array([BOUNDS[name] for name in TRUTH])
-    return Fit(
+    estimates = solution.theta
+    bounds = np.array([BOUNDS[name] for name in TRUTH])
+    return SchemeFit(
         scheme,
         experiment.timestep_s / substeps,
         solution.status.converged,
-        found / list(TRUTH.values()) - 1,
-        np.abs(np.log(found[:, None] / walls)).min(axis=1) < AT_BOUND,
+        estimates / list(TRUTH.values()) - 1,
+        np.abs(np.log(estimates[:, None] / bounds)).min(axis=1) < AT_BOUND_LOG,
         solution.rms_m,
         time.perf_counter() - began,
     )
 
 
-def orders(fits: Sequence[Fit]) -> Array:
-    """(4,) slopes of log |error| against log Δt; NaN where fewer than two steps tell."""
-    telling = [fit for fit in fits if fit.converged and not fit.at_bound.any()]
-    if len(telling) < 2:
+def orders(fits: Sequence[SchemeFit]) -> Array:
+    """Return the slopes (4,) of log |error| against log Δt; NaN with fewer than two usable fits.
+
+    Fits that did not converge or have an estimate at a bound are not used.
+    """
+    usable_fits = [
+        fit for fit in fits if fit.converged and not fit.at_bound.any()
+    ]
+    if len(usable_fits) < 2:
         return np.full(len(TRUTH), np.nan)
-    steps = np.log([fit.step_s for fit in telling])
+    steps = np.log([fit.step_s for fit in usable_fits])
     return np.polyfit(
-        steps, np.log(np.abs([fit.errors for fit in telling])), 1
+        steps, np.log(np.abs([fit.errors for fit in usable_fits])), 1
     )[0]
 
 
-def table(fits: Sequence[Fit]) -> str:
+def table(fits: Sequence[SchemeFit]) -> str:
     """Return a Markdown table of the relative errors."""
     heads = (
         "scheme",
         "Δt [ms]",
-        *(f"{name} [%]" for name in HEADS),
-        "rms [mm]",
+        *(f"error of {name} [%]" for name in PARAMETER_SYMBOLS),
+        "RMS residual [mm]",
         "time [s]",
     )
     lines = []
@@ -160,22 +182,25 @@ def table(fits: Sequence[Fit]) -> str:
             for error, bound in zip(fit.errors, fit.at_bound, strict=True)
         ]
         name = fit.scheme if fit.converged else f"{fit.scheme} (not converged)"
-        rest = (f"{1e3 * fit.rms_m:.2g}", f"{fit.time_s:.1f}")
-        lines.append((name, f"{1e3 * fit.step_s:g}", *cells, *rest))
+        misfit_and_time = (f"{1e3 * fit.rms_m:.2g}", f"{fit.time_s:.1f}")
+        lines.append((name, f"{1e3 * fit.step_s:g}", *cells, *misfit_and_time))
     return markdown(heads, lines)
 
 
-def order_table(fits: Sequence[Fit]) -> str:
-    """Orders over all steps, and over the two finest, as Markdown."""
+def order_table(fits: Sequence[SchemeFit]) -> str:
+    """Return a Markdown table of the orders over all steps, and over the two finest."""
     lines = []
     for scheme in dict.fromkeys(fit.scheme for fit in fits):
-        common = sorted(
+        scheme_fits = sorted(
             (f for f in fits if f.scheme == scheme), key=lambda fit: fit.step_s
         )
-        for name, chosen in (("all steps", common), ("two finest", common[:2])):
+        for name, chosen in (
+            ("all steps", scheme_fits),
+            ("two finest", scheme_fits[:2]),
+        ):
             cells = ["–" if np.isnan(o) else f"{o:.2f}" for o in orders(chosen)]
             lines.append((f"{scheme}, {name}", *cells))
-    return markdown(("order", *HEADS), lines)
+    return markdown(("observed order", *PARAMETER_SYMBOLS), lines)
 
 
 if __name__ == "__main__":

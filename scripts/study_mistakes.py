@@ -1,4 +1,4 @@
-"""Table of mistakes in descriptions and data: what `check` reports, and what `solve` reports.
+"""Mistakes in descriptions and data: table of the reports of `check` and `solve`.
 
 Every mistake is made in a correct problem: in twins of a soft bar with markers (`twins`), also with
 a force sensor, in twins with depth images (`depth_twins`), and in twins with an obstacle
@@ -52,7 +52,7 @@ SHOWN_CAUSES = 2
 
 
 @dataclass(frozen=True)
-class Family:
+class ProblemFamily:
     """Correct problems of one kind, and the mistakes that are made in them.
 
     Attributes
@@ -77,14 +77,14 @@ class Family:
 
 
 @dataclass(frozen=True)
-class Row:
+class MistakeRow:
     """One row of the table.
 
     Attributes
     ----------
     name : str
     checked, solved : str
-        What `check` and `solve` report; the second is empty if it was left out.
+        Reports of `check` and of `solve`; the second is empty if the problem was not solved.
     is_right : bool
         Whether the problem has no mistake.
     is_reported : bool
@@ -96,7 +96,7 @@ class Row:
     name: str
     checked: str
     solved: str
-    is_right: bool
+    is_correct: bool
     is_reported: bool
     is_good: bool
 
@@ -139,18 +139,21 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--body", choices=list(BODIES), default="bar")
     parser.add_argument("--samples", type=int, default=40)
     parser.add_argument(
-        "--seeds", type=int, default=5, help="of correct problems"
+        "--seeds",
+        type=int,
+        default=5,
+        help="number of correct problems of each kind",
     )
     parser.add_argument(
         "--only", default="", help="rows whose name contains this"
     )
     parser.add_argument(
-        "--check-only", action="store_true", help="leave out what solve reports"
+        "--check-only", action="store_true", help="do not solve"
     )
     return parser.parse_args()
 
 
-def families(body: str, samples: int) -> list[Family]:
+def families(body: str, samples: int) -> list[ProblemFamily]:
     """Return all kinds of problems; the arguments are the body and the number of samples of those
     with markers.
     """
@@ -158,7 +161,7 @@ def families(body: str, samples: int) -> list[Family]:
     bar_pa = depth_twins.TRUTH["young_pa"]
     block_pa = contact_twins.TRUTH["young_pa"]
     return [
-        Family(
+        ProblemFamily(
             "tracks",
             "markers",
             lambda seed: twin(body, SOFT, seed, samples),
@@ -166,7 +169,7 @@ def families(body: str, samples: int) -> list[Family]:
             "mu_pa",
             shear_pa,
         ),
-        Family(
+        ProblemFamily(
             "wrench",
             "markers and sensor",
             lambda seed: sensing_twin(body, SOFT, seed, samples),
@@ -174,7 +177,7 @@ def families(body: str, samples: int) -> list[Family]:
             "mu_pa",
             shear_pa,
         ),
-        Family(
+        ProblemFamily(
             "depth",
             "one depth image",
             depth_twins.hanging_twin,
@@ -182,7 +185,7 @@ def families(body: str, samples: int) -> list[Family]:
             "young_pa",
             bar_pa,
         ),
-        Family(
+        ProblemFamily(
             "depth",
             "depth images of a motion",
             depth_twins.swinging_twin,
@@ -190,7 +193,7 @@ def families(body: str, samples: int) -> list[Family]:
             "young_pa",
             bar_pa,
         ),
-        Family(
+        ProblemFamily(
             "obstacle",
             "indentation",
             contact_twins.poked_twin,
@@ -198,7 +201,7 @@ def families(body: str, samples: int) -> list[Family]:
             "young_pa",
             block_pa,
         ),
-        Family(
+        ProblemFamily(
             "obstacle",
             "block on a plate",
             contact_twins.sheared_twin,
@@ -210,13 +213,13 @@ def families(body: str, samples: int) -> list[Family]:
 
 
 def table_rows(
-    kinds: Sequence[Family],
+    kinds: Sequence[ProblemFamily],
     *,
     groups: Sequence[str],
     seeds: int,
     only: str,
     is_solved: bool,
-) -> Iterator[Row]:
+) -> Iterator[MistakeRow]:
     """Yield the rows of all correct problems, then those of all mistakes.
 
     Parameters
@@ -247,12 +250,12 @@ def table_rows(
 
 def table_row(
     name: str,
-    family: Family,
+    family: ProblemFamily,
     fault: Fault | None,
     seed: int,
     *,
     is_solved: bool,
-) -> Row:
+) -> MistakeRow:
     """Return the row of a problem with a mistake, or without one (None).
 
     Parameters
@@ -278,11 +281,11 @@ def table_row(
     report = (
         solve_report(problem, family) if is_solved else SolveReport("", False)
     )
-    return Row(
+    return MistakeRow(
         name,
-        refusal or named(causes),
+        refusal or causes_text(causes),
         solved=report.text,
-        is_right=fault is None,
+        is_correct=fault is None,
         is_reported=bool(causes) or bool(refusal),
         is_good=report.is_good,
     )
@@ -304,7 +307,7 @@ def checked_causes(problem: Problem) -> tuple[Hypothesis, ...]:
     return causes or rank(wrench_mistakes(collocation).hypotheses)
 
 
-def solve_report(problem: Problem, family: Family) -> SolveReport:
+def solve_report(problem: Problem, family: ProblemFamily) -> SolveReport:
     """Return the verdict of `solve` with the likely causes that it names, or with the status of
     the search; a "good" one also with the estimate over the truth.
     """
@@ -313,7 +316,7 @@ def solve_report(problem: Problem, family: Family) -> SolveReport:
     except (InputError, SimulationError) as error:
         return SolveReport(f"refused: {error}", False)
     status = answer.solution.status.value
-    reason = named(answer.causes) if answer.causes else status
+    reason = causes_text(answer.causes) if answer.causes else status
     verdict = answer.trust.verdict
     if verdict != "good":
         return SolveReport(f"{verdict}: {reason}", False)
@@ -324,7 +327,7 @@ def solve_report(problem: Problem, family: Family) -> SolveReport:
     )
 
 
-def named(causes: Sequence[Hypothesis]) -> str:
+def causes_text(causes: Sequence[Hypothesis]) -> str:
     """Return the likeliest causes with the factors by which the misfit falls without them."""
     shown = (
         f"{each.code} ({each.strength:.2g})" for each in causes[:SHOWN_CAUSES]
@@ -332,10 +335,10 @@ def named(causes: Sequence[Hypothesis]) -> str:
     return ", ".join(shown) or "nothing"
 
 
-def summary(rows: Sequence[Row]) -> str:
+def summary(rows: Sequence[MistakeRow]) -> str:
     """Return the numbers of mistakes that are reported or rated good, and of false alarms."""
     counts = Counter(
-        (row.is_right, key)
+        (row.is_correct, key)
         for row in rows
         for key, counted in (
             ("all", True),

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from studies import HEADS, TRUTH, markdown, save
+from studies import PARAMETER_SYMBOLS, TRUTH, markdown, save
 from study_coverage import SCHEME, reference
 from study_starts import BOUNDS
 
@@ -35,13 +35,15 @@ from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
 
 Array = NDArray[np.float64]
 
+# Initial guesses of λ [Pa], μ [Pa], γ_r [s] and γ_m [1/s].
 GUESS = (400.0, 150.0, 0.02, 0.5)
+# Options of methods: inner Levenberg–Marquardt solver.
 LM = {"inner": "levenberg-marquardt"}
 
 
 @dataclass(frozen=True)
-class Case:
-    """A method, and the share of the seeds that it gets."""
+class MethodCase:
+    """Method with options, and the share of the seeds for which it is run."""
 
     name: str
     method: str
@@ -50,21 +52,21 @@ class Case:
 
 
 CASES = (
-    Case("reduced-space", "reduced-space", {}),
-    Case("shooting", "shooting", {}),
-    Case(
+    MethodCase("reduced-space", "reduced-space", {}),
+    MethodCase("shooting", "shooting", {}),
+    MethodCase(
         "augmented-lagrangian, LM",
         "augmented-lagrangian",
         {"rho": 1e2, "max_time_s": 60.0},
         0.1,
     ),
-    Case("penalty, LM", "penalty", {**LM, "max_time_s": 60.0}, 0.1),
+    MethodCase("penalty, LM", "penalty", {**LM, "max_time_s": 60.0}, 0.1),
 )
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
-    """One seed: errors (4,) of the logarithms."""
+class NoiseOutcome:
+    """Identification of one twin: errors (4,) of the logarithms, and time [s]."""
 
     converged: bool
     errors: Array
@@ -83,7 +85,7 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, default=Path("results/study_noise"))
     arguments = parser.parse_args()
-    # Workers start afresh and find one thread each.
+    # Worker processes read these variables when they start: one thread each.
     os.environ |= {
         "OPENBLAS_NUM_THREADS": "1",
         "COLLOCATION_SYSID_THREADS": "1",
@@ -99,23 +101,23 @@ def main() -> None:
     save(arguments.out, "study_noise", text)
 
 
-def run(case: Case, sigma_m: float, seed: int) -> Outcome:
-    """Identify one noisy twin from the guess."""
-    collocation = noisy(sigma_m, seed, GUESS)
+def run(case: MethodCase, sigma_m: float, seed: int) -> NoiseOutcome:
+    """Identify the noisy twin of a seed with one method, starting from the guess."""
+    collocation = noisy_twin(sigma_m, seed, GUESS)
     method = METHODS[case.method](**case.options)
     began = time.perf_counter()
     solution = method(collocation)
-    return Outcome(
+    return NoiseOutcome(
         solution.status.converged,
         np.log(solution.theta / list(TRUTH.values())),
         time.perf_counter() - began,
     )
 
 
-def noisy(
+def noisy_twin(
     sigma_m: float, seed: int | None, guess: Sequence[float]
 ) -> Collocation:
-    """The twin with noise of its seed; without noise where there is none."""
+    """Return the program of a twin with the noise of a seed; without noise if the seed is None."""
     experiment, x = reference(sigma_m)
     tracks = experiment.markers.predict_positions(x.reshape(len(x), -1, 3))
     if seed is not None:
@@ -133,9 +135,9 @@ def noisy(
 
 @cache
 def predicted(sigma_m: float) -> tuple[float, ...]:
-    """Standard errors of the four logarithms at the truth."""
+    """Return the standard errors of the logarithms of the four parameters at the truth."""
     truth = tuple(TRUTH.values())
-    collocation = noisy(sigma_m, None, truth)
+    collocation = noisy_twin(sigma_m, None, truth)
     _, x = reference(sigma_m)
     z = collocation.pack(np.log(truth), [x])
     variances = uncertainty_at(
@@ -145,17 +147,20 @@ def predicted(sigma_m: float) -> tuple[float, ...]:
 
 
 def table(
-    outcomes: Mapping[str, Sequence[Outcome]], expected: Sequence[float]
+    outcomes: Mapping[str, Sequence[NoiseOutcome]], expected: Sequence[float]
 ) -> str:
-    """Bias and spread of every method as Markdown."""
+    """Return a Markdown table of bias and spread of every method.
+
+    `expected` are the predicted standard errors (4,) of the logarithms.
+    """
     heads = (
-        *("method", "seeds", "converged"),
+        *("method", "number of twins", "converged"),
         *(
             f"{name} {what} [%]"
-            for name in HEADS
+            for name in PARAMETER_SYMBOLS
             for what in ("bias", "spread")
         ),
-        "median [s]",
+        "median time [s]",
     )
     spreads = [cell for each in expected for cell in ("0", f"{100 * each:.3g}")]
     lines = [("predicted", "–", "–", *spreads, "–")]
@@ -167,8 +172,11 @@ def table(
         for bias, spread in zip(
             errors.mean(axis=0), errors.std(axis=0, ddof=1), strict=True
         ):
-            doubt = spread / np.sqrt(len(errors))
-            cells += [f"{bias:+.2g} ± {doubt:.1g}", f"{spread:.3g}"]
+            standard_error_bias = spread / np.sqrt(len(errors))
+            cells += [
+                f"{bias:+.2g} ± {standard_error_bias:.1g}",
+                f"{spread:.3g}",
+            ]
         time_s = float(np.median([outcome.time_s for outcome in each]))
         lines.append(
             (name, str(len(each)), str(len(errors)), *cells, f"{time_s:.2g}")

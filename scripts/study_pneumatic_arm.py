@@ -1,4 +1,4 @@
-"""Predict recordings of the pneumatic arm blind, and measure the influence of what is assumed.
+"""Predictions of held-out recordings of the pneumatic arm, and the influence of assumptions.
 
 Material and reinforcement of problems/pneumatic_arm are estimated from 100, 200 and 300 mbar. Other
 recordings are predicted without any of their measurements: delay and lag of their pressure are the
@@ -36,7 +36,7 @@ from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_at
 # Duration at the end of a recording over which the final travel is averaged [s]: two oscillations.
 FINAL_S = 0.25
 # Assumptions that differ from the shipped problem: outer wall [m], Poisson's ratio, factor on all
-# pressures, and a mass at the tip [kg] on which nobody reported.
+# pressures, and an unreported mass at the tip [kg].
 WALLS_M = {"wall_32": 0.0032, "wall_42": 0.0042}
 KEYS = {
     "poisson_40": ["parameters.poisson.fixed=0.40"],
@@ -47,7 +47,7 @@ KEYS = {
 }
 FACTORS = {"pressure_105": 1.05}
 MASSES_KG = {"mass_5g": 0.005}
-# Modulus of the silicone that the authors state, and one of threads that do nothing [Pa].
+# Modulus of the silicone that the authors state, and one so small that the threads have no effect [Pa].
 AUTHORS_YOUNG_PA = 263824.0
 NO_THREADS_PA = 1.0
 # Files of the largest pressure, in place of those of the last recording in the problem.
@@ -92,7 +92,7 @@ def main() -> None:
         if variant == "statics":
             print_statics()
         else:
-            start = WarmStart.of(report(variant, start))
+            start = WarmStart.of(print_fit(variant, start))
 
 
 def print_statics() -> None:
@@ -138,7 +138,7 @@ def static_travel_m(problem: Problem, fibre_pa: float, mbar: float) -> float:
         t_s=t_s,
         positions_m=experiment.markers.positions_m[:2],
     )
-    still = replace(
+    static_experiment = replace(
         experiment,
         kind="static",
         t_s=t_s,
@@ -155,17 +155,21 @@ def static_travel_m(problem: Problem, fibre_pa: float, mbar: float) -> float:
         "fibre_pa": fibre_pa,
         "prony_1.share": 0.0,
     }
-    moved_m = tip_motion(simulate(still, values).markers_m)
-    return float(np.linalg.norm(moved_m[-1]))
+    tip_m = tip_motion(simulate(static_experiment, values).markers_m)
+    return float(np.linalg.norm(tip_m[-1]))
 
 
-def report(variant: str, start: WarmStart | None) -> Solution:
+def print_fit(variant: str, start: WarmStart | None) -> Solution:
     """Fit a variant of the problem, from an earlier answer if there is one, and print parameters,
     misfits and predictions.
     """
     problem = variant_of_problem(variant)
-    fitted = [each for each in problem.experiments if not each.validation]
-    solution = solve(replace(problem, experiments=fitted), start=start)
+    fitted_recordings = [
+        each for each in problem.experiments if not each.validation
+    ]
+    solution = solve(
+        replace(problem, experiments=fitted_recordings), start=start
+    )
     print(
         f"{solution.message} {solution.iterations} sweeps, {solution.timing.total:.0f} s"
     )
@@ -180,13 +184,15 @@ def report(variant: str, start: WarmStart | None) -> Solution:
         "delay [ms]:",
         np.round(1e3 * delays_s, 1),
         "lag [ms]:",
-        timing_text(fitted, log_lags),
+        timing_text(fitted_recordings, log_lags),
     )
-    heads = f"{'measured':>10}{'predicted':>11}{'error':>8}{'% of travel':>13}{'RMS':>7}"
-    print(f"\n{'[mm]':9}{heads}{'polynomial':>12}")
+    columns = f"{'measured':>10}{'predicted':>11}{'error':>8}{'% of travel':>13}{'RMS':>7}"
+    print(f"\n{'[mm]':9}{columns}{'polynomial':>12}")
     for experiment in problem.experiments:
         measured_m = measured_tip(experiment)
-        polynomial_m = polynomial_position(fitted, pressure_mbar(experiment))
+        polynomial_m = polynomial_position(
+            fitted_recordings, pressure_mbar(experiment)
+        )
         without_model_mm = 1e3 * np.linalg.norm(
             polynomial_m - final_position(measured_m)
         )
@@ -278,11 +284,13 @@ def pressure_timing(
 
 
 def timing_text(
-    fitted: Sequence[Experiment], log_lags: NDArray[np.float64]
+    fitted_recordings: Sequence[Experiment], log_lags: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the lags of the fitted recordings [ms], rounded."""
-    stated_s = np.array([each.pressures[0].lag_s for each in fitted])
-    return np.round(1e3 * stated_s * np.exp(log_lags), 1)
+    stated_lags_s = np.array(
+        [each.pressures[0].lag_s for each in fitted_recordings]
+    )
+    return np.round(1e3 * stated_lags_s * np.exp(log_lags), 1)
 
 
 # Motion of the tip ------------------------------------------------------------------------------
@@ -300,20 +308,20 @@ def travel_error(
     """
     (pressure,) = experiment.pressures
     assert pressure.t_s is not None
-    earlier = replace(
+    shifted_pressure = replace(
         pressure,
         t_s=pressure.t_s - delay_s,
         lag_s=pressure.lag_s * float(np.exp(log_lag)),
         body_measure=None,
     )
-    alone = replace(
+    single_recording = replace(
         experiment,
-        pressures=[earlier],
+        pressures=[shifted_pressure],
         nuisance=Nuisance.none(),
         validation=False,
     )
     simulated = simulate(
-        alone, solution.parameters, "midpoint", substeps=1
+        single_recording, solution.parameters, "midpoint", substeps=1
     ).markers_m
     predicted_m = tip_motion(simulated)
     measured_m = measured_tip(experiment)
@@ -360,16 +368,18 @@ def pressure_mbar(experiment: Experiment) -> float:
 
 
 def polynomial_position(
-    fitted: Sequence[Experiment], mbar: float
+    fitted_recordings: Sequence[Experiment], mbar: float
 ) -> NDArray[np.float64]:
     """Return the final position (2,) by a polynomial of the pressure, zero at zero, through the
     fitted recordings: a prediction without a model.
     """
-    known_m = np.array([final_position(measured_tip(each)) for each in fitted])
-    powers = np.arange(1, len(fitted) + 1)
-    known_mbar = np.array([pressure_mbar(each) for each in fitted])
-    factors = np.linalg.solve(known_mbar[:, None] ** powers, known_m)
-    return float(mbar) ** powers @ factors
+    known_m = np.array(
+        [final_position(measured_tip(each)) for each in fitted_recordings]
+    )
+    powers = np.arange(1, len(fitted_recordings) + 1)
+    known_mbar = np.array([pressure_mbar(each) for each in fitted_recordings])
+    coefficients = np.linalg.solve(known_mbar[:, None] ** powers, known_m)
+    return float(mbar) ** powers @ coefficients
 
 
 if __name__ == "__main__":

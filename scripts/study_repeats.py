@@ -1,10 +1,11 @@
-"""Do measured repeats scatter within their whole intervals? Each is identified alone.
+"""Scatter of estimates from repeated measurements, compared with their intervals.
 
-Trials of problems/srl_beam, the five runs of each silicone of problems/phantom_compression, and
-problems/soft_tentacle, of which a pair of recordings with one tension in either tendon tells both
-parameters; get their data by scripts/get_*.py. Counted is how many of the intervals hold the mean
-of all repeats, with which each errs by its share of the scatter too. What repeats have in common,
-such as the size of the mesh, does not scatter: whole intervals may well be too wide for it.
+Each repeat is identified separately: the trials of problems/srl_beam, the five runs of each silicone
+of problems/phantom_compression, and pairs of recordings of problems/soft_tentacle with equal tension
+in either tendon, which determine both parameters. The data are downloaded by scripts/get_*.py. The
+table counts the intervals that contain the mean of all repeats. Errors that all repeats have in
+common, such as the size of the mesh, do not scatter; the combined intervals, which include these
+errors, are therefore wider than the scatter.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from collocation_sysid.runs.result_content import ReportedEstimate
 PROBLEMS = Path(__file__).parents[1] / "problems"
 SILICONES = ("EF10", "EF30", "EF50")
 TENSIONS = ("u01", "u015", "u02", "u025")
-# What means the same in all of them.
+# Parameters that mean the same in all problems.
 NAMES = ("young_pa", "gamma_r_s", "gamma_m_1_s", "density_kg_m3")
 
 
 @dataclass(frozen=True)
-class Repeats:
+class RepeatedMeasurement:
     """Repeated measurement of one body: the problem, and the names of the recordings of each repeat."""
 
     name: str
@@ -46,22 +47,26 @@ def main() -> None:
     )
     only = parser.parse_args().only or ("beam", "cylinders", "tentacle")
     print(
-        "| repeats | number | values | scatter % | 95 % ± % | whole ± % | held | held by whole |"
+        "| measurement | parameter | estimates | standard deviation, % | statistical interval, ± % "
+        "| combined interval, ± % | statistical intervals with the mean "
+        "| combined intervals with the mean |"
     )
     print("|---|---|---|---|---|---|---|---|")
-    for repeats in _all(only):
+    for repeats in _measurements(only):
         values: dict[str, list[ReportedEstimate]] = {}
         for names in repeats.groups.values():
-            for name, estimate in _alone(repeats.problem, names).items():
+            for name, estimate in _estimates_from(
+                repeats.problem, names
+            ).items():
                 values.setdefault(name, []).append(estimate)
         for name, estimates in values.items():
             print(_line(repeats.name, name, estimates), flush=True)
 
 
-def _all(only: Sequence[str]) -> Iterator[Repeats]:
+def _measurements(only: Sequence[str]) -> Iterator[RepeatedMeasurement]:
     if "beam" in only:
         beam = Problem.read(PROBLEMS / "srl_beam" / "problem.toml")
-        yield Repeats(
+        yield RepeatedMeasurement(
             "beam, three loads",
             beam,
             {e.name: [e.name] for e in beam.experiments},
@@ -69,21 +74,21 @@ def _all(only: Sequence[str]) -> Iterator[Repeats]:
     if "cylinders" in only:
         for silicone in SILICONES:
             runs = _cylinders(silicone)
-            yield Repeats(
+            yield RepeatedMeasurement(
                 f"cylinders {silicone}",
                 runs,
                 {e.name: [e.name] for e in runs.experiments},
             )
     if "tentacle" in only:
-        bent = Problem.read(PROBLEMS / "soft_tentacle" / "problem.toml")
-        pairs = {
+        tentacle = Problem.read(PROBLEMS / "soft_tentacle" / "problem.toml")
+        groups = {
             tension: [f"m{k}_{tension}" for k in (1, 2)] for tension in TENSIONS
         }
-        yield Repeats("tentacle, by tension", bent, pairs)
+        yield RepeatedMeasurement("tentacle, by tension", tentacle, groups)
 
 
 def _cylinders(silicone: str) -> Problem:
-    """The problem with the runs of another silicone."""
+    """Return the problem with the runs of another silicone."""
     source = PROBLEMS / "phantom_compression"
     with tempfile.TemporaryDirectory() as folder:
         for file in source.glob(f"{silicone}_*.csv"):
@@ -98,31 +103,33 @@ def _cylinders(silicone: str) -> Problem:
         return Problem.read(problem)
 
 
-def _alone(
+def _estimates_from(
     problem: Problem, names: Sequence[str]
 ) -> dict[str, ReportedEstimate]:
     """Return the estimates from the named recordings alone; empty if they cannot be solved."""
-    own = [
+    recordings = [
         replace(e, validation=False)
         for e in problem.experiments
         if e.name in names
     ]
     try:
-        found = run(replace(problem, experiments=own), seek_causes=False)
+        answer = run(
+            replace(problem, experiments=recordings), seek_causes=False
+        )
     except InputError:
         return {}
-    known = found.estimates
+    estimates = answer.estimates
     return {
-        n: known[n]
+        n: estimates[n]
         for n in NAMES
-        if n in known and known[n].statistical_std_error
+        if n in estimates and estimates[n].statistical_std_error
     }
 
 
 def _line(
     repeats: str, name: str, estimates: Sequence[ReportedEstimate]
 ) -> str:
-    # Where intervals are, with what the step does to all repeats alike.
+    # Centres of the intervals, which include the common correction for the time step.
     logs = np.array(
         [
             np.log(e.statistical95 or (e.value, e.value)).mean()
@@ -131,31 +138,34 @@ def _line(
     )
     mean = logs.mean()
     count = len(logs)
-    scatter = 100 * float(logs.std(ddof=1)) if count > 1 else np.nan
-    told = [(e.statistical95, e.combined95) for e in estimates]
-    halves = []
-    held = []
-    for intervals in zip(*told, strict=True):
+    deviation = 100 * float(logs.std(ddof=1)) if count > 1 else np.nan
+    half_widths = []
+    coverages = []
+    for ends_of_kind in (
+        [e.statistical95 for e in estimates],
+        [e.combined95 for e in estimates],
+    ):
         ends = [
             np.log(np.maximum(interval, 1e-12))
-            for interval in intervals
+            for interval in ends_of_kind
             if interval
         ]
-        halves.append(
+        half_widths.append(
             100 * float(np.median([(high - low) / 2 for low, high in ends]))
         )
-        held.append(
+        coverages.append(
             f"{sum(low <= mean <= high for low, high in ends)} of {len(ends)}"
         )
     values = ", ".join(f"{e.value:.4g}" for e in estimates)
-    cells = (
+    cells = [
         repeats,
         symbol_of(name),
         values,
-        f"{scatter:.2g}",
-        *(f"{h:.2g}" for h in halves),
-    )
-    return f"| {' | '.join((*cells, *held))} |"
+        f"{deviation:.2g}",
+        *(f"{h:.2g}" for h in half_widths),
+        *coverages,
+    ]
+    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":

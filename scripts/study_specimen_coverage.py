@@ -24,16 +24,35 @@ from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 UNDAMPED = {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+# Number of samples per test, and standard deviations of stress [Pa] and lateral stretch.
 SAMPLES = 20
 SIGMA_PA = 2e3
 LATERAL_SIGMA = 2e-3
-# First guess over the truth.
-GUESS = 0.8
+# Initial guess over the true value.
+GUESS_SHARE = 0.8
 
 
 @dataclass(frozen=True)
-class Case:
-    """Tests of one material, and its true constants; those named in `free` are estimated."""
+class SpecimenCase:
+    """Tests of one material.
+
+    Attributes
+    ----------
+    name : str
+        Name in the table.
+    material : str
+        Name of the material law.
+    truth : mapping
+        True constants.
+    free : tuple of str
+        Names of the constants that are estimated.
+    tests : tuple of str
+        Kinds of deformation.
+    strains : tuple of float
+        First and last strain of each test.
+    has_lateral : bool
+        Whether the lateral stretch is measured.
+    """
 
     name: str
     material: str
@@ -45,7 +64,7 @@ class Case:
 
 
 CASES = (
-    Case(
+    SpecimenCase(
         "rubber: uniaxial, planar, equibiaxial",
         "mooney-rivlin",
         {"c10_pa": 1e5, "c01_pa": 2e4, "kappa_pa": 1e9},
@@ -53,7 +72,7 @@ CASES = (
         ("uniaxial", "planar", "equibiaxial"),
         (0.05, 1.5),
     ),
-    Case(
+    SpecimenCase(
         "foam: compression with lateral stretch",
         "neo-hookean",
         {"young_pa": 5e4, "poisson": 0.25},
@@ -62,7 +81,7 @@ CASES = (
         (-0.02, -0.4),
         has_lateral=True,
     ),
-    Case(
+    SpecimenCase(
         "rubber: simple shear and confined compression",
         "neo-hookean",
         {"young_pa": 2e5, "poisson": 0.45},
@@ -90,47 +109,57 @@ def main() -> None:
         else CASES[options.case : options.case + 1]
     ):
         start = time.perf_counter()
-        outcomes = [covered(case, seed) for seed in range(options.twins)]
+        outcomes = [
+            intervals_with_truth(case, seed) for seed in range(options.twins)
+        ]
         elapsed = time.perf_counter() - start
         for name in case.free:
-            inside = np.array([outcome[name] for outcome in outcomes])
-            share = f"{inside.sum()} of {len(inside)}, {inside.mean():.1%}"
+            contains_truth = np.array([outcome[name] for outcome in outcomes])
+            share = f"{contains_truth.sum()} of {len(contains_truth)}, {contains_truth.mean():.1%}"
             rows.append(
-                (case.name, name, share, f"{elapsed / len(inside):.2g}")
+                (case.name, name, share, f"{elapsed / len(contains_truth):.2g}")
             )
-    heads = ("twins", "constant", "intervals with the truth", "s a twin")
+    heads = (
+        "twins",
+        "constant",
+        "intervals that contain the truth",
+        "time per twin [s]",
+    )
     print(markdown(heads, rows))
 
 
-def covered(case: Case, seed: int) -> dict[str, bool]:
-    """Whether the statistical 95 % interval of each estimated constant contains the truth."""
+def intervals_with_truth(case: SpecimenCase, seed: int) -> dict[str, bool]:
+    """Return for each estimated constant whether its statistical 95 % interval contains the truth."""
     rng = np.random.default_rng(seed)
     experiments = [twin(case, test, rng) for test in case.tests]
     free = {
-        name: cs.Unknown(guess=GUESS * case.truth[name]) for name in case.free
+        name: cs.Unknown(guess=GUESS_SHARE * case.truth[name])
+        for name in case.free
     }
     problem = cs.Problem(experiments, {**case.truth, **UNDAMPED, **free})
     solution = cs.solve(problem)
     assert solution.status.converged, seed
     fit = linearise_fit(solution.collocation, solution.z)
     parameters = solution.collocation.parameters
-    known = uncertainty_from_fit(
+    uncertainty = uncertainty_from_fit(
         fit, parameters, solution.q, problem.uncertainty
     )
-    inside = {}
+    contains_truth = {}
     for name in case.free:
-        interval = known.estimates[name].statistical95
+        interval = uncertainty.estimates[name].statistical95
         assert interval is not None, (name, seed)
-        inside[name] = interval[0] <= case.truth[name] <= interval[1]
-    return inside
+        contains_truth[name] = interval[0] <= case.truth[name] <= interval[1]
+    return contains_truth
 
 
-def twin(case: Case, test: str, rng: np.random.Generator) -> cs.Experiment:
-    """A test with noise, whose strains and stresses have a wrong zero and a wrong area."""
+def twin(
+    case: SpecimenCase, test: str, rng: np.random.Generator
+) -> cs.Experiment:
+    """Return a test with noise, a random zero of the strain and a random error of the area."""
     strain = np.linspace(*case.strains, SAMPLES)
     zeros = np.zeros(SAMPLES)
     lateral: Any = 1 + zeros if case.has_lateral else None
-    stated = cs.Specimen(
+    described = cs.Specimen(
         test,
         strain,
         zeros,
@@ -138,17 +167,20 @@ def twin(case: Case, test: str, rng: np.random.Generator) -> cs.Experiment:
         lateral_stretch=lateral,
         lateral_sigma=LATERAL_SIGMA,
     )
-    shifted = strain + stated.strain_zero * rng.normal()
-    true = cs.Specimen(test, shifted, zeros, SIGMA_PA, lateral_stretch=lateral)
-    trajectory = cs.simulate(
-        true.experiment(case.material, test), {**case.truth, **UNDAMPED}
+    true_strain = strain + described.strain_zero * rng.normal()
+    true_specimen = cs.Specimen(
+        test, true_strain, zeros, SIGMA_PA, lateral_stretch=lateral
     )
-    area = 1 + stated.area_error * rng.normal()
-    experiment = stated.experiment(case.material, test)
+    trajectory = cs.simulate(
+        true_specimen.experiment(case.material, test),
+        {**case.truth, **UNDAMPED},
+    )
+    area_factor = 1 + described.area_error * rng.normal()
+    experiment = described.experiment(case.material, test)
     values = [
-        (area if gauge.unit == "Pa" else 1.0) * read
-        + gauge.sigma * rng.normal(size=read.shape)
-        for gauge, read in zip(
+        (area_factor if gauge.unit == "Pa" else 1.0) * reading
+        + gauge.sigma * rng.normal(size=reading.shape)
+        for gauge, reading in zip(
             experiment.readings, trajectory.custom_sensor_values, strict=True
         )
     ]

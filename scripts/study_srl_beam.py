@@ -59,7 +59,7 @@ class Beam:
     recordings: Path
 
     def load(self, *overrides: str) -> Problem:
-        """The problem with these recordings, and other values for some keys."""
+        """Return the problem with these recordings, and with other values of some keys."""
         markers = (
             self.recordings / f"beam_{trial}_V2_a.c3d" for trial in TRIALS
         )
@@ -71,8 +71,8 @@ class Beam:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
-    """A solved problem with its error bars."""
+class BeamFit:
+    """Solved problem with its linearised residuals and uncertainties."""
 
     solution: Solution
     linearised: LinearisedFit
@@ -81,10 +81,10 @@ class Fit:
 
 def main() -> None:
     parts = {
-        "joint": joint,
-        "refinement": refinement,
-        "validation": validation,
-        "poisson": poisson,
+        "joint": print_joint_fit,
+        "refinement": print_refinement,
+        "validation": print_validation,
+        "poisson": print_poisson,
     }
     parser = argparse.ArgumentParser(
         description=__doc__,
@@ -111,17 +111,17 @@ def main() -> None:
 
 @cache
 def shipped(beam: Beam) -> Solution:
-    """The problem as it is shipped, solved from its own guess."""
+    """Return the solution of the shipped problem from its own guess; cached."""
     return solve(beam.load())
 
 
-def fit(problem: Problem, solution: Solution | None = None) -> Fit:
-    """Solve a problem, where that is not done yet, and find the error bars."""
+def fit(problem: Problem, solution: Solution | None = None) -> BeamFit:
+    """Solve a problem unless its solution is passed, and compute the uncertainties."""
     solution = solution or solve(problem)
     if not solution.status.converged:
         print(f"NOT CONVERGED: {solution.message}")
     linearised = linearise_fit(solution.collocation, solution.z)
-    return Fit(
+    return BeamFit(
         solution,
         linearised,
         uncertainty_from_fit(linearised, problem.parameters, solution.q),
@@ -131,11 +131,11 @@ def fit(problem: Problem, solution: Solution | None = None) -> Fit:
 # Parts ----------------------------------------------------------------------------------------
 
 
-def joint(beam: Beam) -> None:
-    """One material for the three trials, and everything the report has to say of it."""
-    found = fit(beam.load(), shipped(beam))
-    solution = found.solution
-    uncertainty = found.uncertainty
+def print_joint_fit(beam: Beam) -> None:
+    """Print the fit of one material to the three trials: parameters, nuisance parameters and notes."""
+    joint_fit = fit(beam.load(), shipped(beam))
+    solution = joint_fit.solution
+    uncertainty = joint_fit.uncertainty
     print(
         f"{solution.message} {solution.iterations} sweeps, {solution.timing.total:.0f} s"
     )
@@ -158,7 +158,7 @@ def joint(beam: Beam) -> None:
                 f"  {name:45}{1e3 * value * scale:8.2f} ±{1e3 * deviation:6.2f} 1e-3"
             )
     print(f"\nRMS distance [mm]: {rms_line(solution)}")
-    said = dict.fromkeys(
+    notes = dict.fromkeys(
         (
             *solution.notes,
             *uncertainty.notes,
@@ -166,86 +166,96 @@ def joint(beam: Beam) -> None:
         )
     )
     sentences = [
-        diagnosis.sentence for diagnosis in diagnose_markers(found.linearised)
+        diagnosis.sentence
+        for diagnosis in diagnose_markers(joint_fit.linearised)
     ]
-    print("\n" + "\n".join(f"- {sentence}" for sentence in (*said, *sentences)))
+    print(
+        "\n" + "\n".join(f"- {sentence}" for sentence in (*notes, *sentences))
+    )
 
 
-def refinement(beam: Beam) -> None:
+def print_refinement(beam: Beam) -> None:
     """Print the joint fit on other meshes, with other time steps, and with other schemes."""
     print(
         f"{'':34}{'E [kPa]':>8}  95 % interval    γ_r [ms]  γ_m [1/s]  RMS [mm]"
     )
-    near = shipped(beam)
+    shipped_answer = shipped(beam)
     for substeps in SUBSTEPS:
         for scheme in SCHEMES:
             steps = f"transcription.substeps={substeps}"
-            here = started(
-                beam.load(f"transcription.scheme={scheme}", steps), near
+            problem = with_guesses_from(
+                beam.load(f"transcription.scheme={scheme}", steps),
+                shipped_answer,
             )
-            report(f"{scheme}, {10 / substeps:g} ms", fit(here))
+            print_row(f"{scheme}, {10 / substeps:g} ms", fit(problem))
     with tempfile.TemporaryDirectory() as folder:
         for element, divisions in MESHES:
             mesh = Path(folder) / "beam.vtu"
             box_mesh(SIZE_M, divisions, ORIGIN_M).write(mesh)
-            here = started(
+            problem = with_guesses_from(
                 beam.load(f"object.mesh={mesh}", f"object.element={element}"),
-                near,
+                shipped_answer,
             )
             bricks = " x ".join(map(str, divisions))
-            report(
-                f"{element} {bricks}, {len(here.bodies[0].nodes_m)} nodes",
-                fit(here),
+            print_row(
+                f"{element} {bricks}, {len(problem.bodies[0].nodes_m)} nodes",
+                fit(problem),
             )
 
 
-def validation(beam: Beam) -> None:
-    """Each trial predicted with the material of the other two."""
-    together = shipped(beam)
-    free = [item.name for item in together.collocation.parameters.free]
+def print_validation(beam: Beam) -> None:
+    """Print the prediction of each trial with the material of the other two."""
+    joint_answer = shipped(beam)
+    free = [item.name for item in joint_answer.collocation.parameters.free]
     print(f"{'predicted':12}" + "".join(f"{name:>15}" for name in free), end="")
-    print(f"{'RMS [mm] with its nuisance':>30}{'without':>10}{'fitted':>9}")
-    all_three = dict(zip(TRIALS, rms_mm(together), strict=True))
+    print(
+        f"{'RMS [mm] with its nuisance':>30}{'without':>10}{'in joint fit':>14}"
+    )
+    joint_rms_mm = dict(zip(TRIALS, rms_mm(joint_answer), strict=True))
     for trial in TRIALS:
-        problem = started(
-            beam.load(f"experiment.{trial}.validation=true"), together
+        problem = with_guesses_from(
+            beam.load(f"experiment.{trial}.validation=true"), joint_answer
         )
         solution = solve(problem)
-        with_own, without = predicted_rms_mm(problem, trial, solution)
+        with_nuisance, without = predicted_rms_mm(problem, trial, solution)
         values = "".join(f"{solution.parameters[name]:15.5g}" for name in free)
         print(f"{trial:12}{values}", end="")
         print(
-            f"{with_own:30.3f}{without:10.3f}{all_three[trial]:9.3f}",
+            f"{with_nuisance:30.3f}{without:10.3f}{joint_rms_mm[trial]:14.3f}",
             flush=True,
         )
 
 
-def poisson(beam: Beam) -> None:
-    """Poisson's ratio estimated too, and fixed at other values."""
-    near = shipped(beam)
+def print_poisson(beam: Beam) -> None:
+    """Print fits with Poisson's ratio estimated, and fixed at several values."""
+    shipped_answer = shipped(beam)
     free = "parameters.poisson={ guess = 0.45, lower = 0.05, upper = 0.495 }"
-    found = fit(started(beam.load(free), near))
-    report("estimated", found)
-    ratio = found.uncertainty.estimates["poisson"]
+    free_fit = fit(with_guesses_from(beam.load(free), shipped_answer))
+    print_row("estimated", free_fit)
+    ratio = free_fit.uncertainty.estimates["poisson"]
     print(f"ν = {ratio.value:.3f}, {interval(ratio)}")
-    said = dict.fromkeys(
+    notes = dict.fromkeys(
         (
-            *found.uncertainty.notes,
-            *identifiability_sentences(found.uncertainty),
+            *free_fit.uncertainty.notes,
+            *identifiability_sentences(free_fit.uncertainty),
         )
     )
-    print("\n".join(f"- {sentence}" for sentence in said))
+    print("\n".join(f"- {sentence}" for sentence in notes))
     for value in (0.3, 0.4, 0.45, 0.48, 0.49):
-        here = started(
-            beam.load(f"parameters.poisson={{ fixed = {value} }}"), near
+        problem = with_guesses_from(
+            beam.load(f"parameters.poisson={{ fixed = {value} }}"),
+            shipped_answer,
         )
-        report(f"fixed at {value}", fit(here))
+        print_row(f"fixed at {value}", fit(problem))
 
 
 def predicted_rms_mm(
     problem: Problem, trial: str, solution: Solution
 ) -> tuple[float, float]:
-    """RMS distance of a trial at a solution's material: its nuisance fitted, and all zero."""
+    """Return the RMS distances [mm] of a trial at the material of a solution.
+
+    The first is with fitted nuisance parameters of the trial, the second with all of them zero.
+    """
     experiment = next(e for e in problem.experiments if e.name == trial)
     fixed = tuple(
         replace(item, guess=solution.parameters[item.name], is_fixed=True)
@@ -263,19 +273,21 @@ def predicted_rms_mm(
 # Tables ---------------------------------------------------------------------------------------
 
 
-def report(label: str, found: Fit) -> None:
-    young = found.uncertainty.estimates["young_pa"]
+def print_row(label: str, beam_fit: BeamFit) -> None:
+    """Print modulus, interval, damping and RMS distances of one fit in one line."""
+    young = beam_fit.uncertainty.estimates["young_pa"]
     low, high = young.statistical95 or (np.nan, np.nan)
-    values = found.solution.parameters
+    values = beam_fit.solution.parameters
     print(
         f"{label:34}{1e-3 * young.value:8.1f}  {1e-3 * low:.1f} to {1e-3 * high:.1f}"
         f"{1e3 * values['gamma_r_s']:12.2f}{values['gamma_m_1_s']:11.2f}"
-        f"  {rms_line(found.solution)}",
+        f"  {rms_line(beam_fit.solution)}",
         flush=True,
     )
 
 
 def interval(estimate: Estimate) -> str:
+    """Return the statistical interval as text, or the reason why there is none."""
     if estimate.statistical95 is None:
         return estimate.reason or "fixed"
     low, high = estimate.statistical95
@@ -284,6 +296,7 @@ def interval(estimate: Estimate) -> str:
 
 
 def matrix(names: Sequence[str], values: NDArray[np.float64]) -> str:
+    """Return a matrix (p, p) as text, with names of rows and columns."""
     rows = (
         f"{name:14}" + "".join(f"{value:13.3f}" for value in row)
         for name, row in zip(names, values, strict=True)
@@ -293,15 +306,15 @@ def matrix(names: Sequence[str], values: NDArray[np.float64]) -> str:
     )
 
 
-def started(problem: Problem, solution: Solution) -> Problem:
-    """The problem with an answer's values as guesses of what both estimate."""
-    found = solution.parameters
+def with_guesses_from(problem: Problem, solution: Solution) -> Problem:
+    """Return the problem with the estimates of a solution as guesses of its free parameters."""
+    values = solution.parameters
     items = tuple(
         item
         if isinstance(item, FieldCoefficients)
         or item.is_fixed
-        or item.name not in found
-        else replace(item, guess=found[item.name])
+        or item.name not in values
+        else replace(item, guess=values[item.name])
         for item in problem.parameters.items
     )
     return replace(problem, parameters=replace(problem.parameters, items=items))
@@ -312,6 +325,7 @@ def rms_mm(solution: Solution) -> list[float]:
 
 
 def rms_of(part: ExperimentIterate) -> float:
+    """Return the RMS marker distance of one experiment [mm]."""
     squares = part.segment.markers.squared_distances_m2(part.x, part.phi)
     return 1e3 * float(np.sqrt(squares.mean()))
 

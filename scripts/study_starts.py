@@ -57,20 +57,32 @@ BOUNDS = {
     "gamma_r_s": (1e-5, 1.0),
     "gamma_m_1_s": (1e-3, 100.0),
 }
+# Radius and height of the cylinder [m].
 RADIUS_M = 0.04
 HEIGHT_M = 0.16
+# Sampling interval [s], and standard deviation of each marker coordinate [m].
 STEP_S = 0.01
 SIGMA_M = 1e-3
-TOLERANCE = 0.01
-ERRORS = 3.0
-ENDED = ("converged", "acceptable")
+# A start succeeds within this share of the best answer, or within this number of standard errors.
+SUCCESS_SHARE = 0.01
+STANDARD_ERRORS = 3.0
+# Statuses of a solve whose answer can be a success.
+SOLVED_STATUSES = ("converged", "acceptable")
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
-    """A body that was swung, and the parameters that its tracks were made with.
+class SwungBody:
+    """Recording of a swung body, and its true parameters.
 
-    Noise of `noise_m` is what its markers have, and are said to have.
+    Attributes
+    ----------
+    experiment : Experiment
+    truth : mapping
+        True constants.
+    scheme : str
+        Scheme of simulation and fit.
+    noise_m : float
+        Standard deviation of each marker coordinate [m], which is also the stated one.
     """
 
     experiment: Experiment
@@ -80,10 +92,32 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """One start; the ratio and the errors are to the best answer of all, of the worst parameter.
+class StartOutcome:
+    """Result of one start, compared with the best answer of all starts.
 
-    `excess` is by how much its loss is higher, `same_fit` whether that alone makes it a success.
+    Attributes
+    ----------
+    number : int
+        Number of the start, from 0 on; without a guess the seed of the noise.
+    status : str
+        Status of the solve; "refused" if the problem was rejected.
+    success : bool
+    same_fit : bool
+        Whether the start succeeds only because its fit is equally good.
+    sweeps : float
+        Factorisations divided by the number of time steps.
+    time_s : float
+        Time of the solve and of the scan [s].
+    loss, excess : float
+        Loss, and by how much it exceeds the smallest one.
+    rms_m : float
+        Root mean square of the marker residuals [m].
+    worst_ratio, worst_errors : float
+        Largest difference of a parameter from the best answer: as a factor, in standard errors.
+    guess, estimates : tuple of float
+        Initial guesses and estimates; NaN without one.
+    notes : tuple of str
+    message : str
     """
 
     number: int
@@ -98,7 +132,7 @@ class Outcome:
     worst_ratio: float
     worst_errors: float
     guess: tuple[float, ...]
-    found: tuple[float, ...]
+    estimates: tuple[float, ...]
     notes: tuple[str, ...]
     message: str
 
@@ -113,27 +147,33 @@ def main() -> None:
     parser.add_argument(
         "--unguessed",
         action="store_true",
-        help="no guess at all, and other noise every time",
+        help="start without a guess, each start with other noise",
     )
     parser.add_argument(
         "--unplaced",
         action="store_true",
-        help="markers' places are unknown too",
+        help="the places of the markers are unknown",
     )
     parser.add_argument(
         "--ideal", action="store_true", help="no nuisance parameters"
     )
     parser.add_argument("--method", default="reduced-space")
-    parser.add_argument("--noise-m", type=float, help="other than the case's")
+    parser.add_argument(
+        "--noise-m",
+        type=float,
+        help="standard deviation of the noise, if not that of the body",
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--only", type=int, nargs="*", help="numbers of the starts to run"
     )
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    found = {}
+    outcomes_by_body = {}
     for body in arguments.bodies:
-        case = described(CASES[body](), arguments.unplaced, arguments.ideal)
+        case = with_description(
+            CASES[body](), arguments.unplaced, arguments.ideal
+        )
         noise_m = (
             case.noise_m if arguments.noise_m is None else arguments.noise_m
         )
@@ -142,35 +182,37 @@ def main() -> None:
         )
         if arguments.unguessed:
             seeds = arguments.only or range(arguments.starts)
-            found[body] = [
-                unguessed(case, noise_m, seed, arguments.method)
+            outcomes_by_body[body] = [
+                solve_without_guess(case, noise_m, seed, arguments.method)
                 for seed in seeds
             ]
         else:
-            noisy = with_noise(case, noise_m, arguments.seed)
-            found[body] = study(noisy, starts, arguments.method, arguments.only)
+            noisy_body = with_noise(case, noise_m, arguments.seed)
+            outcomes_by_body[body] = study(
+                noisy_body, starts, arguments.method, arguments.only
+            )
         if not arguments.json:
-            print(f"{body}: {summary(found[body])}", flush=True)
+            print(f"{body}: {summary(outcomes_by_body[body])}", flush=True)
     if arguments.json:
-        listed = {
+        records = {
             body: [asdict(each) for each in outcomes]
-            for body, outcomes in found.items()
+            for body, outcomes in outcomes_by_body.items()
         }
-        print(json.dumps(listed, indent=1))
+        print(json.dumps(records, indent=1))
 
 
 # Bodies -------------------------------------------------------------------------------------------
 
 
-def cylinder() -> Case:
-    """The paper's: 171 nodes of foam, 100 steps of 10 ms."""
-    return Case(
+def cylinder() -> SwungBody:
+    """Return the cylinder of the paper: 171 nodes of foam, 100 steps of 10 ms."""
+    return SwungBody(
         hanging_cylinder(layers=8, steps=100, scheme="midpoint", rings=2), TRUTH
     )
 
 
-def soft_bar() -> Case:
-    """A bar of 220 × 35 × 50 mm of E = 2 kPa and 95 kg/m³, clamped: its tip hangs down."""
+def soft_bar() -> SwungBody:
+    """Return a clamped bar of 220 × 35 × 50 mm with E = 2 kPa and 95 kg/m³, whose tip hangs down."""
     body = Body(
         box_mesh((0.22, 0.035, 0.05), (11, 2, 3)),
         density_kg_m3=95.0,
@@ -184,20 +226,20 @@ def soft_bar() -> Case:
         rise_s=0.3,
         start=Rotation.identity(),
     )
-    held = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
-    return measured(
+    clamped_nodes = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
+    return swung_body(
         body,
-        held,
+        clamped_nodes,
         motion,
         moduli(2e3, 0.3) | {"gamma_r_s": 0.01, "gamma_m_1_s": 0.5},
     )
 
 
-def silicone_block() -> Case:
-    """A block of 60 × 60 × 100 mm that hangs, of E = 500 kPa and 1100 kg/m³.
+def silicone_block() -> SwungBody:
+    """Return a hanging block of 60 × 60 × 100 mm with E = 500 kPa and 1100 kg/m³.
 
-    It sways by some tenths of a millimetre, so its markers are seen as well as that: noise of 1 mm
-    would tell nothing of its damping.
+    The block deforms by some tenths of a millimetre. The noise of its markers is therefore 0.1 mm:
+    with 1 mm the data would not determine the damping.
     """
     body = Body(
         box_mesh((0.06, 0.06, 0.1), (3, 3, 5)),
@@ -212,12 +254,13 @@ def silicone_block() -> Case:
         rise_s=0.3,
         start=HANGING,
     )
-    held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
+    clamped_nodes = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
     truth = moduli(5e5, 0.45) | {"gamma_r_s": 2e-3, "gamma_m_1_s": 0.5}
-    return measured(body, held, motion, truth, noise_m=1e-4)
+    return swung_body(body, clamped_nodes, motion, truth, noise_m=1e-4)
 
 
 def moduli(young_pa: float, poisson: float) -> dict[str, float]:
+    """Return λ and μ [Pa]."""
     shear = young_pa / (2 * (1 + poisson))
     return {
         "lambda_pa": 2 * shear * poisson / (1 - 2 * poisson),
@@ -225,33 +268,42 @@ def moduli(young_pa: float, poisson: float) -> dict[str, float]:
     }
 
 
-def measured(
+def swung_body(
     body: Body,
-    held: NDArray[np.int64],
+    clamped_nodes: NDArray[np.int64],
     motion: Swing,
     truth: Mapping[str, float],
     noise_m: float = SIGMA_M,
-) -> Case:
-    """A body swung from its rest state, with tracks of every fifth node outside."""
+) -> SwungBody:
+    """Return the recording of a swung body, with exact tracks of every fifth node of its surface.
+
+    `clamped_nodes` are the nodes in the gripper, `noise_m` is the noise that the markers state [m].
+    """
     poses = motion.poses(STEP_S)
     nodes = body.nodes_m
     at_side = (nodes == nodes.min(axis=0)) | (nodes == nodes.max(axis=0))
-    marked = np.setdiff1d(np.flatnonzero(at_side.any(axis=1)), held)[::5]
-    nowhere = np.zeros((len(poses.t_s), len(marked), 3))
+    marked_nodes = np.setdiff1d(
+        np.flatnonzero(at_side.any(axis=1)), clamped_nodes
+    )[::5]
+    no_tracks = np.zeros((len(poses.t_s), len(marked_nodes), 3))
     markers = Markers(
-        poses.t_s, nowhere, noise_m, places_m=body.nodes_m[marked]
+        poses.t_s, no_tracks, noise_m, places_m=body.nodes_m[marked_nodes]
     )
-    grasp = Grasp(held, poses)
+    grasp = Grasp(clamped_nodes, poses)
     ideal = Nuisance.none()
     experiment = Experiment(
         body, poses.t_s, [grasp], markers, name="swing", nuisance=ideal
     )
     tracks = simulate(experiment, truth, "midpoint", substeps=1).markers_m
-    return Case(with_markers(experiment, tracks), truth, noise_m=noise_m)
+    return SwungBody(with_markers(experiment, tracks), truth, noise_m=noise_m)
 
 
-def described(case: Case, unplaced: bool, ideal: bool) -> Case:
-    """The case with the default nuisance parameters or none, maybe without its markers' places."""
+def with_description(case: SwungBody, unplaced: bool, ideal: bool) -> SwungBody:
+    """Return the body as a problem describes it.
+
+    If `ideal`, no nuisance parameters are estimated, else the default ones; if `unplaced`, the places
+    of the markers are unknown.
+    """
     experiment = case.experiment
     if unplaced:
         markers = experiment.markers
@@ -263,7 +315,8 @@ def described(case: Case, unplaced: bool, ideal: bool) -> Case:
     return replace(case, experiment=replace(experiment, nuisance=nuisance))
 
 
-def with_noise(case: Case, noise_m: float, seed: int) -> Case:
+def with_noise(case: SwungBody, noise_m: float, seed: int) -> SwungBody:
+    """Return the recording with noise of a standard deviation [m] on its tracks."""
     tracks = case.experiment.markers.positions_m
     noise = np.random.default_rng(seed).normal(size=tracks.shape) * noise_m
     return replace(
@@ -271,7 +324,7 @@ def with_noise(case: Case, noise_m: float, seed: int) -> Case:
     )
 
 
-CASES: dict[str, Callable[[], Case]] = {
+CASES: dict[str, Callable[[], SwungBody]] = {
     "cylinder": cylinder,
     "soft-bar": soft_bar,
     "silicone-block": silicone_block,
@@ -281,7 +334,10 @@ CASES: dict[str, Callable[[], Case]] = {
 def hanging_cylinder(
     layers: int, steps: int, scheme: str, rings: int = 1
 ) -> Experiment:
-    """A cylinder held at one end, hanging and swung, with tracks of its own scheme."""
+    """Return the recording of a hanging, swung cylinder with exact tracks of a scheme.
+
+    `layers` and `rings` are numbers of elements, `steps` is the number of samples.
+    """
     shape = cylinder_mesh(RADIUS_M, HEIGHT_M, rings, layers)
     body = Body(shape, density_kg_m3=20.0, damping="rayleigh")
     t_s = STEP_S * np.arange(steps, dtype=np.float64)
@@ -291,13 +347,15 @@ def hanging_cylinder(
         amplitude_rad=(0.1, 0.1, 0.6),
         frequency_hz=(0.9, 1.1, 1.3),
         rise_s=0.3,
-        start=Rotation.from_rotvec([np.pi, 0, 0]),  # it hangs
+        start=Rotation.from_rotvec([np.pi, 0, 0]),  # the cylinder hangs
     )
     heights = body.nodes_m[:, 2]
     on_side = np.linalg.norm(body.nodes_m[:, :2], axis=1) > RADIUS_M / 2
-    marked = np.flatnonzero(on_side & (heights > 0.2 * HEIGHT_M))[::5]
-    nowhere = np.zeros((steps, len(marked), 3))
-    markers = Markers(t_s, nowhere, SIGMA_M, places_m=body.nodes_m[marked])
+    marked_nodes = np.flatnonzero(on_side & (heights > 0.2 * HEIGHT_M))[::5]
+    no_tracks = np.zeros((steps, len(marked_nodes), 3))
+    markers = Markers(
+        t_s, no_tracks, SIGMA_M, places_m=body.nodes_m[marked_nodes]
+    )
     grasp = Grasp(np.flatnonzero(heights < 1e-9), poses)
     ideal = Nuisance.none()
     experiment = Experiment(
@@ -314,31 +372,46 @@ def hanging_cylinder(
 def guesses(
     count: int, factor: float, seed: int, truth: Mapping[str, float] = TRUTH
 ) -> NDArray[np.float64]:
-    """(count, p) log-uniform within a factor of the truth."""
+    """Return guesses (count, p), log-uniform within a factor of the truth."""
     spread = np.random.default_rng(seed).uniform(-1, 1, (count, len(truth)))
     return np.array(list(truth.values())) * factor**spread
 
 
 def study(
-    case: Case,
+    case: SwungBody,
     starts: NDArray[np.float64],
     method: str = "reduced-space",
     only: list[int] | None = None,
-) -> list[Outcome]:
-    """Solve from the truth, for the best answer, and from every start; NaN is no guess."""
+) -> list[StartOutcome]:
+    """Solve from the truth and from every start, and compare with the best answer.
+
+    Parameters
+    ----------
+    case : SwungBody
+    starts : (S, p) array
+        Initial guesses; NaN for no guess.
+    method : str
+    only : list of int or None
+        Numbers of the starts that are solved; None for all.
+
+    Raises
+    ------
+    SystemExit
+        If the solve from the truth does not converge.
+    """
     truth = np.array(list(case.truth.values()))
     best = solve(problem_of(case, truth), method)
     if not best.status.converged:
         raise SystemExit(f"from the truth: {best.message}")
     fit = linearise_fit(best.collocation, best.z)
-    found = uncertainty_from_fit(
+    uncertainty = uncertainty_from_fit(
         fit,
         best.collocation.parameters,
         best.q,
         ErrorModel("given", "independent"),
     )
     std_errors = [
-        found.estimates[name].statistical_std_error or np.nan
+        uncertainty.estimates[name].statistical_std_error or np.nan
         for name in case.truth
     ]
     outcomes = []
@@ -349,68 +422,81 @@ def study(
     losses = [best.history[-1].loss, *(each.loss for each in outcomes)]
     answers = [
         tuple(best.parameters[name] for name in case.truth),
-        *(e.found for e in outcomes),
+        *(e.estimates for e in outcomes),
     ]
-    ended = [True, *(each.status in ENDED for each in outcomes)]
-    first = min(np.flatnonzero(ended), key=lambda k: losses[k])
-    least = losses[first]
-    reference = np.array(answers[first])
+    has_ended = [True, *(each.status in SOLVED_STATUSES for each in outcomes)]
+    best_index = min(np.flatnonzero(has_ended), key=lambda k: losses[k])
+    smallest_loss = losses[best_index]
+    reference = np.array(answers[best_index])
     return [
-        judged(each, reference, least, np.array(std_errors))
+        with_success(each, reference, smallest_loss, np.array(std_errors))
         for each in outcomes
     ]
 
 
-def unguessed(case: Case, noise_m: float, seed: int, method: str) -> Outcome:
-    """Solve without a guess, with noise of its own, and compare with the fit of the truth."""
+def solve_without_guess(
+    case: SwungBody, noise_m: float, seed: int, method: str
+) -> StartOutcome:
+    """Solve a recording with the noise of a seed without a guess, and compare with the loss of the truth."""
     noisy = with_noise(case, noise_m, seed)
     outcome = attempt(noisy, seed, np.full(len(case.truth), np.nan), method)
     print(end=".", file=sys.stderr, flush=True)
     excess = outcome.loss - loss_of_truth(noisy, case)
-    ratios = np.abs(np.log(np.array(outcome.found) / list(case.truth.values())))
+    ratios = np.abs(
+        np.log(np.array(outcome.estimates) / list(case.truth.values()))
+    )
     return replace(
         outcome,
-        success=excess < 0 and outcome.status in ENDED,
+        success=excess < 0 and outcome.status in SOLVED_STATUSES,
         excess=excess,
         worst_ratio=float(np.exp(ratios.max())),
         worst_errors=np.nan,
     )
 
 
-def loss_of_truth(noisy: Case, clean: Case) -> float:
-    """The noise's sum of squares, in its deviations."""
-    seen = noisy.experiment.markers
-    true = clean.experiment.markers.positions_m
+def loss_of_truth(noisy: SwungBody, clean: SwungBody) -> float:
+    """Return the sum of squares of the noise, in standard deviations."""
+    noisy_markers = noisy.experiment.markers
+    true_positions_m = clean.experiment.markers.positions_m
     return float(
-        (((seen.positions_m - true) / seen.sigma_m[:, None]) ** 2).sum()
+        (
+            (
+                (noisy_markers.positions_m - true_positions_m)
+                / noisy_markers.sigma_m[:, None]
+            )
+            ** 2
+        ).sum()
     )
 
 
 def attempt(
-    case: Case, number: int, guess: NDArray[np.float64], method: str
-) -> Outcome:
-    """Solve a case from one initial guess, and return its errors and its number of sweeps."""
-    given = tuple(guess.tolist())
-    nothing = (np.nan,) * len(guess)
+    case: SwungBody, number: int, guess: NDArray[np.float64], method: str
+) -> StartOutcome:
+    """Solve from one initial guess (p,); success and errors are set later, by `with_success`."""
+    guess_values = tuple(guess.tolist())
+    no_estimates = (np.nan,) * len(guess)
     with counted_factorisations() as count:
         try:
             solution = solve(problem_of(case, guess), method)
         except InputError as error:
-            worst = (np.inf, np.inf, np.nan, np.inf, np.inf)
-            return Outcome(
+            return StartOutcome(
                 number,
-                "refused",
-                False,
-                False,
-                0.0,
-                0.0,
-                *worst,
-                given,
-                nothing,
-                (),
-                str(error),
+                status="refused",
+                success=False,
+                same_fit=False,
+                sweeps=0.0,
+                time_s=0.0,
+                loss=np.inf,
+                excess=np.inf,
+                rms_m=np.nan,
+                worst_ratio=np.inf,
+                worst_errors=np.inf,
+                guess=guess_values,
+                estimates=no_estimates,
+                notes=(),
+                message=str(error),
             )
-    return Outcome(
+    return StartOutcome(
         number,
         solution.status.value,
         False,
@@ -423,47 +509,55 @@ def attempt(
         solution.rms_m,
         np.inf,
         np.inf,
-        given,
+        guess_values,
         tuple(solution.parameters[name] for name in case.truth),
         tuple(solution.notes),
         solution.message,
     )
 
 
-def judged(
-    outcome: Outcome,
+def with_success(
+    outcome: StartOutcome,
     best: NDArray[np.float64],
-    least: float,
+    smallest_loss: float,
     std_errors: NDArray[np.float64],
-) -> Outcome:
-    """The outcome compared with the best answer."""
-    found = np.array(outcome.found)
-    excess = outcome.loss - least
-    ratios = np.abs(np.log(found / best))
-    errors = np.abs(found - best) / std_errors
-    close = bool(((ratios < TOLERANCE) | (errors < ERRORS)).all())
-    # The loss is χ².
-    as_well = excess < ERRORS**2
+) -> StartOutcome:
+    """Return the outcome with its success, by comparison with the best answer.
+
+    `best` (p,) are the estimates of the best answer, `smallest_loss` is its loss, and `std_errors` (p,)
+    are their standard errors.
+    """
+    estimates = np.array(outcome.estimates)
+    excess = outcome.loss - smallest_loss
+    ratios = np.abs(np.log(estimates / best))
+    errors = np.abs(estimates - best) / std_errors
+    is_close = bool(
+        ((ratios < SUCCESS_SHARE) | (errors < STANDARD_ERRORS)).all()
+    )
+    # The loss follows a χ² distribution, so that this difference is that of as many standard deviations.
+    fits_equally = excess < STANDARD_ERRORS**2
     return replace(
         outcome,
-        success=(close or as_well) and outcome.status in ENDED,
-        same_fit=as_well and not close,
+        success=(is_close or fits_equally)
+        and outcome.status in SOLVED_STATUSES,
+        same_fit=fits_equally and not is_close,
         excess=excess,
         worst_ratio=float(np.exp(ratios.max())),
         worst_errors=float(np.nanmax(errors, initial=0.0)),
     )
 
 
-def problem_of(case: Case, guess: NDArray[np.float64]) -> Problem:
-    """The problem with guesses where they are numbers."""
-    given = {
+def problem_of(case: SwungBody, guess: NDArray[np.float64]) -> Problem:
+    """Return the problem with initial guesses (p,); NaN for no guess."""
+    unknowns = {
         name: Unknown(float(value) if np.isfinite(value) else None)
         for name, value in zip(case.truth, guess, strict=True)
     }
-    return Problem([case.experiment], given, scheme=case.scheme, substeps=1)
+    return Problem([case.experiment], unknowns, scheme=case.scheme, substeps=1)
 
 
 def parameters(values: NDArray[np.float64]) -> Parameters:
+    """Return the four parameters with guesses (4,) and `BOUNDS`."""
     return Parameters(
         tuple(
             Parameter(name, float(value), *BOUNDS[name])
@@ -474,7 +568,7 @@ def parameters(values: NDArray[np.float64]) -> Parameters:
 
 @contextmanager
 def counted_factorisations() -> Iterator[list[int]]:
-    """Count the matrices factorised meanwhile."""
+    """Count the factorised matrices in the body of a with statement; the list has the current number."""
     count = [0]
     original = Factoriser.factorise
 
@@ -489,7 +583,8 @@ def counted_factorisations() -> Iterator[list[int]]:
         Factoriser.factorise = original
 
 
-def summary(outcomes: list[Outcome]) -> str:
+def summary(outcomes: list[StartOutcome]) -> str:
+    """Return numbers of successes, sweeps and time, and one line for each failure."""
     sweeps = [outcome.sweeps for outcome in outcomes if outcome.success]
     failures = [outcome for outcome in outcomes if not outcome.success]
     lines = [
@@ -502,14 +597,14 @@ def summary(outcomes: list[Outcome]) -> str:
         f"failures: {dict(Counter(outcome.status for outcome in failures)) or 'none'}",
     ]
     for outcome in failures:
-        guess, found = (
+        guess, estimates = (
             " ".join(f"{value:.4g}" for value in values)
-            for values in (outcome.guess, outcome.found)
+            for values in (outcome.guess, outcome.estimates)
         )
         lines.append(
-            f"  {outcome.number}: {guess} -> {found}, {outcome.sweeps:.1f} sweeps, "
-            f"rms {1e3 * outcome.rms_m:.3g} mm, a factor of {outcome.worst_ratio:.3g} and "
-            f"{outcome.worst_errors:.2g} standard errors off, loss {outcome.excess:.3g} higher: "
+            f"  {outcome.number}: {guess} -> {estimates}, {outcome.sweeps:.1f} sweeps, "
+            f"RMS {1e3 * outcome.rms_m:.3g} mm, largest error a factor of {outcome.worst_ratio:.3g} or "
+            f"{outcome.worst_errors:.2g} standard errors, loss {outcome.excess:.3g} higher: "
             f"{outcome.message}"
         )
     return "\n".join(lines)

@@ -1,9 +1,9 @@
-"""Do intervals for noise and step hold the truth, with one step a sample and as many as chosen?
+"""Coverage of intervals for noise and time step, with one step per sample and with the chosen number.
 
     python scripts/study_step.py [twins of each body and noise] [first seed]
 
-The bodies of `study_refinement`, simulated on their own mesh by Newmark's rule at a sixteenth of
-the samples' distance, and 0.05, 0.2 or 1 mm of noise.
+The bodies of `study_refinement` are simulated on the mesh of the fit by Newmark's scheme with a
+sixteenth of the sampling interval, and with noise of 0.05, 0.2 or 1 mm.
 """
 
 from __future__ import annotations
@@ -13,69 +13,91 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
-from study_refinement import BODIES, NAMES, STEP_S, still
+from study_refinement import BODIES, NAMES, STEP_S, unmeasured_problem
 
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.runs.result_content import ReportedEstimate
 
+# Standard deviations of each marker coordinate [m].
 NOISES_M = (5e-5, 2e-4, 1e-3)
 
 
 def twin(
     name: str, noise_m: float, seed: int
 ) -> tuple[Problem, dict[str, float]]:
-    """A problem with data of a far finer step, and what is true."""
+    """Return a problem with tracks of a much finer time step, and its true parameters."""
     rng = np.random.default_rng(seed)
-    problem, truth = still(name, rng)
-    (moved,) = problem.experiments
+    problem, truth = unmeasured_problem(name, rng)
+    (experiment,) = problem.experiments
     markers = replace(
-        moved.markers, sigma_m=np.full(len(moved.markers.names), noise_m)
+        experiment.markers,
+        sigma_m=np.full(len(experiment.markers.names), noise_m),
     )
-    tracks = simulate(moved, truth, timestep_s=STEP_S / 16).markers_m
+    tracks = simulate(experiment, truth, timestep_s=STEP_S / 16).markers_m
     noise = rng.normal(scale=noise_m, size=tracks.shape)
-    seen = with_markers(replace(moved, markers=markers), tracks + noise)
-    return replace(problem, experiments=[seen]), truth
+    recording = with_markers(
+        replace(experiment, markers=markers), tracks + noise
+    )
+    return replace(problem, experiments=[recording]), truth
 
 
 def main(twins: int = 20, first: int = 0) -> None:
-    """Print how many intervals hold the truth."""
+    """Print the coverage of the intervals, and how often each number of steps was chosen.
+
+    `twins` is the number of twins of each body and noise, `first` the first seed.
+    """
     for noise_m in NOISES_M:
-        held = Counter()
+        covered = Counter()
         steps = Counter()
-        all_of_them = 0
+        count = 0
         for name in BODIES:
             for seed in range(first, first + twins):
                 problem, truth = twin(name, noise_m, seed)
-                one = run(replace(problem, substeps=1), seek_causes=False)
-                chosen = run(problem, seek_causes=False)
-                steps[chosen.solution.collocation.substeps] += 1
+                one_step_answer = run(
+                    replace(problem, substeps=1), seek_causes=False
+                )
+                chosen_step_answer = run(problem, seek_causes=False)
+                steps[chosen_step_answer.solution.collocation.substeps] += 1
                 for key in NAMES[:3]:
-                    ends = {
-                        "noise": one.optimum[key].statistical95,
-                        "noise, corrected": one.estimates[key].statistical95,
-                        "noise and step": _with_step(one.estimates[key]),
-                        "chosen": _with_step(chosen.estimates[key]),
+                    intervals = {
+                        "one step, noise": one_step_answer.optimum[
+                            key
+                        ].statistical95,
+                        "one step, noise, estimate corrected": one_step_answer.estimates[
+                            key
+                        ].statistical95,
+                        "one step, noise and step": _interval_with_step(
+                            one_step_answer.estimates[key]
+                        ),
+                        "chosen steps, noise and step": _interval_with_step(
+                            chosen_step_answer.estimates[key]
+                        ),
                     }
-                    if all(ends.values()):
-                        all_of_them += 1
-                        held.update(
+                    if all(intervals.values()):
+                        count += 1
+                        covered.update(
                             k
-                            for k, e in ends.items()
+                            for k, e in intervals.items()
                             if e and e[0] <= truth[key] <= e[1]
                         )
         shares = ", ".join(
-            f"{kind} {100 * n / all_of_them:.0f} %" for kind, n in held.items()
+            f"{kind} {100 * n / count:.0f} %" for kind, n in covered.items()
         )
         print(
-            f"{1e3 * noise_m:g} mm, {all_of_them} intervals held: {shares}",
+            f"noise {1e3 * noise_m:g} mm, coverage of {count} intervals: {shares}",
             flush=True,
         )
-        print(f"    steps a sample: {dict(sorted(steps.items()))}", flush=True)
+        print(
+            f"    number of twins by chosen steps per sample: {dict(sorted(steps.items()))}",
+            flush=True,
+        )
 
 
-def _with_step(estimate: ReportedEstimate) -> tuple[float, float] | None:
+def _interval_with_step(
+    estimate: ReportedEstimate,
+) -> tuple[float, float] | None:
     """Return the interval for noise and time step; that for noise if the step changes nothing."""
     error = estimate.numerical_error
     return estimate.statistical95 if error is None else error.interval95

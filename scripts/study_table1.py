@@ -1,7 +1,8 @@
-"""The paper's Table I with every method: problems/table1, from one guess, data of its own scheme.
+"""Table I of the paper with every method, for problems/table1 with data of the scheme of the fit.
 
-The paper paid for the dynamics by a penalty and found 734.3, 182.8, 0.021 and 0.91; its tip
-missed by 15 cm when it was simulated with these.
+All methods start from the same guess. The paper uses a penalty for the equations of motion; its
+estimates are 734.3, 182.8, 0.021 and 0.91, and in a simulation with these the error of the tip is
+15 cm.
 
     python scripts/study_table1.py
     python scripts/study_table1.py --methods interior-point --time-s 600
@@ -13,13 +14,22 @@ import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from studies import HEADS, TRUTH, Variant, markdown, number, run_variants, save
+from studies import (
+    PARAMETER_SYMBOLS,
+    TRUTH,
+    Variant,
+    markdown,
+    number,
+    run_variants,
+    save,
+)
 
 from collocation_sysid.extras.studies.study_rows import Row
 
 PROBLEM = (
     Path(__file__).parents[1] / "problems" / "table1" / "problem_scheme.toml"
 )
+# Options of methods: inner Levenberg–Marquardt solver.
 LM = {"inner": "levenberg-marquardt"}
 VARIANTS = (
     Variant("reduced-space", "reduced-space"),
@@ -31,7 +41,7 @@ VARIANTS = (
         {"rho": 1e2},
     ),
     Variant("penalty, CG", "penalty"),
-    # Without the schedule, the weight that the first stage has, and a large one.
+    # Constant weights: that of the first stage of the schedule, and a large one.
     Variant(
         "penalty, CG, ρ = 1e2",
         "penalty",
@@ -43,10 +53,11 @@ VARIANTS = (
         {"schedule": "constant", "rho": 1e6, "inner_iterations": 10000},
     ),
     Variant("penalty, LM", "penalty", LM),
-    # Not from a coarse solution by reduced space.
+    # Initial trajectories are simulated at the guess, not taken from a coarse solution by reduced space.
     Variant("interior-point", "interior-point", {"initial": "simulation"}),
 )
-PAPER = (
+# Row of the paper, with the heads of `table`.
+PAPER_ROW = (
     *("paper, penalty and CG", "734.3", "182.8", "0.021", "0.91"),
     *("1 (mean)", "–", "–", "150", "–", "–", "–"),
 )
@@ -62,7 +73,7 @@ def main() -> None:
         "--methods", nargs="*", choices=names, default=names[:-1]
     )
     parser.add_argument(
-        "--time-s", type=float, default=180.0, help="limit of a run"
+        "--time-s", type=float, default=180.0, help="time limit of a run [s]"
     )
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument(
@@ -80,14 +91,14 @@ def main() -> None:
 
 
 def table(rows: Mapping[str, Sequence[Row]]) -> str:
-    """Estimates and how far they are to be believed, as Markdown."""
+    """Return a Markdown table of the estimates, misfits and constraint violations."""
     heads = (
         *(
             "method",
-            *HEADS,
-            "marker rms [mm]",
-            "violation [N]",
-            "relative",
+            *PARAMETER_SYMBOLS,
+            "RMS marker residual [mm]",
+            "constraint violation [N]",
+            "relative violation",
             "tip error [mm]",
         ),
         *("iterations", "time [s]", "status"),
@@ -98,7 +109,7 @@ def table(rows: Mapping[str, Sequence[Row]]) -> str:
         *("0",) * 4,
         *"–––",
     )
-    lines = [truth, PAPER]
+    lines = [truth, PAPER_ROW]
     for name, (row, *_) in rows.items():
         lines.append(
             (

@@ -40,19 +40,36 @@ from collocation_sysid.statistics.misspecification.plausibility import (
     size_and_density_hypotheses,
 )
 
-# With fewer steps the scheme, not a mistake, would be what is recognised.
+# Samples, sampling interval [s] and time steps per sample; with fewer steps the verdict would report
+# the error of the scheme instead of the fault.
 SAMPLES = 60
 STEP_S = 0.01
 SUBSTEPS = 3
+# Standard deviation of each marker coordinate [m].
 SIGMA_M = 1e-3
-# An answer is right whose parameters are all within so many standard errors.
-RIGHT = 3.0
+# An answer is right if the errors of all parameters are less than this number of standard errors.
+RIGHT_STANDARD_ERRORS = 3.0
+# True damping of all twins.
 DAMPING = {"gamma_r_s": 0.01, "gamma_m_1_s": 2.0}
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """Verdict on one twin, and the largest error of its parameters in standard errors."""
+class VerdictOutcome:
+    """Verdict on one twin, and the largest error of its parameters.
+
+    Attributes
+    ----------
+    fault : str
+        "none", or a key of `FAULTS`.
+    seed : int
+    verdict : str
+        "refused" if the problem is rejected before it is solved.
+    reasons : tuple of str
+    worst_errors : float or None
+        Largest error, in standard errors; None without estimates.
+    worst : str or None
+        Name of the parameter with this error.
+    """
 
     fault: str
     seed: int
@@ -63,14 +80,21 @@ class Outcome:
 
     @property
     def is_right(self) -> bool:
-        """Whether the error bars hold the truth after all."""
-        return self.worst_errors is not None and self.worst_errors < RIGHT
+        """Whether all parameters are within `RIGHT_STANDARD_ERRORS` of the truth."""
+        return (
+            self.worst_errors is not None
+            and self.worst_errors < RIGHT_STANDARD_ERRORS
+        )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--twins", type=int, default=200, help="faultless ones")
-    parser.add_argument("--faulty", type=int, default=9, help="of each fault")
+    parser.add_argument(
+        "--twins", type=int, default=200, help="number of twins without a fault"
+    )
+    parser.add_argument(
+        "--faulty", type=int, default=9, help="number of twins with each fault"
+    )
     parser.add_argument(
         "--only",
         nargs="*",
@@ -79,21 +103,21 @@ def main() -> None:
     )
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument(
-        "--json", type=Path, help="a file for every twin, a line each"
+        "--json", type=Path, help="file to which one line per twin is appended"
     )
     arguments = parser.parse_args()
     rows = []
-    faulty = []
+    faulty_outcomes = []
     began = time.perf_counter()
     for name in arguments.only:
         count = arguments.twins if name == "none" else arguments.faulty
         outcomes = []
         for seed in range(arguments.first, arguments.first + count):
-            outcomes.append(judged(name, seed))
+            outcomes.append(judge_twin(name, seed))
             if arguments.json:
                 with arguments.json.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(asdict(outcomes[-1])) + "\n")
-        faulty += outcomes if name != "none" else []
+        faulty_outcomes += outcomes if name != "none" else []
         rows.append(row(name, outcomes))
         print(" | ".join(rows[-1]), flush=True)
     heads = (
@@ -102,28 +126,30 @@ def main() -> None:
         "doubtful",
         "check",
         "good",
-        "of these right",
-        "mostly said",
+        "good and right",
+        "most frequent reasons",
     )
-    print(markdown(heads, [*rows, row("all with a fault", faulty)]))
+    print(markdown(heads, [*rows, row("all with a fault", faulty_outcomes)]))
     print(f"{time.perf_counter() - began:.0f} s")
 
 
-def row(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
-    """Return a row of the table: the number of twins with each verdict."""
+def row(name: str, outcomes: Sequence[VerdictOutcome]) -> tuple[str, ...]:
+    """Return a row of the table: numbers of twins with each verdict, and the most frequent reasons."""
     verdicts = Counter(each.verdict for each in outcomes)
     counts = [
         str(verdicts[word]) for word in ("refused", "doubtful", "check", "good")
     ]
-    right = sum(each.verdict == "good" and each.is_right for each in outcomes)
-    said = Counter(
+    right_count = sum(
+        each.verdict == "good" and each.is_right for each in outcomes
+    )
+    reasons = Counter(
         subject(each.reasons[0]) for each in outcomes if each.reasons
     )
     return (
         name,
         *counts,
-        str(right),
-        "; ".join(f"{n} × {text}" for text, n in said.most_common(2)),
+        str(right_count),
+        "; ".join(f"{n} × {text}" for text, n in reasons.most_common(2)),
     )
 
 
@@ -135,10 +161,10 @@ def subject(reason: str) -> str:
     )[0].strip()
 
 
-def judged(fault: str, seed: int) -> Outcome:
-    """Verdict on one twin; "refused" where the problem is not even read or solved."""
-    problem, truth = swung(seed)
-    # Nothing but the stated fault is unlike the twin: its systematic effects are none.
+def judge_twin(fault: str, seed: int) -> VerdictOutcome:
+    """Return the verdict on the twin of a seed with a fault; "refused" if the problem is rejected."""
+    problem, truth = swung_twin(seed)
+    # The stated fault is the only error: the twin has no systematic effects.
     problem = replace(
         problem, uncertainty=UncertaintyOptions(assumptions=Assumptions.exact())
     )
@@ -153,38 +179,38 @@ def judged(fault: str, seed: int) -> Outcome:
             require_plausible_markers(
                 experiment, typical_constants(problem.parameters)
             )
-        found = run(problem, seek_causes=False)
-        if found.trust.verdict == "good":
-            found = replace(
-                found, causes=find_misspecifications(found.solution)
+        answer = run(problem, seek_causes=False)
+        if answer.trust.verdict == "good":
+            answer = replace(
+                answer, causes=find_misspecifications(answer.solution)
             )
     except (InputError, SimulationError) as error:
-        return Outcome(fault, seed, "refused", (str(error),), None, None)
-    errors = errors_of(found, truth)
-    worst = max(errors, key=errors.__getitem__) if errors else None
-    return Outcome(
+        return VerdictOutcome(fault, seed, "refused", (str(error),), None, None)
+    errors = errors_of(answer, truth)
+    worst_name = max(errors, key=errors.__getitem__) if errors else None
+    return VerdictOutcome(
         fault,
         seed,
-        found.trust.verdict,
-        found.trust.reasons,
-        errors[worst] if worst else None,
-        worst,
+        answer.trust.verdict,
+        answer.trust.reasons,
+        errors[worst_name] if worst_name else None,
+        worst_name,
     )
 
 
-def errors_of(found: Run, truth: Mapping[str, float]) -> dict[str, float]:
+def errors_of(answer: Run, truth: Mapping[str, float]) -> dict[str, float]:
     """Return the error of every parameter in standard errors; parameters without one are left out."""
-    bars = {name: found.std_error(name) for name in truth}
+    standard_errors = {name: answer.std_error(name) for name in truth}
     return {
-        name: abs(found.parameters[name] - value) / error
+        name: abs(answer.parameters[name] - value) / error
         for name, value in truth.items()
-        if np.isfinite(error := bars[name])
+        if np.isfinite(error := standard_errors[name])
     }
 
 
 @cache
 def bodies() -> tuple[tuple[Body, float], ...]:
-    """Each with its Young's modulus [Pa] where it is soft."""
+    """Return two bodies, each with its smaller true Young's modulus [Pa]; cached."""
     cylinder = cylinder_mesh(0.04, 0.16, 1, 5)
     box = box_mesh((0.04, 0.05, 0.15), (2, 2, 5))
     return (
@@ -194,8 +220,11 @@ def bodies() -> tuple[tuple[Body, float], ...]:
 
 
 @cache
-def swung(seed: int) -> tuple[Problem, dict[str, float]]:
-    """A body moved at random, described rightly and guessed wrongly, and its truth."""
+def swung_twin(seed: int) -> tuple[Problem, dict[str, float]]:
+    """Return the correct problem of a body that is moved at random, and its true parameters.
+
+    The guesses are wrong by factors of 0.3 to 3.
+    """
     rng = np.random.default_rng(seed)
     body, young_pa = bodies()[seed % 2]
     truth = {
@@ -205,17 +234,19 @@ def swung(seed: int) -> tuple[Problem, dict[str, float]]:
     t_s = STEP_S * np.arange(SAMPLES)
     nodes = body.nodes_m
     length_m = np.ptp(body.nodes_m[:, 2])
-    held = np.flatnonzero(nodes[:, 2] < 1e-9)
-    outside = np.setdiff1d(
+    clamped_nodes = np.flatnonzero(nodes[:, 2] < 1e-9)
+    marker_candidates = np.setdiff1d(
         np.unique(body.mesh.surface),
         np.flatnonzero(nodes[:, 2] < 0.3 * length_m),
     )
-    places = nodes[rng.choice(outside, 8, replace=False)]
-    markers = Markers(t_s, np.zeros((SAMPLES, 8, 3)), SIGMA_M, places_m=places)
-    grasp = Grasp(held, random_poses(t_s, rng))
+    places_m = nodes[rng.choice(marker_candidates, 8, replace=False)]
+    markers = Markers(
+        t_s, np.zeros((SAMPLES, 8, 3)), SIGMA_M, places_m=places_m
+    )
+    grasp = Grasp(clamped_nodes, random_poses(t_s, rng))
     experiment = Experiment(body, t_s, [grasp], markers, name="swing")
     tracks = simulate(experiment, truth).markers_m
-    seen = with_markers(
+    recording = with_markers(
         experiment, tracks + rng.normal(scale=SIGMA_M, size=tracks.shape)
     )
     guesses = {
@@ -223,7 +254,7 @@ def swung(seed: int) -> tuple[Problem, dict[str, float]]:
         for name, value in truth.items()
     }
     guesses["poisson"] = Unknown(float(rng.uniform(0.2, 0.45)))
-    return Problem([seen], guesses, substeps=SUBSTEPS), truth
+    return Problem([recording], guesses, substeps=SUBSTEPS), truth
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""The whole stroke of problems/phantom_compression: each specimen alone, and what else E hangs on.
+"""Complete stroke of problems/phantom_compression: each specimen, and the influence of assumptions.
 
     python scripts/study_whole_stroke.py [--only specimens assumed meshes]
 
-Specimens are A1 to A5 with Yeoh's law. Of A1 alone then other compressibilities, contacts and
-frictions, and other meshes. Get the data by scripts/get_phantom_compression.py. Each line takes
-half a minute of processor time, the fine mesh several.
+The specimens A1 to A5 are identified with Yeoh's law, A1 also with other compressibilities,
+contacts, frictions and meshes. The data are downloaded by scripts/get_phantom_compression.py. Each
+row takes half a minute of processor time, that of the fine mesh several minutes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from make_phantom_mesh import SECTIONS_MM, turned
+from make_phantom_mesh import SECTIONS_MM, quarter_revolution
 
 from collocation_sysid import Problem, run
 from collocation_sysid.errors import InputError, SimulationError
@@ -30,7 +30,8 @@ FILE = (
     / "whole_stroke.toml"
 )
 PLATEN = "experiment.A1.obstacle.platen"
-ASSUMED = {
+# Keys of the problem file that differ in each row.
+ASSUMPTIONS = {
     "as shipped": (),
     "half the bulk modulus": ("parameters.kappa_pa.fixed=2e6",),
     "2.5 times the bulk modulus": ("parameters.kappa_pa.fixed=1e7",),
@@ -48,7 +49,9 @@ def main() -> None:
     )
     only = parser.parse_args().only or ("specimens", "assumed", "meshes")
     print(
-        "| | E kPa | 95 % | whole | μ | 95 % | whole | misfit N | % of the largest load |"
+        "| specimen or assumption | E, kPa | statistical interval of E | combined interval of E "
+        "| friction coefficient | its statistical interval | its combined interval "
+        "| RMS residual of the load, N | % of the largest load |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
@@ -63,35 +66,43 @@ def _variants(
         for k in range(1, 6):
             yield f"A{k}", f"A{k}", ()
     if "assumed" in only:
-        for name, changes in ASSUMED.items():
+        for name, changes in ASSUMPTIONS.items():
             yield name, "A1", changes
     if "meshes" in only:
         for name, section in SECTIONS_MM.items():
-            turned(*section).write(folder / f"{name}.vtu")
+            quarter_revolution(*section).write(folder / f"{name}.vtu")
             yield f"{name} mesh", "A1", (f"object.mesh={folder / name}.vtu",)
 
 
 def _line(name: str, specimen: str, changes: Sequence[str]) -> str:
     problem = Problem.read(FILE, list(changes))
-    (alone,) = (each for each in problem.experiments if each.name == specimen)
+    (experiment,) = (
+        each for each in problem.experiments if each.name == specimen
+    )
     try:
-        found = run(replace(problem, experiments=[alone]), seek_causes=False)
+        answer = run(
+            replace(problem, experiments=[experiment]), seek_causes=False
+        )
     except (InputError, SimulationError) as error:
         return f"| {name} | {error} | | | | | | | |"
     (wrench,) = (
-        each.wrench for each in alone.obstacles if each.wrench is not None
+        each.wrench for each in experiment.obstacles if each.wrench is not None
     )
     largest_n = wrench.symmetry * np.nanmax(np.abs(wrench.values))
-    missed_n = pooled_wrench_rms(found.solution)[0]
-    assert missed_n is not None
-    young = _told(found.estimates["young_pa"], 1e-3, "{:.1f}")
-    friction = _told(found.estimates["platen_friction"], 1.0, "{:.2f}")
-    misfit = f"{missed_n:.2f} | {100 * missed_n / largest_n:.2f}"
+    misfit_n = pooled_wrench_rms(answer.solution)[0]
+    assert misfit_n is not None
+    young = _value_and_intervals(answer.estimates["young_pa"], 1e-3, "{:.1f}")
+    friction = _value_and_intervals(
+        answer.estimates["platen_friction"], 1.0, "{:.2f}"
+    )
+    misfit = f"{misfit_n:.2f} | {100 * misfit_n / largest_n:.2f}"
     return f"| {name} | {young} | {friction} | {misfit} |"
 
 
-def _told(estimate: ReportedEstimate, factor: float, form: str) -> str:
-    """A value and its two intervals."""
+def _value_and_intervals(
+    estimate: ReportedEstimate, factor: float, form: str
+) -> str:
+    """Return three cells: value, statistical interval and combined interval, times a factor."""
     cells = [form.format(factor * estimate.value)]
     for interval in (estimate.statistical95, estimate.combined95):
         ends = (form.format(factor * end) for end in interval or ())

@@ -1,4 +1,4 @@
-"""Shared by the scripts that make synthetic problems: a body swung by a robot, seen by cameras."""
+"""Synthetic problems of a body that a robot swings and cameras observe; shared by the makers of problems."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from collocation_sysid.recording import (
     write_poses_csv,
 )
 
+# Rotation by 180° about x: the body hangs below the gripper.
 HANGING = Rotation.from_rotvec([np.pi, 0, 0])
 
 Triple = tuple[float, float, float]
@@ -25,7 +26,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Swing:
-    """A motion from rest in all six degrees of freedom, of a body that hangs at first."""
+    """Motion from rest in all six degrees of freedom; see `swing` for the arguments."""
 
     duration_s: float
     amplitude_m: Triple
@@ -54,7 +55,11 @@ def swing(
     rise_s: float,
     start: Rotation,
 ) -> PoseSequence:
-    """Poses at `t_s`: from rest, each axis swings at its own frequency, rotations faster."""
+    """Return the poses at times `t_s` [s] of a swing from rest.
+
+    Each axis swings at its own frequency, the rotations 1.2 times as fast. The amplitudes rise from
+    zero to their values within about `rise_s` [s], from the rotation `start` on.
+    """
     t = np.asarray(t_s) - t_s[0]
     rise = t**2 / (t**2 + rise_s**2)
     angular = 2 * np.pi * np.array(frequency_hz)
@@ -62,35 +67,47 @@ def swing(
     positions = (
         rise[:, None] * amplitude_m * np.sin(phase + np.array([0.0, 0.7, 1.4]))
     )
-    turns = (
+    rotation_vectors_rad = (
         rise[:, None]
         * amplitude_rad
         * np.sin(1.2 * phase + np.array([0.3, 1.0, 1.7]))
     )
-    rotations = Rotation.from_rotvec(turns) * start
+    rotations = Rotation.from_rotvec(rotation_vectors_rad) * start
     return PoseSequence(np.asarray(t_s), positions, rotations.as_quat())
 
 
-def unmeasured(problem: Path, poses: str, logged: PoseSequence) -> Experiment:
-    """Write the robot's poses, remove old tracks, and load the experiment at the poses' times."""
+def prepare_experiment(
+    problem: Path, poses: str, logged: PoseSequence
+) -> Experiment:
+    """Write the poses, delete old marker tracks, and return the experiment at the times of the poses.
+
+    Parameters
+    ----------
+    problem : Path
+        Problem file; the files of poses and tracks are in its folder.
+    poses : str
+        Name of the file of poses.
+    logged : PoseSequence
+        Poses that the robot logs.
+    """
     write_poses_csv(problem.parent / poses, logged)
     for tracks in problem.parent.glob("*_markers.csv"):
         tracks.unlink()
     return Problem.read(problem, simulation=True).experiments[0]
 
 
-def measure(
+def simulate_tracks(
     experiment: Experiment,
     fine: PoseSequence,
     truth: Mapping[str, float],
     noise_m: float,
     seed: int,
 ) -> np.ndarray:
-    """Marker tracks (T, M, 3) of a Newmark simulation on the fine poses' own step, with noise."""
+    """Return noisy tracks (T, M, 3) [m] of a Newmark simulation with the time step of the poses `fine`."""
     grasp = experiment.grasps[0]
-    moved = replace(experiment, grasps=(Grasp(grasp.nodes, fine),))
+    on_fine_grid = replace(experiment, grasps=(Grasp(grasp.nodes, fine),))
     step_s = float(fine.t_s[1] - fine.t_s[0])
-    tracks = simulate(moved, truth, timestep_s=step_s).markers_m
+    tracks = simulate(on_fine_grid, truth, timestep_s=step_s).markers_m
     return (
         tracks + np.random.default_rng(seed).normal(size=tracks.shape) * noise_m
     )
@@ -99,7 +116,7 @@ def measure(
 def exchanged(
     tracks: np.ndarray, pair: Sequence[int], frames: slice
 ) -> np.ndarray:
-    """Tracks in which two markers have each other's label for some frames."""
+    """Return the tracks with the labels of two markers exchanged in some frames."""
     swapped = tracks.copy()
     swapped[frames, list(pair)] = tracks[frames, list(pair)[::-1]]
     return swapped
@@ -111,8 +128,8 @@ def occluded(
     share: float,
     seed: int,
 ) -> np.ndarray:
-    """Tracks without some markers' blocks of frames, and without a share of all samples."""
-    lost = np.random.default_rng(seed).random(tracks.shape[:2]) < share
+    """Return the tracks with NaN in blocks of (marker, frames), and in a random share of all samples."""
+    is_missing = np.random.default_rng(seed).random(tracks.shape[:2]) < share
     for marker, frames in blocks:
-        lost[frames, marker] = True
-    return np.where(lost[..., None], np.nan, tracks)
+        is_missing[frames, marker] = True
+    return np.where(is_missing[..., None], np.nan, tracks)

@@ -22,14 +22,17 @@ from collocation_sysid.recording import (
     Wrench,
 )
 
+# Standard deviation of each marker coordinate [m], typical of cameras in a room.
 NOISE_M = 5e-4
+# Number of samples, and the time between them [s].
 SAMPLES = 60
 STEP_S = 0.01
-# Body, and where its grasp begins along its longest axis; both hang or stick out of the hand.
+# Edges [m] and numbers of elements along x, y and z; the nodes of the upper face are grasped.
 BODIES = {
     "block": ((0.06, 0.06, 0.09), (2, 2, 3)),
     "bar": ((0.03, 0.03, 0.12), (1, 1, 4)),
 }
+# True constants of the soft and of the stiff body, and initial guesses with bounds.
 SOFT = {
     "lambda_pa": 800.0,
     "mu_pa": 600.0,
@@ -47,14 +50,17 @@ STIFF = SOFT | {"lambda_pa": 16e3, "mu_pa": 12e3, "gamma_r_s": 0.002}
 
 @cache
 def block(size_m: tuple[float, ...], divisions: tuple[int, ...]) -> Body:
-    """Bodies are shared: their kernels compile once."""
+    """Return a block of foam with edges `size_m` [m].
+
+    The cached body is shared by all twins, so that its kernels compile once.
+    """
     return Body(
         box_mesh(size_m, divisions), density_kg_m3=30.0, damping="rayleigh"
     )
 
 
 def random_poses(t_s: np.ndarray, rng: np.random.Generator) -> PoseSequence:
-    """A motion from rest in all six degrees of freedom, from some pose in the room."""
+    """Return poses at `t_s` [s] of a motion from rest, from a random pose, in all six degrees of freedom."""
     start = Rotation.from_quat(rng.normal(size=4))
     place_m = rng.uniform(-0.5, 0.5, 3)
     rise = (t_s - t_s[0]) ** 2 / ((t_s - t_s[0]) ** 2 + 0.1**2)
@@ -65,8 +71,8 @@ def random_poses(t_s: np.ndarray, rng: np.random.Generator) -> PoseSequence:
         wave = np.sin(2 * np.pi * np.outer(t_s, frequency) + phase)
         return size * rise[:, None] * rng.uniform(0.5, 1.0, 3) * wave
 
-    turns = Rotation.from_rotvec(swing(0.5)) * start
-    return PoseSequence(t_s, place_m + swing(0.05), turns.as_quat())
+    rotations = Rotation.from_rotvec(swing(0.5)) * start
+    return PoseSequence(t_s, place_m + swing(0.05), rotations.as_quat())
 
 
 def twin(
@@ -77,27 +83,48 @@ def twin(
     integrator: str = "newmark",
     substeps: int | Literal["auto"] = "auto",
 ) -> Problem:
-    """A body that is described rightly; simulated with so many steps per sample, or as many as are
-    necessary.
+    """Return the correct problem of a simulated recording with noise.
+
+    Parameters
+    ----------
+    name : str
+        Body, a key of `BODIES`.
+    truth : dict
+        True constants, such as `SOFT`.
+    seed : int
+        Seed of motion, markers and noise.
+    samples : int
+        Number of samples.
+    integrator : str
+        Integration scheme of the simulation.
+    substeps : int or "auto"
+        Time steps per sample; "auto" takes as many as the accuracy requires.
     """
     rng = np.random.default_rng(seed)
     size_m, divisions = BODIES[name]
     body = block(size_m, divisions)
     t_s = STEP_S * np.arange(samples)
-    held = np.flatnonzero(body.nodes_m[:, 2] > size_m[2] - 1e-6)
-    free = np.setdiff1d(np.arange(len(body.nodes_m)), held)
-    places = body.nodes_m[rng.choice(free, 6, replace=False)]
-    markers = Markers(t_s, np.zeros((samples, 6, 3)), NOISE_M, places_m=places)
-    experiment = Experiment(
-        body, t_s, [Grasp(held, random_poses(t_s, rng))], markers, name="swing"
+    grasped_nodes = np.flatnonzero(body.nodes_m[:, 2] > size_m[2] - 1e-6)
+    free_nodes = np.setdiff1d(np.arange(len(body.nodes_m)), grasped_nodes)
+    places_m = body.nodes_m[rng.choice(free_nodes, 6, replace=False)]
+    markers = Markers(
+        t_s, np.zeros((samples, 6, 3)), NOISE_M, places_m=places_m
     )
-    tracks = simulate(
+    experiment = Experiment(
+        body,
+        t_s,
+        [Grasp(grasped_nodes, random_poses(t_s, rng))],
+        markers,
+        name="swing",
+    )
+    tracks_m = simulate(
         experiment, truth, integrator, substeps=substeps
     ).markers_m
-    noise = rng.normal(scale=NOISE_M, size=tracks.shape)
-    return Problem([with_markers(experiment, tracks + noise)], GUESS)
+    noise = rng.normal(scale=NOISE_M, size=tracks_m.shape)
+    return Problem([with_markers(experiment, tracks_m + noise)], GUESS)
 
 
+# Standard deviations of the noise of the force [N] and torque [N m] sensor.
 WRENCH_N = 5e-4
 WRENCH_NM = 5e-5
 
@@ -105,9 +132,12 @@ WRENCH_NM = 5e-5
 def sensing_twin(
     name: str, truth: dict[str, float], seed: int, samples: int = SAMPLES
 ) -> Problem:
-    """Return a twin with a force sensor at the grasp, in its frame and about a point above the body."""
-    given = twin(name, truth, seed, samples)
-    (experiment,) = given.experiments
+    """Return a `twin` with a force–torque sensor at the grasp.
+
+    The wrench is expressed in the frame of the grasp, about a point above the body.
+    """
+    unsensed = twin(name, truth, seed, samples)
+    (experiment,) = unsensed.experiments
     (grasp,) = experiment.grasps
     point_m = (0.01, 0.02, BODIES[name][0][2] + 0.03)
     zero = np.zeros((samples, 6))
@@ -124,8 +154,10 @@ def sensing_twin(
     noise = np.random.default_rng(seed).normal(
         scale=np.repeat([WRENCH_N, WRENCH_NM], 3), size=values.shape
     )
-    felt = replace(sensor, values=values + noise)
+    noisy_sensor = replace(sensor, values=values + noise)
     return replace(
-        given,
-        experiments=[replace(experiment, grasps=[replace(grasp, wrench=felt)])],
+        unsensed,
+        experiments=[
+            replace(experiment, grasps=[replace(grasp, wrench=noisy_sensor)])
+        ],
     )

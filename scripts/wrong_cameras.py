@@ -1,7 +1,7 @@
-"""Mistakes in the description of a depth camera or in its images.
+"""Errors in the description of a depth camera or in its images.
 
 Each entry of `DEPTH_FAULTS` takes a problem with one depth camera whose images are stored, and
-returns the problem as somebody would describe it who makes that mistake. `MOVING_FAULTS` need
+returns the problem with one error in its description. `MOVING_FAULTS` need
 several images.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from wrong_twins import Change, Fault, Rng
+from wrong_twins import ExperimentChange, Fault, Rng
 
 from collocation_sysid.common.array_types import Array
 from collocation_sysid.recording import Depth, DepthCamera, Experiment
@@ -31,6 +31,7 @@ FORWARD_LEFT_UP = np.array(
 MILLIMETRES_PER_METRE = 1e3
 # Distance of a wall behind the bar from the camera [m]: less than the gate behind its far end.
 WALL_M = 0.50
+# Delay of the camera's clock [s]: two intervals between the images of `depth_twins.swinging_twin`.
 LATE_S = 0.1
 
 
@@ -58,7 +59,7 @@ def described(
     )
 
 
-def depths(change: Callable[[Depth], Depth]) -> Change:
+def depths(change: Callable[[Depth], Depth]) -> ExperimentChange:
     """Return the change of every depth camera of an experiment."""
 
     def changed(experiment: Experiment, rng: Rng) -> Experiment:
@@ -69,7 +70,7 @@ def depths(change: Callable[[Depth], Depth]) -> Change:
     return changed
 
 
-def images(change: Callable[[Array], Array]) -> Change:
+def images(change: Callable[[Array], Array]) -> ExperimentChange:
     """Return the change of the images (S, rows, columns) of every depth camera."""
     return depths(
         lambda depth: described(
@@ -78,14 +79,14 @@ def images(change: Callable[[Array], Array]) -> Change:
     )
 
 
-def poses(change: Callable[[Array], Array]) -> Change:
+def poses(change: Callable[[Array], Array]) -> ExperimentChange:
     """Return the change of the stated pose (4, 4) of every depth camera."""
     return depths(
         lambda depth: described(depth, pose=change(depth.camera.pose))
     )
 
 
-def with_focal_lengths_times(factor: float) -> Change:
+def with_focal_lengths_times(factor: float) -> ExperimentChange:
     """Return the change of both focal lengths, as of an image that was scaled after calibration."""
     scale = np.array([[factor, 1.0, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]])
     return depths(
@@ -150,14 +151,14 @@ def late(experiment: Experiment, rng: Rng) -> Experiment:
 
     def delayed(depth: Depth) -> Depth:
         times_s = depth.sample_times_s + LATE_S
-        kept = times_s <= experiment.t_s[-1] + 1e-9
-        images_m = np.array(depth.images_m, dtype=float)[kept]
+        is_recorded = times_s <= experiment.t_s[-1] + 1e-9
+        images_m = np.array(depth.images_m, dtype=float)[is_recorded]
         return Depth.of_images(
             depth.name,
             images_m,
             depth.camera,
             depth.sigma_m,
-            times_s[kept],
+            times_s[is_recorded],
             spacing_m=depth.spacing_m,
         )
 

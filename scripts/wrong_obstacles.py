@@ -1,4 +1,4 @@
-"""Mistakes in the description of an obstacle, or in its measured load.
+"""Errors in the description of an obstacle, or in its measured load.
 
 Entries of `POKING_FAULTS` are made in a static indentation along z, those of `PLATE_FAULTS` with a
 plane.
@@ -29,7 +29,7 @@ MISPLACED_M = 0.005
 STROKE_OFFSET_M = 5e-4
 # Index of the sample at which the load was zeroed.
 TARED_SAMPLE = 3
-# Number of equal parts of the specimen.
+# Number of equal parts of the specimen, of which one is modelled by symmetry.
 PARTS = 4
 
 
@@ -59,9 +59,9 @@ def with_ball(
         ball = obstacle.shape
         assert isinstance(ball, Sphere)
         radius_m = radius_factor * ball.radius_m
-        raised_m = np.array(ball.centre_m)
-        raised_m[2] += radius_m - ball.radius_m + shift_m
-        return replace(obstacle, shape=Sphere(radius_m, raised_m))
+        centre_m = np.array(ball.centre_m)
+        centre_m[2] += radius_m - ball.radius_m + shift_m
+        return replace(obstacle, shape=Sphere(radius_m, centre_m))
 
     return changed
 

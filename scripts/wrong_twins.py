@@ -26,20 +26,29 @@ from collocation_sysid.recording import (
 )
 
 Rng = np.random.Generator
-Change = Callable[[Experiment, Rng], Experiment]
+ExperimentChange = Callable[[Experiment, Rng], Experiment]
+# Smallest and largest jump of a pose, and slip of a marker [m]: far above the noise.
 JUMP_M = (0.01, 0.03)
 SLIP_M = (0.005, 0.02)
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Error in a description, and the codes of the hypotheses that name it correctly."""
+    """Error in a description, and the codes of the hypotheses that name it correctly.
 
-    change: Change
+    Attributes
+    ----------
+    change : function of an experiment and a random generator
+        Returns the experiment with the error in its description.
+    causes : tuple of str
+        Codes of the correct hypotheses; empty if no hypothesis names this error.
+    """
+
+    change: ExperimentChange
     causes: tuple[str, ...]
 
     def __call__(self, problem: Problem, rng: Rng) -> Problem:
-        """The problem with this mistake in every experiment."""
+        """Return the problem with this error in every experiment."""
         return replace(
             problem,
             experiments=[self.change(e, rng) for e in problem.experiments],
@@ -59,7 +68,10 @@ def _with_poses(
 def _with_body(
     experiment: Experiment, points_m: np.ndarray, density: float = 1.0
 ) -> Experiment:
-    """With another mesh, on which grasps and markers keep their nodes."""
+    """Return the experiment with other positions of the mesh points (n, 3) [m].
+
+    Grasps and markers keep their nodes. The density is multiplied by the factor `density`.
+    """
     old = experiment.body
     density_kg_m3 = density * old.mass_kg / old.mesh.volume_m3
     mesh = TetMesh(points_m, old.mesh.tetrahedra)
@@ -73,11 +85,11 @@ def _with_body(
     return replace(experiment, body=body)
 
 
-# Units ------------------------------------------------------------------------------------------
+# Units --------------------------------------------------------------------------------------------
 
 
-def poses_times(factor: float) -> Change:
-    """Positions of the poses in another unit."""
+def poses_times(factor: float) -> ExperimentChange:
+    """Return a change that multiplies the positions of all poses by a factor, as of another unit."""
 
     def scaled(poses: PoseSequence) -> PoseSequence:
         return replace(poses, positions_m=factor * poses.positions_m)
@@ -85,36 +97,36 @@ def poses_times(factor: float) -> Change:
     return lambda e, rng: _with_poses(e, scaled)
 
 
-def markers_times(factor: float) -> Change:
+def markers_times(factor: float) -> ExperimentChange:
     """Return a change that multiplies all marker positions by a factor."""
     return lambda e, rng: with_markers(e, factor * e.markers.positions_m)
 
 
-def mesh_times(factor: float) -> Change:
-    """The mesh, and the places on it, in another unit."""
+def mesh_times(factor: float) -> ExperimentChange:
+    """Return a change that multiplies the mesh by a factor, with all places on it, as of another unit."""
     return lambda e, rng: _with_body(e, factor * e.body.mesh.points_m)
 
 
-def density_times(factor: float) -> Change:
-    """A density in g/cm³ (0.001), or a mass in g (1000)."""
+def density_times(factor: float) -> ExperimentChange:
+    """Return a change of the density by a factor: 0.001 for g/cm³, 1000 for a mass in g."""
     return lambda e, rng: _with_body(e, e.body.mesh.points_m, factor)
 
 
-# Motion -----------------------------------------------------------------------------------------
+# Motion -------------------------------------------------------------------------------------------
 
 
 def inverted(poses: PoseSequence) -> PoseSequence:
-    """The inverse of every pose."""
-    turns = Rotation.from_quat(np.array(poses.quaternions_xyzw)).inv()
+    """Return the inverse of every pose."""
+    rotations = Rotation.from_quat(np.array(poses.quaternions_xyzw)).inv()
     return replace(
         poses,
-        positions_m=-turns.apply(np.array(poses.positions_m)),
-        quaternions_xyzw=turns.as_quat(),
+        positions_m=-rotations.apply(np.array(poses.positions_m)),
+        quaternions_xyzw=rotations.as_quat(),
     )
 
 
 def reordered(places: int) -> Callable[[PoseSequence], PoseSequence]:
-    """Quaternions read in the other order: by 1, w first taken for x; by −1 the reverse."""
+    """Return a change that rotates the components of quaternions: by 1 from wxyz, by −1 the reverse."""
 
     def change(poses: PoseSequence) -> PoseSequence:
         return replace(
@@ -125,35 +137,38 @@ def reordered(places: int) -> Callable[[PoseSequence], PoseSequence]:
     return change
 
 
-def late(lag_s: float) -> Change:
-    """The markers' clock late by `lag_s`: what they show at t was at t − lag."""
+def late(lag_s: float) -> ExperimentChange:
+    """Return a change by which the marker clock is late: positions at t were measured at t − `lag_s`."""
 
     def change(experiment: Experiment, rng: Rng) -> Experiment:
         end_s = experiment.t_s[-1] - max(lag_s, 0.0)
         begin_s = experiment.t_s[0] - min(lag_s, 0.0)
         slack = 1e-9
-        kept = (experiment.t_s >= begin_s - slack) & (
+        is_recorded = (experiment.t_s >= begin_s - slack) & (
             experiment.t_s <= end_s + slack
         )
         markers = experiment.markers
         tracks = replace(
             markers,
-            t_s=markers.t_s[kept],
-            positions_m=markers.positions_m[kept],
+            t_s=markers.t_s[is_recorded],
+            positions_m=markers.positions_m[is_recorded],
         )
         shifted = [
             replace(g, poses=replace(g.poses, t_s=g.poses.t_s - lag_s))
             for g in experiment.grasps
         ]
         return replace(
-            experiment, t_s=experiment.t_s[kept], grasps=shifted, markers=tracks
+            experiment,
+            t_s=experiment.t_s[is_recorded],
+            grasps=shifted,
+            markers=tracks,
         )
 
     return change
 
 
 def jumping(experiment: Experiment, rng: Rng) -> Experiment:
-    """Poses that are shifted from a sample on."""
+    """Return the experiment with poses that are shifted from a random sample on."""
     shift = _direction(rng) * rng.uniform(*JUMP_M)
     from_s = rng.choice(
         experiment.t_s[len(experiment.t_s) // 4 : -len(experiment.t_s) // 4]
@@ -166,7 +181,7 @@ def jumping(experiment: Experiment, rng: Rng) -> Experiment:
     return _with_poses(experiment, change)
 
 
-# Frames -----------------------------------------------------------------------------------------
+# Frames -------------------------------------------------------------------------------------------
 
 
 def _frame(rng: Rng) -> tuple[Rotation, np.ndarray]:
@@ -175,22 +190,22 @@ def _frame(rng: Rng) -> tuple[Rotation, np.ndarray]:
 
 
 def in_grippers_frame(experiment: Experiment, rng: Rng) -> Experiment:
-    """Poses that map the gripper's own frame."""
+    """Return the experiment with the poses of the gripper's own frame in place of those of the mesh."""
     turn, shift_m = _frame(rng)
 
     def change(poses: PoseSequence) -> PoseSequence:
-        turns = Rotation.from_quat(poses.quaternions_xyzw)
+        rotations = Rotation.from_quat(poses.quaternions_xyzw)
         return replace(
             poses,
-            positions_m=poses.positions_m + turns.apply(shift_m),
-            quaternions_xyzw=(turns * turn).as_quat(),
+            positions_m=poses.positions_m + rotations.apply(shift_m),
+            quaternions_xyzw=(rotations * turn).as_quat(),
         )
 
     return _with_poses(experiment, change)
 
 
 def in_meshs_frame(experiment: Experiment, rng: Rng) -> Experiment:
-    """A mesh that lies elsewhere than the poses take it to."""
+    """Return the experiment with a rotated and shifted mesh, which the poses do not map to the body."""
     turn, shift_m = _frame(rng)
     return _with_body(
         experiment,
@@ -199,18 +214,18 @@ def in_meshs_frame(experiment: Experiment, rng: Rng) -> Experiment:
 
 
 def in_cameras_frame(experiment: Experiment, rng: Rng) -> Experiment:
-    """Tracks in the cameras' frame, poses in the robot's."""
+    """Return the experiment with marker tracks in the frame of the cameras, not of the robot."""
     turn, shift_m = _frame(rng)
     tracks = np.array(experiment.markers.positions_m)
     moved = turn.apply(tracks.reshape(-1, 3)).reshape(tracks.shape) + shift_m
     return with_markers(experiment, moved)
 
 
-# Markers, gravity, grasp ------------------------------------------------------------------------
+# Markers, gravity, grasp --------------------------------------------------------------------------
 
 
 def exchanged(experiment: Experiment, rng: Rng) -> Experiment:
-    """Two markers with each other's track."""
+    """Return the experiment with the tracks of two markers exchanged."""
     order = np.arange(len(experiment.markers.names))
     pair = rng.choice(order, 2, replace=False)
     order[pair] = order[pair[::-1]]
@@ -218,7 +233,7 @@ def exchanged(experiment: Experiment, rng: Rng) -> Experiment:
 
 
 def slipping(experiment: Experiment, rng: Rng) -> Experiment:
-    """A marker that slips on the body."""
+    """Return the experiment with one marker that slips on the body at a random sample."""
     t_s = experiment.t_s
     markers = experiment.markers
     k = int(rng.integers(len(t_s) // 4, 3 * len(t_s) // 4))
@@ -230,21 +245,21 @@ def slipping(experiment: Experiment, rng: Rng) -> Experiment:
 
 
 def other_gravity(experiment: Experiment, rng: Rng) -> Experiment:
-    """Gravity along another axis, or with the other sign."""
-    given = experiment.gravity_m_s2
-    size = np.linalg.norm(given)
+    """Return the experiment with gravity along another axis, or with the other sign."""
+    stated_m_s2 = experiment.gravity_m_s2
+    size = np.linalg.norm(stated_m_s2)
     axes = [sign * size * axis for axis in np.eye(3) for sign in (1, -1)]
-    others = [axis for axis in axes if not np.allclose(axis, given)]
+    others = [axis for axis in axes if not np.allclose(axis, stated_m_s2)]
     return replace(experiment, gravity_m_s2=others[rng.integers(len(others))])
 
 
-def held_deeper(experiment: Experiment, rng: Rng) -> Experiment:
-    """A grasp that holds one layer of nodes too many."""
+def with_deeper_grasp(experiment: Experiment, rng: Rng) -> Experiment:
+    """Return the experiment with grasps of one layer of nodes too many."""
     grasps = []
     for grasp in experiment.grasps:
-        touched = np.isin(experiment.body.cells, grasp.nodes).any(axis=1)
+        is_adjacent = np.isin(experiment.body.cells, grasp.nodes).any(axis=1)
         grasps.append(
-            replace(grasp, nodes=np.unique(experiment.body.cells[touched]))
+            replace(grasp, nodes=np.unique(experiment.body.cells[is_adjacent]))
         )
     return replace(experiment, grasps=grasps)
 
@@ -282,19 +297,19 @@ FAULTS = {
     "gravity": Fault(other_gravity, ("gravity",)),
     "density in g/cm3": Fault(density_times(1e-3), ("density",)),
     "mass in g": Fault(density_times(1e3), ("density",)),
-    "grasp one layer deeper": Fault(held_deeper, ("grasp-layer",)),
+    "grasp one layer deeper": Fault(with_deeper_grasp, ("grasp-layer",)),
     "pose jumps": Fault(jumping, ("pose-jump",)),
     "marker slips": Fault(slipping, ("marker-slip",)),
 }
 
 
-# Tracks and bodies that no grasped body has ------------------------------------------------------
+# Tracks and meshes that no grasped body can have --------------------------------------------------
 
 
 def with_track_axes(
     order: tuple[int, ...], signs: tuple[int, ...] = (1, 1, 1)
-) -> Change:
-    """Tracks with their axes exchanged or reversed."""
+) -> ExperimentChange:
+    """Return a change that takes the axes of tracks in another order, with signs."""
     return lambda e, rng: with_markers(
         e, np.array(signs) * e.markers.positions_m[..., list(order)]
     )
@@ -313,7 +328,7 @@ def constant(poses: PoseSequence) -> PoseSequence:
 
 
 def restarting(experiment: Experiment, rng: Rng) -> Experiment:
-    """Tracks of a simulation that grows without bound, fails, and is reset to its first state."""
+    """Return the experiment with tracks that grow without bound, are NaN, and begin again."""
     tracks = np.array(experiment.markers.positions_m)
     k = int(rng.integers(len(tracks) // 2, 3 * len(tracks) // 4))
     growth = 0.002 * 2.0 ** np.arange(6)
@@ -326,7 +341,7 @@ def restarting(experiment: Experiment, rng: Rng) -> Experiment:
 
 
 def torn(experiment: Experiment, rng: Rng) -> Experiment:
-    """A mesh whose lower elements share no nodes with the others."""
+    """Return the experiment with a mesh whose lower elements share no nodes with the others."""
     body = experiment.body
     cells = np.array(experiment.body.mesh.tetrahedra)
     points_m = np.array(body.mesh.points_m)
@@ -376,7 +391,7 @@ TRACK_FAULTS = {
 # Wrenches -----------------------------------------------------------------------------------------
 
 
-def wrenches(change: Callable[[Wrench], Wrench]) -> Change:
+def wrenches(change: Callable[[Wrench], Wrench]) -> ExperimentChange:
     """Return a change that applies a function to every measured wrench."""
 
     def changed(experiment: Experiment, rng: Rng) -> Experiment:
@@ -391,21 +406,21 @@ def wrenches(change: Callable[[Wrench], Wrench]) -> Change:
     return changed
 
 
-def wrench_times(force: float, torque: float) -> Change:
+def wrench_times(force: float, torque: float) -> ExperimentChange:
     """Return a change that multiplies the measured forces and torques by factors."""
     factors = np.repeat([force, torque], 3)
     return wrenches(lambda w: replace(w, values=factors * w.values))
 
 
 def tared(wrench: Wrench) -> Wrench:
-    """Zeroed with the body in hand."""
+    """Return a wrench that was zeroed while the gripper held the body."""
     return replace(
         wrench, values=wrench.values - np.nanmean(wrench.values[:5], axis=0)
     )
 
 
 def in_other_frame(wrench: Wrench) -> Wrench:
-    """Stated in the world's axes if in the grasp's, and the reverse."""
+    """Return the wrench with the other frame stated: world in place of grasp, or the reverse."""
     return replace(
         wrench, frame="world" if wrench.frame == "grasp" else "grasp"
     )
@@ -445,7 +460,7 @@ WRENCH_FAULTS = {
 # Obstacles ----------------------------------------------------------------------------------------
 
 
-def obstacles(change: Callable[[Obstacle], Obstacle]) -> Change:
+def obstacles(change: Callable[[Obstacle], Obstacle]) -> ExperimentChange:
     """Return a change that applies a function to every obstacle."""
     return lambda e, rng: e.with_obstacles(
         [change(each) for each in e.obstacles]
@@ -453,7 +468,7 @@ def obstacles(change: Callable[[Obstacle], Obstacle]) -> Change:
 
 
 def reversed_normal(obstacle: Obstacle) -> Obstacle:
-    """A plane on the other side of which the body is."""
+    """Return a plane with its normal reversed, so that the body is on the wrong side."""
     assert isinstance(obstacle.shape, Plane)
     return replace(
         obstacle, shape=replace(obstacle.shape, normal=-obstacle.shape.normal)

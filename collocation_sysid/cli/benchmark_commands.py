@@ -87,7 +87,9 @@ def _list_bodies(options: BenchmarkCommand) -> None:
     if options.write or options.body is not None:
         where = "--write" if options.write else "--body"
         raise InputError(
-            "needs a folder; expected benchmark FOLDER", None, where=where
+            f"this option needs a folder; expected benchmark FOLDER {where}",
+            None,
+            where=where,
         )
     listed: list[dict[str, Any]] = []
     for body in BODIES.values():

@@ -34,7 +34,7 @@ def interruption_exit(
     again = shlex.join(["collocation-sysid", *sys.argv[1:]])
     text = f"interrupted: {saved_results}"
     error_console.print(
-        Text(f"{text}; go on with: {again}" if continues else text),
+        Text(f"{text}; continue with: {again}" if continues else text),
         soft_wrap=True,
     )
     return typer.Exit(EXIT_INTERRUPTED)

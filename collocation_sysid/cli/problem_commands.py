@@ -269,7 +269,7 @@ class CheckCommand(ProblemOptions, OutputOptions):
     full : bool
         Simulate the complete recordings and make all comparisons, however long this takes.
     out : DIR
-        Folder for pictures of the depth cameras' images; runs/<problem>_check by default.
+        Folder for pictures of the cameras' images; runs/<problem>_check by default.
     """
 
     full: bool = False
@@ -290,7 +290,7 @@ def check(options: CheckCommand) -> None:
     of a solve and a simulation at the guess follow. If a simulation of the complete recordings
     would take more than ten seconds, only their first samples are simulated.
 
-    For each depth camera, a picture shows the first image and the undeformed body. The pictures are
+    For each camera, a picture shows the first image and the undeformed body. The pictures are
     written into runs/NAME_check by default; with --json no pictures are written.
 
     The exit code is 0, and 1 if derivatives disagree or the description is probably wrong, 2 for
@@ -302,7 +302,7 @@ def check(options: CheckCommand) -> None:
     problem = options.read_problem()
     if not options.as_json:
         print_result(quick_check_tables(quick_check(problem)))
-        _write_depth_overlays(
+        _write_camera_overlays(
             problem,
             options.out or Path("runs") / f"{run_name(options.problem)}_check",
         )
@@ -313,22 +313,22 @@ def check(options: CheckCommand) -> None:
     raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)
 
 
-def _write_depth_overlays(problem: Problem, folder: Path) -> None:
-    """Write a picture of each depth camera's first image with the undeformed body into the folder,
-    and print the names of the files.
+def _write_camera_overlays(problem: Problem, folder: Path) -> None:
+    """Write a picture of each camera's first image with the undeformed body into the folder, and
+    print the names of the files.
 
-    The folder is made if necessary. Nothing is written or printed without depth cameras.
+    The folder is made if necessary. Nothing is written or printed without cameras.
 
     Raises
     ------
     InputError
         If the folder cannot be made or written in.
     """
-    if not any(experiment.depths for experiment in problem.experiments):
+    if not any(each.camera_names for each in problem.experiments):
         return
-    from ..result.camera_overlays import save_overlays
+    from ..result.camera_overlays import OVERLAY_TEXT, save_overlays
 
     require_possible(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for file in save_overlays(problem.experiments, folder):
-        typer.echo(f"depth over the undeformed body: {file}")
+        typer.echo(f"{OVERLAY_TEXT}: {file}")

@@ -111,7 +111,8 @@ def _require_size(
     )
     if stored_bytes > size:
         raise InputError(
-            f"{array} by its header, but the file has {size:,} bytes of it"
+            f"{array} according to its header, but the file has only {size:,} bytes of it; "
+            "expected a complete file: it may be truncated"
         )
     if stored_bytes <= SMALL_BYTES:
         return

@@ -41,7 +41,7 @@ RESULT_FILE = "result.json"
 # Version of the form of result.json and summary.json.
 SCHEMA = 4
 # Remedy for a damaged file, at the end of a message.
-AGAIN = "; run what wrote it again"
+AGAIN = "; run the command that wrote it again"
 
 
 def require_regular(path: str | Path, where: str | None = None) -> None:
@@ -68,7 +68,7 @@ def require_regular(path: str | Path, where: str | None = None) -> None:
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         kind = "a pipe" if stat.S_ISFIFO(mode) else "a device or socket"
         raise InputError(
-            f"is {kind}; expected a regular file", path, where=where
+            f"this is {kind}; expected a regular file", path, where=where
         )
 
 
@@ -96,7 +96,8 @@ def require_own(file: Path) -> None:
     require_regular(file)
     if file.is_file() and not is_own(file.parent, file):
         raise InputError(
-            "is a link to elsewhere; expected a file of this folder itself",
+            "this is a link to a file outside of the folder; expected a file in the folder "
+            "itself: replace the link by a copy",
             file,
         )
 
@@ -160,10 +161,14 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
         ) from error
     if not isinstance(content, dict):
         raise InputError(
-            f"{file.name} is damaged: it holds no object{AGAIN}", file.parent
+            f"{file.name} is damaged: it contains no JSON object{AGAIN}",
+            file.parent,
         )
     if (schema := content.get("schema")) != SCHEMA:
-        message = f"{file.name} has schema {str(schema)[:20]}; expected {SCHEMA}, this version's{AGAIN}"
+        message = (
+            f"{file.name} has schema {str(schema)[:20]}; expected {SCHEMA}, which this version "
+            f"writes{AGAIN}"
+        )
         raise InputError(message, file.parent)
     return content
 
@@ -261,7 +266,7 @@ def naming(target: Path, draft: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = f"cannot be written: {error.strerror or error}"
+        reason = f"this cannot be written: {error.strerror or error}"
         raise InputError(reason, target) from error
     except InputError as error:
         if error.source is None or not Path(error.source).is_relative_to(draft):
@@ -303,10 +308,11 @@ def require_possible(folder: Path) -> None:
         if place.is_dir():
             if not os.access(place, os.W_OK):
                 raise InputError(
-                    "this folder cannot be written in; choose another", place
+                    "this folder is not writable; expected one that is: choose another",
+                    place,
                 )
             return
         if place.exists():
             raise InputError(
-                "this is a file; expected a folder to write in", place
+                "this is a file; expected a folder: choose another path", place
             )

@@ -152,14 +152,14 @@ def run_isolated(
             )
         except subprocess.TimeoutExpired as late:
             raise Failed(
-                f"it was not finished after {late.timeout:.3g} s"
+                f"the process was not finished after {late.timeout:.3g} s"
             ) from None
         if done.returncode:
             if limits is not None and done.returncode == -getattr(
                 signal, "SIGXCPU", 0
             ):
                 raise Failed(
-                    f"it was not finished after {limits.time_s:.3g} s of processor time"
+                    f"the process was not finished after {limits.time_s:.3g} s of processor time"
                 )
             last_line = (done.stderr.strip().splitlines() or ["no message"])[-1]
             raise Failed(killed_by(done.returncode) or last_line)
@@ -173,5 +173,5 @@ def killed_by(code: int) -> str:
     """
     if code < 0:
         with contextlib.suppress(ValueError):
-            return f"its process was killed by {signal.Signals(-code).name}"
+            return f"the process was killed by {signal.Signals(-code).name}"
     return ""

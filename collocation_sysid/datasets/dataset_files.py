@@ -124,7 +124,8 @@ def copy_dataset(name: str, folder: Path) -> list[Path]:
     for copy in (*copies.values(), *schema):
         if copy.exists():
             raise InputError(
-                "this file exists already; choose another folder", copy
+                "this file exists already; expected a folder without it: choose another folder",
+                copy,
             )
     for file, copy in copies.items():
         _copy_file(file, copy, schema=url or SCHEMA_FILE)

@@ -26,6 +26,14 @@ from ..statistics.misspecification.misspecification_hypothesis import (
     HypothesisTest,
 )
 
+# Messages of the hypotheses by the codes of their concerns.
+MESSAGES_OF_TIMES = {
+    "description/camera-clock": "its images fit {by_ms:.3g} ms away from their times: its clock is "
+    "{when} relative to that of the poses; {do} its times",
+    "description/camera-order": "its images fit in reverse order: sort their files by time",
+    "description/camera-constant": "all its images show the same moment, although the body moves by "
+    "{by_mm:.3g} mm: check that the images are those of this recording",
+}
 # Fewest images whose order can be tested.
 FEWEST_IMAGES = 3
 # Most images that are compared, evenly spread.
@@ -195,7 +203,7 @@ class _MotionComparison:
                 data={
                     "by_ms": 1e3 * abs(lag_s),
                     "when": "late" if lag_s > 0 else "early",
-                    "do": "subtract" if lag_s > 0 else "add",
+                    "do": "subtract this from" if lag_s > 0 else "add this to",
                 },
                 corrected=ImageTimes(stated.images[covered], times_s[covered]),
             )

@@ -38,6 +38,24 @@ from ..statistics.misspecification.misspecification_hypothesis import (
     HypothesisTest,
 )
 
+# Messages of the hypotheses by the codes of their concerns.
+MESSAGES_OF_IMAGES = {
+    "description/camera-image": "the points fit with rows and columns of the image read {order}: the "
+    "image was flipped or rotated after the camera took it; undo that, or describe the "
+    "camera as it took the image",
+    "description/camera-matrix/focal": "the points fit with focal lengths {factor:g} times as large: "
+    "check fx and fy of camera.matrix, which are in pixels of these images",
+    "description/camera-matrix/size": "the points fit with camera.matrix multiplied by {factor:g}, "
+    "except for its last row: it is that of images of another size; state the matrix of "
+    "these images",
+    "description/camera-matrix/centre": "the points fit with the principal point {centre}, {how}: "
+    "state cx and cy of camera.matrix from the upper left corner, cx along the columns",
+    "description/camera-rays": "the points fit if the depths are distances along the rays: convert "
+    "them to depths along the optical axis, dividing by the length of K⁻¹ (u, v, 1)",
+    "description/camera-pose": "the points fit only if the camera is turned by {degrees:.2g}° and "
+    "shifted by {by_mm:.2g} mm, {deviations:.2g} standard deviations of its prior: "
+    "measure camera.pose again, or state nuisance.depth_pose",
+}
 # Young's moduli of the equilibria [Pa], stiff to soft.
 YOUNG_PA = np.geomspace(1e7, 1e2, 11)
 # Deformation over the body's diagonal between neighbouring shapes: the camera follows as much.

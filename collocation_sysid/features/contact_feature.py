@@ -50,9 +50,10 @@ TOPICS = {
         "contact area.",
         messages={
             "never": "in '{experiment}'{more} the body never touches {obstacle}{guess}; the "
-            "smallest gap is {mm:.3g} mm: its force and friction carry no information",
+            "smallest gap is {mm:.3g} mm. The contact carries no information: check the place and "
+            "the motion of the obstacle, or remove it",
             "coarse": "in '{experiment}'{more} only {faces:.2g} faces, {face_mm:.2g} mm large, "
-            "touch {obstacle} at a time{guess}: the mesh is too coarse for the contact area; "
+            "touch {obstacle} at the same time{guess}: the mesh is too coarse for the contact area; "
             "refine it there",
             "pressed": "in '{experiment}'{more} the body touches {obstacle} already at the first "
             "sample{guess}: the beginning of the contact is not recorded; start the "

@@ -81,7 +81,7 @@ def reason_against_copy(experiment: Experiment, other: Experiment) -> str:
     """Return that the recordings have different sensors; "" if the same."""
     own = [gauge.name for gauge in experiment.readings]
     theirs = [gauge.name for gauge in other.readings]
-    return "other readings" if own != theirs else ""
+    return "other sensor readings" if own != theirs else ""
 
 
 def errors(

@@ -32,12 +32,15 @@ from ..statistics.misspecification.misspecification_hypothesis import (
     rank,
 )
 from .camera_clock_misspecifications import (
+    MESSAGES_OF_TIMES,
     camera_clock_hypotheses,
 )
 from .camera_image_misspecifications import (
+    MESSAGES_OF_IMAGES,
     camera_image_hypotheses,
 )
 from .camera_misspecifications import (
+    MESSAGES_OF_POSES,
     camera_hypotheses,
     require_depth_units,
 )
@@ -50,6 +53,18 @@ from .measurement_results import (
     PredictionErrors,
 )
 
+# Messages of concerns about a fit or a prediction, by code.
+MESSAGES = {
+    "residuals/outline": "{percent:.0f} % of the model's outline are more than {pixels:.0f} pixels "
+    "away from the edge of the body in the images of {camera}: the body may be grasped "
+    "at another place, be partly hidden, or have another stiffness; if depths are "
+    'missing on the body itself, state background = "unknown"',
+    "nuisance/camera": "{name} is {deviations:.1f} standard deviations of its prior away from the "
+    "stated pose: another stiffness may fit equally well with another pose of the "
+    "camera; measure the pose, or state how well it is known (nuisance.depth_pose)",
+    "prediction/unseen": "none of the {seen} points of {camera} is near the predicted surface of "
+    "'{experiment}': check camera.pose and the unit of the depth",
+}
 # Pose of a depth camera in standard deviations of its prior: "check", because it compensates wrong
 # shapes.
 LARGEST_CAMERA_OFFSET = 2.0
@@ -61,6 +76,15 @@ OUTLINE_SHARE = 0.1
 # RMS distance of depth points in standard deviations up to which there is nothing to explain: noise
 # along the normal is rarely known better.
 LARGEST_NOISE = 1.5
+# Excluded points in notes, by the reason for which they are not compared.
+EXCLUSION_WORDS = {
+    "far": "farther from the body than gate_m",
+    "grazing": "on faces seen at a grazing angle",
+    "turned away": "on faces turned away from the camera",
+    "not chosen": "on faces that are not selected",
+    "hidden": "on hidden faces",
+    "crease": "near a crease",
+}
 # Most nodes of a body whose equilibria for many stiffnesses take seconds.
 NODES = 2000
 
@@ -415,11 +439,11 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
         distance_m = reading.signed_distances_m(observation, part.phi)
         correspondences = reading.correspondences
         excluded = ", ".join(
-            f"{count} {why}"
+            f"{count} {EXCLUSION_WORDS[why]}"
             for why, count in correspondences.excluded_counts.items()
             if count
         )
-        distances = "are compared, because none is near enough to the body"
+        distances = "are compared, because no point is near enough to the body"
         if correspondences.is_compared.any():
             distances = (
                 f"deviate from the surface by {1e3 * np.sqrt(np.nanmean(distance_m**2)):.3g} "
@@ -464,7 +488,7 @@ def _distance_text(error: DepthError) -> str:
     if error.rms_m is None:
         return "no point near the body"
     sentence = f"{1e3 * error.rms_m:.3g} mm RMS of {error.points} points"
-    gate = f"the gate of {1e3 * error.gate_m:.3g} mm"
+    gate = f"the limit of {1e3 * error.gate_m:.3g} mm (gate_m)"
     if not error.share_beyond_gate:
         return f"{sentence}, all within {gate}"
     beyond = f"{sentence}, {error.share_beyond_gate:.0%} beyond {gate}"
@@ -475,6 +499,12 @@ def _distance_text(error: DepthError) -> str:
 
 DEPTH = Feature(
     "depth",
+    messages={
+        **MESSAGES,
+        **MESSAGES_OF_POSES,
+        **MESSAGES_OF_IMAGES,
+        **MESSAGES_OF_TIMES,
+    },
     picture_kinds=[
         PictureKind(
             "depth",

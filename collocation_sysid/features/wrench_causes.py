@@ -49,12 +49,13 @@ MESSAGES = {
     "for a log state sensor_frame in the table of the wrench",
     "description/wrench-gain": "its {what} fit if multiplied by {factor:.3g}: check the calibration of "
     "the sensor, and the density or mass of the body",
-    "description/wrench-point": "its torques refer to a point {by_mm:.3g} mm away from point_m: they "
-    "fit with point_m = {point}",
+    "description/wrench-point": "its torques refer to a point {by_mm:.3g} mm away from point_m: "
+    "set point_m = {point}, with which they fit",
     "description/wrench-frame": 'it is expressed in the frame of the {other}: set frame = "{other}"',
-    "description/wrench-unit": "its {what} seem to be in {unit}: multiply by {factor:g}",
+    "description/wrench-unit": "its {what} seem to be in {unit}: multiply them by {factor:g}",
     "description/wrench-clock": "it was measured about {by_ms:.3g} ms {when} than its times t_s "
-    "state: its clock differs from that of the poses",
+    "state: its clock differs from that of the poses; correct t_s of the wrench, or "
+    "estimate the difference with nuisance.sensor_time",
     "description/wrench-tare": "the sensor was probably zeroed while it carried the body: zero it "
     "before the grasp, or widen nuisance.tare",
     "description/sign": "along {axis} the displacement of grasp {grasp} and its force on the body have "

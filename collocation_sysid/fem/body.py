@@ -213,7 +213,8 @@ class Body(Discretisation):
             rest_shape, UnderGravity
         ):
             raise InputError(
-                f"found {rest_shape!r}; expected 'stress_free' or UnderGravity(nodes, gravity)",
+                f"found {rest_shape!r}; expected 'stress_free', or for a mesh that was scanned under "
+                "its own weight cs.UnderGravity(nodes, gravity_m_s2)",
                 where="rest_shape",
             )
         if self.scan_conditions is not None:
@@ -643,11 +644,11 @@ class Body(Discretisation):
             return None
         part = self.parts[masses[:, node].argmin()]
         density = part.full_name(DENSITY.name)
-        remedy = "state a density above zero"
+        remedy = "state a larger density"
         if part.field is not None and part.stress_field is None:
             remedy = "lower the amplitude of its field to 0.3 or less, or its field_1, field_2, …"
         return (
-            f"{density} is so low near node {node} that its mass is {total[node]:.2g} kg; "
+            f"node {node} has the mass {total[node]:.2g} kg, because {density} is too low near it; "
             f"expected masses above zero: {remedy}"
         )
 

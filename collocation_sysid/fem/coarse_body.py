@@ -264,8 +264,9 @@ def _coarse_field(
         return None
     if type(modes) is not FieldModes:
         raise InputError(
-            f"the field of {source.field_name} has a value of its own in each element, so that it "
-            "cannot be taken over to a coarse mesh"
+            f"the two-phase field of {source.field_name} has values that belong to the elements of "
+            "its own mesh, so that it cannot be transferred to a coarse mesh; expected a body "
+            "without field, or a field with prior = 'smooth'"
         )
     centres_m = body.mesh.centres_m[source.cells]
     _, nearest = KDTree(centres_m).query(coarse.mesh.centres_m[part.cells])

@@ -97,8 +97,9 @@ class Discretisation(ConstantsModel):
         self.element: Element = element_named(element)
         if self.has_memory and self.element.mean_dilatation:
             raise InputError(
-                f"element '{element}' averages the dilatation and cannot have a memory (prony); "
-                "expected tet10 or tet4"
+                f"element '{element}' averages the volume change over each element and does not "
+                "support materials with memory (prony); expected element 'tet10' or 'tet4', or a "
+                "material without prony"
             )
         self.nodes = ElementNodes.for_element(mesh, self.element)
         self.nodes_m: Array = self.nodes.points_m
@@ -413,8 +414,9 @@ class Discretisation(ConstantsModel):
         for array in arrays:
             if array.size % (3 * nodes) or array.size != arrays[0].size:
                 raise InputError(
-                    f"node fields of shapes {', '.join(str(a.shape) for a in arrays)}; "
-                    f"expected ({nodes}, 3) or (T, {nodes}, 3), with the same T in all"
+                    "arrays with values at nodes have the shapes "
+                    f"{', '.join(str(a.shape) for a in arrays)}; expected ({nodes}, 3) or (T, {nodes}, 3), "
+                    "with the same number T of times in all"
                 )
         return [array.reshape(-1, 3 * nodes) for array in arrays]
 
@@ -423,7 +425,8 @@ class Discretisation(ConstantsModel):
         states = self._states(positions)[0]
         if len(states) != 1:
             raise InputError(
-                f"positions hold {len(states)} states; expected one, ({len(self.nodes_m)}, 3)"
+                f"found positions at {len(states)} times; expected those at one time, an array "
+                f"({len(self.nodes_m)}, 3)"
             )
         return states
 
@@ -458,8 +461,8 @@ class Discretisation(ConstantsModel):
         """
         if len(theta) != len(self.constants):
             raise InputError(
-                f"{len(theta)} constants given, expected {len(self.constants)}: "
-                f"{', '.join(self.constants)}"
+                f"found {len(theta)} values of constants; expected {len(self.constants)}, in this "
+                f"order: {', '.join(self.constants)}"
             )
         with COMPILING:
             if name not in self._evaluators:

@@ -152,12 +152,16 @@ class NodeForce:
         ]
         if "at" in arguments:
             raise InputError(
-                f"force {name!r} has an argument before `at`, as forces with internal variables "
-                "have; expected carries = the number of internal variables"
+                f"force {name!r}: the function has an argument between v and `at`; expected the "
+                "arguments x, v, at and then named constants. For a force with internal variables, "
+                "whose arguments are x, v, before, at, state carries = the number of internal "
+                "variables"
             )
         if unused := sorted(set(definitions) - set(arguments)):
             raise InputError(
-                f"force {name!r} has no constant {unused[0]!r}{hint_at(unused[0], arguments)}"
+                f"force {name!r}: the function has no argument for the given constant {unused[0]!r}; "
+                "expected its name among the arguments "
+                f"{', '.join(arguments)}{hint_at(unused[0], arguments)}"
             )
         known = tuple(
             definitions.get(a) or constant_named(a) for a in arguments
@@ -169,7 +173,7 @@ class NodeForce:
         )
         if on not in get_args(On):
             raise InputError(
-                f"force {name!r} is on {on!r}; expected one of {', '.join(get_args(On))}"
+                f"force {name!r}: found on = {on!r}; expected one of {', '.join(get_args(On))}"
             )
         force = cls(
             name,
@@ -340,18 +344,19 @@ class NodeForce:
             _ = self._symbols
         except (Exception, SystemExit) as error:
             internal_text = (
-                " and the new internal variables"
+                ", and of the new internal variables"
                 if self.internal_variable_count
                 else ""
             )
             raise InputError(
-                f"force {self.name!r} cannot be evaluated ({reason(error)}); expected a function "
-                "of x, v, at and named constants in CasADi operations that returns three forces"
-                + internal_text
+                f"force {self.name!r} cannot be evaluated ({reason(error)}); expected a function of x, "
+                "v, at and named constants in CasADi operations that returns the three components of "
+                f"a force{internal_text}"
             ) from error
         if force.shape != (3, 1):
             raise InputError(
-                f"force {self.name!r} has the shape {force.shape}; expected (3, 1)"
+                f"force {self.name!r} returns an expression of the shape {force.shape}; expected (3, "
+                "1): the force in x, y and z"
             )
         if after.shape != (self.internal_variable_count, 1):
             raise InputError(
@@ -366,8 +371,9 @@ class NodeForce:
             for e in self._force_and_jacobian(at_rest, np.ones(CONTEXT_SIZE))
         ):
             raise InputError(
-                f"force {self.name!r} or its derivative is not finite for a node at rest; "
-                "expected a smooth law, such as sqrt(v·v + 1e-12) in place of |v|"
+                f"force {self.name!r} or its derivative is not finite for a node at rest; expected a "
+                "smooth law: a norm |v|, whose derivative is not finite at zero, can be replaced by "
+                "sqrt(v·v + 1e-12)"
             )
 
     def on_refined_body(self, nodes: Index | None) -> NodeForce:
@@ -447,8 +453,8 @@ class LocatedForce:
             nodes = faces[np.isin(faces, chosen).all(axis=1)]
             if not len(nodes):
                 raise InputError(
-                    f"force {force.name!r} is on faces, but none of the surface has all of its "
-                    "nodes among those chosen"
+                    f"force {force.name!r} acts on faces of the surface, but no face has all of its nodes "
+                    "among the chosen nodes; expected all nodes of the faces on which it acts"
                 )
             data = data[:, nodes[:, -3:]].mean(axis=2)
             data[3:] = 0.0

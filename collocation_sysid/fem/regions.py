@@ -231,8 +231,8 @@ def parts_from_regions(
     require_admissible_damping(remainder.damping, remainder.material)
     if field is not None and not rest.size:
         raise InputError(
-            "the field applies to the cells outside all regions, but there are none; expected "
-            "the field of a region"
+            "found a field for the part of the body outside all regions, but the regions contain "
+            "every cell; expected the field as an entry of one of the regions"
         )
     parts = [_with_field(remainder, field, mesh=mesh)] if rest.size else []
     for region, cells, density in zip(
@@ -313,11 +313,14 @@ def _densities(
         the given mass, or if a mass is given and every cell has a density of its own.
     """
     if (density_kg_m3 is None) == (mass_kg is None):
-        raise InputError("give exactly one of density_kg_m3 and mass_kg")
+        raise InputError(
+            f"found {'neither' if mass_kg is None else 'both'} of density_kg_m3 and mass_kg; "
+            "expected exactly one of them"
+        )
     for region in regions:
         if region.density_kg_m3 is not None and not region.density_kg_m3 > 0:
             raise InputError(
-                "density_kg_m3 must be positive",
+                f"density_kg_m3 is {region.density_kg_m3:g}; expected a positive number",
                 None,
                 where=f"region '{region.name}'",
             )
@@ -334,8 +337,8 @@ def _densities(
         )
         if remaining_m3 <= 1e-12 * mesh.volume_m3:
             raise InputError(
-                "every cell is in a region with a density of its own, so mass_kg has no effect; "
-                "omit one of the densities"
+                "every cell is in a region with a density of its own, so that mass_kg has no effect; "
+                "omit mass_kg and give density_kg_m3 of the body, or omit the density of one region"
             )
         default_density = (float(mass_kg or 0.0) - known_kg) / remaining_m3
         key = "mass_kg"
@@ -373,7 +376,7 @@ def _cells_of_regions(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
     for k, region in enumerate(regions):
         if region.name in [other.name for other in regions[:k]]:
             raise InputError(
-                f"two regions are named {region.name!r}; names must differ"
+                f"two regions are named {region.name!r}; expected a different name for each region"
             )
         try:
             cells = _resolve_cells(mesh, region.cells)
@@ -382,8 +385,8 @@ def _cells_of_regions(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
         if (overlap := cells[region_of_cell[cells] >= 0]).size:
             other = regions[int(region_of_cell[overlap[0]])].name
             raise InputError(
-                f"cell {overlap[0]} is in the regions {other!r} and {region.name!r}; expected "
-                "every cell in one at most"
+                f"cell {overlap[0]} is in the regions {other!r} and {region.name!r}; expected every "
+                "cell in at most one region: make the selections of the two regions disjoint"
             )
         region_of_cell[cells] = k
         claimed.append(cells)
@@ -406,13 +409,14 @@ def _resolve_cells(mesh: TetMesh, cells: Selection | ArrayLike) -> Index:
         array = np.flatnonzero(array)
     if array.ndim != 1 or array.dtype.kind not in "iu" or not array.size:
         raise InputError(
-            f"cells are an array {array.shape} of {array.dtype}; expected cell numbers, or a mask "
-            f"({count},) that is true somewhere"
+            f"cells are an array {array.shape} of {array.dtype}; expected indices of cells from 0, "
+            f"or a boolean array ({count},) that is true somewhere"
         )
     outside = array[(array < 0) | (array >= count)]
     if outside.size:
         raise InputError(
-            f"cell {outside[0]} does not exist; the mesh has {count}, from 0 on"
+            f"cell {outside[0]} does not exist; expected indices of the {count} cells of the mesh, "
+            f"0 to {count - 1}"
         )
     return np.unique(array).astype(np.int64)
 
@@ -458,15 +462,17 @@ class ConstantsModel:
             for constant in force.constants:
                 if constant.name in self.list_parameter_names():
                     raise InputError(
-                        f"force {force.name!r} has the constant {constant.name!r}, whose name "
-                        "another part of the body uses; expected another name"
+                        f"force {force.name!r} has the constant {constant.name!r}, but another "
+                        "constant of the body has the same name; expected another name for the "
+                        "constant of the force"
                     )
                 self.constants[constant.name] = constant
         for constant in frictions:
             if constant.name in self.list_parameter_names():
                 raise InputError(
-                    f"a friction is called {constant.name!r}, like another constant of the body; "
-                    "expected another name"
+                    f"the coefficient of friction {constant.name!r} has the name of another constant of "
+                    "the body; expected another name of the obstacle, which the name of its friction "
+                    "begins with"
                 )
             self.constants[constant.name] = constant
 
@@ -573,7 +579,8 @@ class ConstantsModel:
         for name in list(self.constants)[len(theta) :]:
             if name not in values:
                 raise InputError(
-                    "this constant of a force or friction has no value; expected one in [parameters]",
+                    "this constant of a force or friction has no value; expected a number in "
+                    "[parameters], or {} to estimate it",
                     None,
                     where=name,
                 )
@@ -698,7 +705,7 @@ class ConstantsModel:
             if name not in self.list_parameter_names():
                 hint = hint_at(name, self.list_parameter_names())
                 raise InputError(
-                    f"no constant {name!r}; expected {', '.join(self.constants)}{hint}"
+                    f"found the constant {name!r}; expected one of {', '.join(self.constants)}{hint}"
                 )
         stored = {
             p.full_name(c.name)

@@ -148,8 +148,14 @@ class UnderGravity:
             chosen = np.unique(np.asarray(self.nodes, dtype=np.int64))
         count = len(nodes.points_m)
         if not chosen.size or chosen[0] < 0 or chosen[-1] >= count:
+            found = (
+                f"node indices from {chosen[0]} to {chosen[-1]}"
+                if chosen.size
+                else "no nodes"
+            )
             raise InputError(
-                f"found {chosen.size} nodes; expected numbers of the {count} nodes of the body",
+                f"found {found}; expected the nodes that were held during the scan, with indices "
+                f"from 0 to {count - 1}",
                 where="scan.nodes",
             )
         points_m = nodes.points_m[chosen]

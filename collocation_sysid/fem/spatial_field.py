@@ -159,7 +159,8 @@ class Laplacian:
         local_nodes = local_nodes.reshape(-1, 4)
         if not count + 2 < size:
             raise InputError(
-                f"modes is {count}; expected at most {size - 3}, with {size} nodes"
+                f"modes is {count}; expected at most {size - 3}, because the part of the body that has "
+                f"the field has {size} nodes"
             )
         geometry = reference_geometry(
             mesh.points_m[nodes], local_nodes, element=ELEMENTS["tet4"]
@@ -305,7 +306,7 @@ class FieldModes:
         if not scaled and field.parameter != DENSITY.name:
             known = [ALL_MODULI] * bool(moduli) + [*names, DENSITY.name]
             raise InputError(
-                f"parameter of a field is {field.parameter!r}; expected one of {', '.join(known)}"
+                f"parameter of the field is {field.parameter!r}; expected one of {', '.join(known)}"
             )
         laplacian = Laplacian.from_mesh(mesh, cells, count=field.modes)
         return cls(

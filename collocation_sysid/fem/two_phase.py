@@ -127,8 +127,8 @@ class TwoPhaseModes(FieldModes):
         """
         if field.parameter == DENSITY.name:
             raise InputError(
-                f"prior of a field of {DENSITY.name} is 'two-phase'; expected 'smooth', or regions "
-                "with densities of their own"
+                f"the field of {DENSITY.name} has prior = 'two-phase'; expected prior = 'smooth', or "
+                "regions with densities of their own in place of the field"
             )
         if len(field.lengths_m) > 1:
             raise InputError(

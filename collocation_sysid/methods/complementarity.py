@@ -86,8 +86,9 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
         if not solution.status.converged:
             break
     note = (
-        f"contact as complementarity: after the solve with a contact energy, {len(RELAXED)} "
-        f"further solves reduced pressure times gap to {share:g} κδ²"
+        "contact as complementarity: after the solve with a contact energy of stiffness κ and "
+        f"range δ, {len(RELAXED)} further solves reduced the product of pressure and gap to "
+        f"{share:g} κδ²"
     )
     # The multipliers are computed again where needed, as the solver's contain its rounding errors.
     return replace(

@@ -219,7 +219,8 @@ class DaskExecutor:
             yield
         except dask.scheduler.KilledWorker as error:
             raise _disconnection(
-                "A recording terminated every worker that computed it: check the workers' memory."
+                "One of the recordings terminated every worker that computed it: check the memory of "
+                "the workers."
             ) from error
         except (Exception, dask.client.CancelledError) as error:
             is_disconnected = isinstance(
@@ -229,7 +230,7 @@ class DaskExecutor:
                 self.client.status == "running" and not is_disconnected
             ):
                 raise
-            raise _disconnection("Its scheduler no longer responds.") from error
+            raise _disconnection("The scheduler no longer responds.") from error
 
     def _submit(
         self, home: str, run: Callable[..., Any], *arguments: Any
@@ -364,8 +365,8 @@ def _require_package(client: Any) -> set[str]:
     for address, worker_version in versions.items():
         if worker_version != own_version:
             raise _refusal(
-                f"found {worker_version!r} on the worker {address}; expected collocation-sysid "
-                f"{own_version}"
+                f"found collocation-sysid {worker_version} on the worker {address}; expected "
+                f"{own_version}, the version on this machine: install it there"
             )
     return set(versions)
 

@@ -308,8 +308,9 @@ class InteriorPoint(Options):
         if "Invalid_Option" not in solution.message:
             return solution
         missing = (
-            f"linear_solver = '{self.linear_solver}' needs a library that is not installed; "
-            "'mumps' and 'spral' come with CasADi"
+            f"IPOPT refused one of its options: linear_solver = '{self.linear_solver}' probably "
+            "needs a library that is not installed; expected 'mumps' or 'spral', which come with "
+            "CasADi"
         )
         return replace(solution, notes=(*solution.notes, missing))
 

@@ -41,9 +41,11 @@ def method_from_options(
     known = [field.name for field in fields(kind)]
     for name in options:
         if name not in known:
-            has = f"it has {', '.join(known)}{hint_at(name, known)}"
+            has = f"expected one of {', '.join(known)}{hint_at(name, known)}"
             raise InputError(
-                f"{kind.name!r} has no option {name!r}; {has}", None, where=key
+                f"the method {kind.name!r} has no option {name!r}; {has}",
+                None,
+                where=key,
             )
     try:
         return kind(**options)

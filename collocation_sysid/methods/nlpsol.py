@@ -300,7 +300,9 @@ def _run(
     else:
         search()
     if not results:
-        return _NlpsolResult.failure(len(start), "left behind")
+        return _NlpsolResult.failure(
+            len(start), "interrupted before the solver returned a result"
+        )
     return results[0]
 
 

@@ -62,11 +62,17 @@ _SENTENCES = {
     "not reached.",
     Status.ITERATION_LIMIT: "Stopped at the iteration limit; raise max_iterations or start from a "
     "better guess.",
-    Status.TIME_LIMIT: "Stopped at the time limit.",
+    Status.TIME_LIMIT: (
+        "Stopped at the time limit before the tolerances were reached; raise max_time_s or "
+        "start from a better guess."
+    ),
     Status.INFEASIBLE: "The equations of motion could not be satisfied from this start; check "
     "grasp, mass and units, or start from another guess.",
-    Status.STALLED: "The steps became too small to make progress; check the likely causes below, "
-    "and the guess if one is given.",
+    Status.STALLED: (
+        "The steps became too small to make progress before the tolerances were reached; "
+        "check the guess, if one is given, and the likely causes of the misfit that the "
+        "report lists."
+    ),
     Status.DIVERGED: "The iterates grew without bound; check units and bounds.",
     Status.NUMERICAL_FAILURE: "A step could not be computed or a function was not finite; another "
     "guess or linear solver may help.",

@@ -161,7 +161,10 @@ def start_problem(
         return collocation, None
     reason = f"the body cannot be simulated at the guess ({failure})"
     if failure is None:
-        reason = "at the guess, the simulation is farther from the measurements than an undeformed body"
+        reason = (
+            "at the guess, the simulation is farther from the measurements than a body that moves "
+            "rigidly with its grasps"
+        )
     result = rescue(collocation, reason, is_complete=is_complete)
     if result is None:
         return collocation, None  # the method reports what it needs
@@ -238,8 +241,6 @@ def scan_stiffness(
     if trials.is_best_at_end(softest=False):
         trials.last_trajectories = None
         trials.extend_range(max(trials.misfits), 1 / step)
-    if any(s.association.correspondences for s in collocation.transcriptions):
-        trials.refine_best()
     young_pa = np.array(sorted(trials.misfits))
     misfit = np.array([trials.misfits[young] for young in young_pa])
     candidates = [
@@ -634,8 +635,6 @@ class ScanState:
         Misfit by Young's modulus [Pa]; NaN where the simulation failed.
     last_trajectories : list or None
         Trajectories of the last simulation that succeeded; None before.
-    best_trajectories : list or None
-        Trajectories with the smallest misfit so far; None before the first.
     is_ended_early : bool
         Whether the scan ended before the softest modulus.
     """
@@ -644,7 +643,6 @@ class ScanState:
         self.trial = trial
         self.misfits: dict[float, float] = {}
         self.last_trajectories: list[Array] | None = None
-        self.best_trajectories: list[Array] | None = None
         self.is_ended_early = False
 
     def try_sequence(self, young_pa: Sequence[float]) -> None:
@@ -698,27 +696,6 @@ class ScanState:
             best = misfit
             beyond = beyond * factor
 
-    def refine_best(self) -> None:
-        """Try the geometric means of the best modulus and those next to it; their misfits are
-        stored.
-
-        Where correspondences make local minima, searches from moduli nearer to the solution
-        take fewer steps. Nothing is tried if no modulus could be simulated.
-        """
-        ascending = sorted(y for y, m in self.misfits.items() if np.isfinite(m))
-        if not ascending:
-            return
-        best = min(ascending, key=lambda young: self.misfits[young])
-        place = ascending.index(best)
-        neighbours = [
-            *ascending[max(place - 1, 0) : place],
-            *ascending[place + 1 : place + 2],
-        ]
-        start = self.best_trajectories
-        for young_pa in neighbours:
-            self.last_trajectories = start
-            self._try(float(np.sqrt(best * young_pa)))
-
     def is_best_at_end(self, softest: bool) -> bool:
         """Return whether the best modulus is the softest (or else the stiffest) that was tried.
 
@@ -741,8 +718,6 @@ class ScanState:
         """
         misfit, warm = self.trial.evaluate_at(young_pa, self.last_trajectories)
         self.last_trajectories = warm or self.last_trajectories
-        if all(misfit < each for each in self.misfits.values() if each == each):
-            self.best_trajectories = warm or self.best_trajectories
         self.misfits[young_pa] = misfit
         complete_steps(StepUnit.STIFFNESS)
         return misfit

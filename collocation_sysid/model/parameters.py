@@ -166,7 +166,9 @@ class Parameter:
             self.prior[1] > 0 and (self.prior[0] > 0 or self.scale == "linear")
         ):
             raise InputError(
-                f"prior = {self.prior}, expected positive mean and deviation",
+                f"prior = {self.prior}, expected "
+                f"{'any mean' if self.scale == 'linear' else 'a positive mean'} and a positive "
+                "standard deviation",
                 None,
                 where=self.name,
             )
@@ -293,7 +295,8 @@ def complete_parameter(
         and usual_value(name, 1.0) is None
     ):
         raise InputError(
-            "there is no guess, and no usual value of it is known; expected guess = a value",
+            "this parameter has no guess, and no usual value of it is known; expected guess = a "
+            "value",
             None,
             where=name,
         )
@@ -421,7 +424,9 @@ class Parameters:
         for name, count in Counter(self.names).items():
             if count > 1:
                 raise InputError(
-                    "given twice, expected one value", None, where=name
+                    "this parameter is given twice, expected one value",
+                    None,
+                    where=name,
                 )
         # A scalar cannot be tied to a component of a vector.
         self._check_ties(self.scalars)
@@ -827,7 +832,7 @@ class Parameters:
                     dict.fromkeys(n for body in bodies for n in body.constants)
                 )
                 raise InputError(
-                    f"no such parameter; the model's are {expected}{hint_at(name, known)}",
+                    f"the model has no such parameter; expected one of {expected}{hint_at(name, known)}",
                     None,
                     where=name,
                 )
@@ -838,7 +843,7 @@ class Parameters:
         for name in self.names:
             if name not in used:
                 raise InputError(
-                    "no part of the model uses it, because every region has its own value; "
+                    "no part of the model uses this parameter, because every region has its own value; "
                     "remove it",
                     None,
                     where=name,
@@ -860,7 +865,8 @@ def _guess(item: Parameter) -> float:
     """Return the guess of a parameter, or raise an `InputError` if there is none."""
     if item.guess is None:
         raise InputError(
-            "it has no guess; expected guess = a value here (solve and check find one)",
+            "this parameter has no guess; expected guess = a value, because only solve and check "
+            "find one by themselves",
             None,
             where=item.name,
         )

@@ -194,10 +194,11 @@ def as_scheme(
         return scheme
     if start_rule != "paper":
         raise InputError(
-            f"no start rule {start_rule!r}; available: standard, paper"
+            f"no start rule {start_rule!r}; expected one of standard, paper"
         )
     if scheme != SCHEMES["backward-euler"]:
         raise InputError(
-            f"start rule 'paper' belongs to scheme 'backward-euler', not {scheme.name!r}"
+            f"found start rule 'paper' and scheme {scheme.name!r}; expected start rule 'standard', "
+            "or scheme 'backward-euler'"
         )
     return replace(scheme, start=(replace(_FIRST_STEP, s=(0.0, 0.0), r=0.0),))

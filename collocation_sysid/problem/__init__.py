@@ -7,7 +7,7 @@ to a problem, `recording_reader` reads the files of one experiment (`marker_trac
 names, `bench_files` tables of a test bench, `density_guesses` the mass), and
 `problem_size` estimates memory and time; `specimen_reader` reads tests without a mesh, and
 `gripper_transforms` the poses of bodies in grippers. `schema`, `recording_schema`, `load_schema`,
-`depth_section` (a `measurement_section`, which reads its own files), `nuisance_schema` (with
+`camera_section` (a `measurement_section`, which reads its own files), `nuisance_schema` (with
 `nuisance_priors`), `specimen_schema` and `solver_schema` define the keys,
 `editor_schema` describes them for editors, `key_descriptions` for readers, and
 `validation_messages` words validation errors.

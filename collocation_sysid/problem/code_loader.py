@@ -99,10 +99,10 @@ class CodeLoader:
         if isinstance(loaded, NodeForce):
             if carries not in (0, loaded.internal_variable_count):
                 message = (
-                    f"found {carries}, but the number of internal variables of the force "
-                    f"{name!r} is"
+                    f"found {carries}, but the force {name!r} has "
+                    f"{loaded.internal_variable_count} internal variables; expected no carries: omit "
+                    "this key"
                 )
-                message += f" {loaded.internal_variable_count}; expected the key to be omitted"
                 raise InputError(message, where=f"{key}.carries")
             return loaded if nodes is None else replace(loaded, nodes=nodes)
         with located(file):
@@ -194,7 +194,8 @@ class CodeLoader:
             names = runpy.run_path(str(file))
         except (Exception, SystemExit) as error:
             raise InputError(
-                f"running it failed: {reason(error)}", file
+                f"this Python file raised an error when it was run: {reason(error)}",
+                file,
             ) from error
         if not is_kind(names.get(value_name)):
             known_names = [

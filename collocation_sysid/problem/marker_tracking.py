@@ -152,8 +152,8 @@ def poses_from_markers(
     notes = []
     if incomplete_frames := int((fit.missing & is_in_window).sum()):
         notes.append(
-            f"{incomplete_frames} of {is_in_window.sum()} frames contain fewer than three of "
-            f"{', '.join(names)}; their poses are interpolated"
+            f"{incomplete_frames} of {is_in_window.sum()} frames contain fewer than three of the "
+            f"markers {', '.join(names)}; the poses of these frames are interpolated"
         )
     residual_m = np.where(is_in_window, fit.residual_m, np.nan)
     if np.isfinite(residual_m).any():
@@ -199,7 +199,10 @@ def _rigidity_note(
     worst = int(np.nanargmax(residual_m))
     size_m = float(np.linalg.norm(np.ptp(reference_m, axis=0)))
     limit_m = max_residual_m or max(UNUSUAL * median_m, ROUNDING * size_m)
-    fit_sentence = f"{', '.join(names)} fit a rigid motion to {_mm(median_m)} (median over the frames)"
+    fit_sentence = (
+        f"the markers {', '.join(names)} fit a rigid motion to {_mm(median_m)} (median over "
+        "the frames)"
+    )
     count = int((residual_m > limit_m).sum())
     if not count:
         return f"{fit_sentence}, at worst {_mm(residual_m[worst])}"
@@ -208,7 +211,7 @@ def _rigidity_note(
     return (
         f"{fit_sentence}, but {frames} above {_mm(limit_m)}, the worst with "
         f"{_mm(residual_m[worst])} at t = {t_s[worst]:.6g} s (frame {worst + 1}), where "
-        f"{worst_marker!r} moves against the others"
+        f"{worst_marker!r} moves relative to the others"
     )
 
 

@@ -24,6 +24,9 @@ def existing_file(folder: Path, name: str, key: str) -> Path:
         fault = "is a folder" if file.is_dir() else "does not exist"
         hint = folder / "README.md"
         see = f"; {hint} explains how to get it" if hint.is_file() else ""
-        message = f"{file} {fault}; expected a file, named from the problem file's folder{see}"
+        message = (
+            f"{file} {fault}; expected a file: the path is relative to the folder of the problem "
+            f"file{see}"
+        )
         raise InputError(message, where=key)
     return file

@@ -352,7 +352,7 @@ class Problem:
             {name for name in names if names.count(name) > 1}
         ):
             raise InputError(
-                f"two experiments are named {repeated[0]!r}; names must differ"
+                f"two experiments are named {repeated[0]!r}; expected different names"
             )
         if isinstance(self.substeps, str) and self.substeps != "auto":
             raise InputError(
@@ -363,8 +363,8 @@ class Problem:
             each.is_static for each in self.experiments
         ):
             raise InputError(
-                f"found {self.substeps}, but every experiment is static, and between equilibria "
-                "there are no steps; expected none",
+                f"found {self.substeps}, but every experiment is static, and there are no time steps "
+                "between equilibria; expected no substeps",
                 where="transcription.substeps",
             )
         self.parameters.require_constants_of(self.bodies)

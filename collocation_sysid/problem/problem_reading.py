@@ -120,8 +120,8 @@ def _beyond_limits(error: Exception) -> str:
     raised `error`.
     """
     if isinstance(error, RecursionError):
-        return "nests tables or lists too deeply; expected a few levels"
-    return "contains an integer with too many digits; expected fewer than 4,300"
+        return f"tables or lists are nested too deeply; expected at most {DEEPEST} levels"
+    return "an integer has too many digits; expected fewer than 4,300"
 
 
 def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
@@ -153,7 +153,9 @@ def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
             f"this is not a text file; expected {what}", path
         ) from None
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", path) from error
+        raise InputError(
+            f"the file cannot be read: {error.strerror}", path
+        ) from error
 
 
 def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
@@ -174,12 +176,15 @@ def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
     matched = re.match(r"line (\d+)", place)
     if matched is None:
         return InputError(
-            f"not valid TOML: {reason or complaint}, at its end", path
+            f"the file is not valid TOML: {reason or complaint}, at the end of the file",
+            path,
         )
     number = int(matched[1])
     line = excerpt(text.splitlines()[number - 1].strip())
     return InputError(
-        f"not valid TOML: {reason} in: {line}", path, where=f"line {number}"
+        f"the file is not valid TOML: {reason} in: {line}",
+        path,
+        where=f"line {number}",
     )
 
 

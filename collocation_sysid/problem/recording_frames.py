@@ -185,13 +185,15 @@ class RecordingFrames:
         """
         if self.transforms is None:
             raise InputError(
-                f"found {child!r}, but poses and markers are not topics of a log, which would "
-                "state frames; expected no such key, and values in the axes of the poses"
+                f"found {child!r}, but poses and markers are not topics of a log, from which the "
+                "frames would be known; expected no such key: omit it, and state the values in the "
+                "axes of the poses"
             )
         if not parent:
             raise InputError(
                 f"found {child!r}, but the log {self.transforms.name} does not state the frame of "
-                "poses or markers; expected no such key, and values in the axes of the poses"
+                "poses or markers; expected no such key: omit it, and state the values in the axes of "
+                "the poses"
             )
         matrix = self.transforms.static_transform(parent, child)
         if matrix is not None:

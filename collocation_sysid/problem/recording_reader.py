@@ -318,7 +318,10 @@ class RecordingReader:
             At `key`, if there are no tracks, or a marker is unknown.
         """
         if self._marker_tracks is None:
-            message = "there are no tracks to fit the poses to; expected markers.file, or poses"
+            message = (
+                "the poses are to be fitted to markers, but there are no marker tracks; expected "
+                "markers.file, or poses"
+            )
             raise InputError(message, where=key)
         _require_known_markers(
             grasp.markers or (), self._marker_tracks.names, key=key
@@ -681,7 +684,7 @@ class RecordingReader:
         fewest = 1 if self._is_static else 3
         if len(times) < fewest:
             message = (
-                f"there is neither a markers.file nor a poses file with at least {fewest} times; "
+                f"there is neither a markers.file nor a poses file with {fewest} or more times; "
                 "expected one of them, whose times the simulation uses"
             )
             raise InputError(message, where="grasp")
@@ -853,9 +856,7 @@ class RecordingReader:
         known_m = section.reference_sigma_m
         if np.isnan(sigma_m).any():
             missing_name = names[int(np.isnan(sigma_m).argmax())]
-            message = (
-                f"no value for {missing_name!r}; expected one for every marker"
-            )
+            message = f"found no value for the marker {missing_name!r}; expected one for every marker"
             raise InputError(message, where="markers.sigma_m")
         arguments: dict[str, Any] = declared_in(
             section, Markers, where="markers"

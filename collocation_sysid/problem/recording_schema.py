@@ -26,7 +26,7 @@ from ..recording.node_selection import Nodes
 from ..recording.placement import AttachmentRule
 from ..recording.poses import Frame
 from ..recording.solid_sections import SolidSection
-from .depth_section import DepthSection
+from .camera_section import DepthSection
 from .load_schema import (
     ForceSection,
     PointMassSection,
@@ -148,8 +148,8 @@ class ForceSensorSection(TableSection):
         Axes of the components. "world": those of the world frame of the poses. "grasp": those of
         the undeformed body, which move with the grasp.
     point_m : list
-        Point [x, y, z] about which the torque is measured. In the frame "world" it is fixed; in the
-        frame "grasp" it is stated on the undeformed body and moves with the grasp.
+        Point [x, y, z] about which the torque is measured; it is fixed in the frame "world", and in
+        the frame "grasp" it is stated on the undeformed body and moves with the grasp.
     sensor_frame : str, optional
         Frame of the log in which the sensor measures, instead of frame and point_m. The static
         transforms of the log rotate the components to the axes of the body or of the world, and

@@ -125,6 +125,12 @@ class RegionSection(Section):
     cells : ElementNodes
         Elements of the region, selected by their centres: a table of box_m, ball_m or indices, or
         the name of a cell array or of a physical group.
+    material : Material, optional
+        Material of the region; by default that of the object.
+    damping : DampingName, optional
+        Damping law of the region; by default that of the object.
+    density_kg_m3 : float, optional
+        Density of the region [kg/m³]; by default that of the object.
     field : FieldSection, optional
         A constant that varies in space within the region.
     """
@@ -215,6 +221,9 @@ class ObjectSection(Section):
         Damping law, whose constant is γ_r. "kelvin-voigt": viscous stress proportional to the rate
         of deformation. "material": viscous stress proportional to the rate of the Green strain, as
         in MuJoCo. "rayleigh": the law of the paper, which also damps rigid rotation.
+    element : {"tet4", "tet10", "tet10-p0"}
+        Finite element: linear tetrahedra ("tet4"), quadratic tetrahedra ("tet10"), or quadratic
+        tetrahedra with one pressure each, for nearly incompressible materials ("tet10-p0").
     region : list of RegionSection
         [[object.region]] tables: parts of the body with other properties.
     prony : list of PronySection
@@ -231,7 +240,8 @@ class ObjectSection(Section):
     scan : ScanSection, optional
         Gravity and held nodes during the scan: gravity_m_s2, nodes.
     evaluator : {"auto", "simd", "casadi"}
-        How element kernels are evaluated.
+        How the expressions of the elements are evaluated: by compiled vector code ("simd"), by
+        CasADi ("casadi"), or by CasADi only if vector code cannot evaluate the material ("auto").
     """
 
     mesh: Text | None = None
@@ -300,14 +310,14 @@ class ObjectSection(Section):
 
 
 class PriorSection(Section):
-    """A normal prior: on the logarithm of a positive parameter, or on a linear one.
+    """A normal prior, of the logarithm of a positive parameter or of the value of a linear one.
 
     Attributes
     ----------
     relative : float, optional
         Relative standard deviation, such as 0.2 for 20 %.
     deviation : float, optional
-        Standard deviation of a linear parameter, in its unit.
+        Standard deviation of a parameter with scale = "linear", in the unit of the parameter.
     """
 
     mean: Finite
@@ -432,6 +442,8 @@ class TranscriptionSection(Section):
 
     Attributes
     ----------
+    scheme : {"midpoint", "bdf2", "backward-euler"}
+        Time discretisation: midpoint rule, second-order backward differences, or backward Euler.
     substeps : str
         Number of time steps between samples. "auto": one, or more (up to 8) if one step would
         change a parameter by more than half a standard error.
@@ -507,6 +519,8 @@ class ProblemFile(Section):
 
     Attributes
     ----------
+    title : str
+        Title of the problem in reports.
     parameters : Parameters
         Constants of the model by name: {} or a guess for a constant to estimate, a number for a
         known one, or a tie to another constant.

@@ -88,6 +88,8 @@ class SolverSection(Section):
 
     Attributes
     ----------
+    method : str
+        Name of the method that solves the nonlinear program.
     huber : float, optional
         Threshold in standard deviations beyond which residuals count linearly, not squared (Huber's
         loss).
@@ -183,8 +185,8 @@ def _method_from_table(method: str, table: Any) -> Any:
     for name in table:
         owners = _methods_with(name)
         if owners and method not in owners:
-            owned = f"{name} is an option of {', '.join(owners)}"
-            has = f"{method} has {', '.join(OPTIONS[method])}"
+            owned = f"found {name}, which is an option of {', '.join(owners)}"
+            has = f"expected options of {method}: {', '.join(OPTIONS[method])}"
             raise InputError(f"{owned}; {has}", None, where=where)
     return method_from_options(METHODS[method], table, key=where)
 

@@ -79,8 +79,9 @@ class SpecimenReader:
         )
         if table.is_incompressible and section.stress == "true":
             self._add_note(
-                "true stresses were converted to engineering stresses as those of an "
-                "incompressible material; a lateral stretch in the file would be used instead"
+                "true stresses were converted to engineering stresses as if the material was "
+                "incompressible, because the file has no lateral stretch; a lateral stretch would be "
+                "used instead"
             )
         specimen = self._specimen(table)
         with located(file):
@@ -150,7 +151,11 @@ class SpecimenReader:
         )
         rows = rows[is_inside]
         if not rows.size:
-            raise InputError("no sample is within window_s", where="window_s")
+            raise InputError(
+                f"found [{first_s:g}, {last_s:g}], which contains no sample; expected a window "
+                f"within the times of the table, {table.t_s[0]:g} s to {table.t_s[-1]:g} s",
+                where="window_s",
+            )
         if section.skip_cycles:
             rows = rows[
                 rows_after_cycles(table.strain[rows], section.skip_cycles)
@@ -177,8 +182,9 @@ class SpecimenReader:
         strain: Array = np.abs(specimen.strain)
         if self.body.has_memory and strain[0] > UNKNOWN_PAST * strain.max():
             self._add_note(
-                f"the first sample has a strain of {specimen.strain[0]:.3g}, in which the material "
-                "is taken to have relaxed completely; expected samples from the unloaded state on"
+                f"the strain of the first sample is {specimen.strain[0]:.3g}, and the model assumes "
+                "that the material has relaxed completely in this state; expected samples from the "
+                "unloaded state on"
             )
 
 

@@ -154,7 +154,8 @@ class Collocation:
     def __post_init__(self) -> None:
         if all(experiment.validation for experiment in self.experiments):
             raise InputError(
-                "every experiment is for validation: there is nothing to fit"
+                "every experiment is for validation, so that none is left for the fit; expected at "
+                "least one without validation = true"
             )
         if self.substeps < 1:
             raise InputError(f"substeps = {self.substeps}, expected at least 1")

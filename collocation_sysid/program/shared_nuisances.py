@@ -175,12 +175,12 @@ def _require_same_prior(
     if row == PLACE:
         places = [_declared_place(*one), _declared_place(*other)]
         if not np.allclose(*places, rtol=0, atol=1e-9, equal_nan=True):
-            difference = f"'{leader.name}', which states another {label.partition(',')[0]}"
+            difference = f"'{leader.name}', which states another {label.partition(',')[0]} on the body"
             raise _sharing_error(
                 experiment,
                 row,
                 result=difference,
-                expected="the same position in both, or in neither",
+                expected="the same position in both recordings, or in neither",
             )
 
 

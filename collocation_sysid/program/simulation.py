@@ -103,7 +103,8 @@ def require_steps(experiment: Experiment, step_s: float) -> None:
     """
     if not experiment.is_static and experiment.timestep_s > MOST_STEPS * step_s:
         raise InputError(
-            f"found steps of {step_s:g} s; expected at most {MOST_STEPS} from sample to sample"
+            f"found a time step of {step_s:g} s, which gives {experiment.timestep_s / step_s:.3g} "
+            f"steps from sample to sample; expected at most {MOST_STEPS}: state a longer step"
         )
 
 

@@ -735,7 +735,7 @@ class StreamingSweep:
         `failure`.
         """
         model = self.model
-        what = f"the step at row {self.row}"
+        what = f"time step {self.row}"
         time_s = (
             self.row * model.experiment.timestep_s / model.collocation.substeps
         )

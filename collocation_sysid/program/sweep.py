@@ -785,8 +785,8 @@ class Sweep:
             )
         except np.linalg.LinAlgError as error:
             raise SimulationError(
-                f"experiment '{self.segment.experiment.name}': the linearised equations of "
-                f"motion cannot be solved: {error}",
+                f"experiment '{self.segment.experiment.name}': the linearised equations of motion "
+                f"cannot be solved ({error}); check mass, units and grasps, or give other guesses",
                 float(dynamics.t_s[grid_times.start]),
             ) from error
 

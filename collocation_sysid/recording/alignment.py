@@ -177,9 +177,8 @@ def _cut_to_poses(
     if is_inside.sum() < fewest:
         raise InputError(
             f"poses run {spans}, markers {_span_text(t_s)}: they share {is_inside.sum()} marker "
-            "samples; "
-            f"expected at least {fewest}: check that both are of one recording and one "
-            "clock, and window_s"
+            f"samples; expected at least {fewest}: check that both belong to the same recording "
+            "and use the same clock, and check window_s"
         )
     cut = t_s[is_inside]
     ends = [
@@ -196,7 +195,7 @@ def _cut_to_poses(
         f"{_span_text(t_s)}"
     )
     if cut[0] > t_s[0]:
-        note += f"; start now refers to the state at {cut[0]:.9g} s now"
+        note += f"; start now refers to the state at {cut[0]:.9g} s"
     return at_times(table, is_inside), [note]
 
 
@@ -220,8 +219,8 @@ def _cut_to_window(
     )
     if not is_inside.any():
         raise InputError(
-            f"window_s = [{first_s:g}, {last_s:g}] holds no marker sample; "
-            f"the markers run from {table.t_s[0]:.9g} s to {table.t_s[-1]:.9g} s"
+            f"window_s = [{first_s:g}, {last_s:g}] contains no marker sample; expected a window "
+            f"within the times of the markers, from {table.t_s[0]:.9g} s to {table.t_s[-1]:.9g} s"
         )
     return at_times(table, is_inside)
 
@@ -345,7 +344,8 @@ def _jump_notes(poses: PoseSequence, grid: Array) -> list[str]:
         return []
     others = f" and {at_s.size - 1} more times" if at_s.size > 1 else ""
     return [
-        f" jump after t = {at_s[0]:.6g} s{others}; the motion is linear there, not smooth"
+        f" jump after t = {at_s[0]:.6g} s{others}; between the two poses of a jump the motion "
+        "is interpolated linearly, not smoothly"
     ]
 
 

@@ -56,8 +56,8 @@ class DepthCamera:
     Parameters
     ----------
     matrix : (3, 3) array, optional
-        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs
-        no matrix; if it has one, an offset and a scale error of the depth are estimated, and
+        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels; a cloud needs
+        no matrix. If a cloud has one, an offset and a scale error of the depth are estimated, and
         surfaces that face away from the camera are not used.
     distortion : sequence of up to five numbers
         k1, k2, p1, p2, k3 of the model of Brown and Conrady.
@@ -197,7 +197,7 @@ def _require_selection(faces: Any) -> Selection:
     """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
     if not isinstance(faces, Selection):
         raise InputError(
-            f"faces of a depth camera is {faces!r}; expected a selection"
+            f"faces of a depth camera is {faces!r}; expected a selection, such as cs.Named(…)"
         )
     return faces
 
@@ -286,8 +286,8 @@ class Depth(SeparateSensor):
             )
         if len(times) != len(self.clouds):
             raise InputError(
-                f"{where} has {len(times)} times and {len(self.clouds)} images or clouds; "
-                "expected as many"
+                f"{where} has {len(times)} times and {len(self.clouds)} images or clouds; expected one "
+                "image or cloud for each time"
             )
         clouds = tuple(
             self._thin_cloud(np.asarray(cloud, dtype=float))
@@ -321,8 +321,9 @@ class Depth(SeparateSensor):
             return ()
         if len(self.images_m) != count or self.camera.matrix is None:
             raise InputError(
-                f"{where} has {len(self.images_m)} images for {count} times; expected as many, or "
-                "none, and the matrix of the camera with them"
+                f"{where} has {len(self.images_m)} images for {count} times and "
+                f"{'no' if self.camera.matrix is None else 'a'} camera matrix; expected one image for "
+                "each time and the matrix of the camera, or no images"
             )
         images = []
         for image in self.images_m:
@@ -503,7 +504,8 @@ def points_from_image(image_m: Array, camera: DepthCamera) -> Array:
     """
     if camera.matrix is None:
         raise InputError(
-            "a depth image needs the matrix of its camera; only a point cloud does not"
+            "found a depth image without the matrix of its camera; expected matrix = [[fx, 0, "
+            "cx], [0, fy, cy], [0, 0, 1]] in pixels: only point clouds can be used without it"
         )
     depth = np.where(np.isfinite(image_m) & (image_m > 0), image_m, np.nan)
     is_inner = np.isfinite(depth)

@@ -624,8 +624,8 @@ class Experiment:
         fewest = 1 if self.is_static else 3
         if len(self.t_s) < fewest:
             raise InputError(
-                f"{len(self.t_s)} samples in time; at least {fewest} are needed: check window_s "
-                "and the marker file"
+                f"found {len(self.t_s)} sample times; expected at least {fewest}: check window_s and "
+                "the marker file"
             )
         if not self.is_static:
             step_s = sample_interval_s(
@@ -640,7 +640,8 @@ class Experiment:
             np.abs(measured - self.t_s).max() > STEP_TOLERANCE * step_s
         ):
             raise InputError(
-                "the markers' times differ from t_s; align poses and markers to one grid first"
+                "the sample times of the markers differ from t_s of the experiment; expected the same "
+                "times: cs.align brings poses and markers to common times"
             )
         if self.markers.count_samples() == 0:
             self._require_measurements()
@@ -670,7 +671,7 @@ class Experiment:
             what = f"the reading '{gauge.name}'"
             if [other.name for other in self.readings].count(gauge.name) > 1:
                 raise InputError(
-                    f"two readings are called {gauge.name!r}; expected another name"
+                    f"two readings are called {gauge.name!r}; expected different names"
                 )
             is_within_experiment(
                 gauge.sample_times_s,
@@ -694,7 +695,7 @@ class Experiment:
             what = f"the depth camera '{depth.name}'"
             if [other.name for other in self.depths].count(depth.name) > 1:
                 raise InputError(
-                    f"two depth cameras are called {depth.name!r}; expected another"
+                    f"two depth cameras are called {depth.name!r}; expected different names"
                 )
             is_within_experiment(
                 depth.sample_times_s,
@@ -718,7 +719,10 @@ class Experiment:
         if self.separate_sensors or self.find_instrumented_grasps():
             return
         if not self.markers.names:
-            message = "nothing is measured: there are no markers, no wrench and no reading"
+            message = (
+                "nothing is measured: there are no markers, no measured wrench, no reading of a "
+                "sensor and no depth camera"
+            )
             raise InputError(f"{message}; expected at least one of them")
         raise InputError(
             "there is no marker sample; check the marker file and window_s"
@@ -741,7 +745,8 @@ class Experiment:
         grasped = prescribed_dofs(self.grasps)
         if grasped.size and grasped[-1] >= 3 * n:
             raise InputError(
-                f"a grasp holds node {grasped[-1] // 3}, but the body has only {n} nodes"
+                f"a grasp holds node {grasped[-1] // 3}; expected node indices from 0 to {n - 1}: the "
+                f"body has {n} nodes"
             )
         for what, loads in (
             ("point mass is attached to", self.masses),
@@ -750,7 +755,8 @@ class Experiment:
             beyond = [load.nodes[-1] for load in loads if load.nodes[-1] >= n]
             if beyond:
                 raise InputError(
-                    f"a {what} node {beyond[0]}, but the body has only {n} nodes"
+                    f"a {what} node {beyond[0]}; expected node indices from 0 to {n - 1}: the body has {n} "
+                    "nodes"
                 )
         placed = self.markers.placement.node_count
         own = len(self.body.nodes.points_m)

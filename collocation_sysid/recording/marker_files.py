@@ -182,12 +182,16 @@ def _label_chooser(
                 if label not in excluded or label in renamed
             ]
             if not labels:
-                raise InputError("holds no markers")
+                raise InputError(
+                    "the file contains no markers; expected at least one"
+                )
             if not chosen:
                 remedy = (
                     f"label them, or rename with labels: {', '.join(labels)}"
                 )
-                raise InputError(f"holds unlabelled markers only; {remedy}")
+                raise InputError(
+                    f"all markers of the file are unlabelled; {remedy}"
+                )
             return chosen
         if not names:
             raise InputError(
@@ -291,7 +295,7 @@ def _require_rate(t_s: Array, key: str, rate_hz: float) -> None:
     ):
         raise InputError(
             f"{key} is {rate_hz:g} Hz, but the times are {1 / mean_hz:.6g} s apart, "
-            f"{mean_hz:.6g} Hz; expected the same"
+            f"{mean_hz:.6g} Hz; expected the same rate: correct {key} or the times"
         )
 
 

@@ -116,7 +116,7 @@ class Markers:
             name for name, count in Counter(self.names).items() if count > 1
         ]:
             raise InputError(
-                f"the marker name '{repeated[0]}' is given more than once"
+                f"the marker name '{repeated[0]}' is given more than once; expected different names"
             )
         each = (
             np.broadcast_to(self.sigma_m, m)
@@ -158,7 +158,8 @@ class Markers:
             )
         if placement is not None and len(placement.nodes) != m:
             raise InputError(
-                f"{len(placement.nodes)} positions on the body for {m} markers"
+                f"placement has {len(placement.nodes)} positions on the body for {m} markers; expected "
+                "one for each marker"
             )
         if placement is None:
             places_m = np.full((m, 3), np.nan) if places_m is None else places_m

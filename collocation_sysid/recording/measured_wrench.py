@@ -59,8 +59,8 @@ class Wrench:
         Axes of the components. "world": those of the world frame of the poses. "grasp": those of
         the undeformed body, which move with the grasp.
     point_m : (3,) array
-        Point [x, y, z] about which the torque is measured. In the frame "world" it is fixed; in the
-        frame "grasp" it is stated on the undeformed body and moves with the grasp.
+        Point [x, y, z] about which the torque is measured; it is fixed in the frame "world", and in
+        the frame "grasp" it is stated on the undeformed body and moves with the grasp.
     symmetry : int
         Number of equal parts of the specimen that share the load, 4 where a quarter is modelled.
         Values and sigmas are those of the modelled part; results are reported for the specimen.
@@ -89,7 +89,9 @@ class Wrench:
     def __post_init__(self) -> None:
         """Check the measurements and store them as read-only floats (S, 6), in place."""
         if not len(self.t_s):
-            raise InputError("a wrench without samples; expected at least one")
+            raise InputError(
+                "the measured wrench has no samples; expected at least one"
+            )
         shape = len(self.t_s), 6
         values = read_only_floats(
             self.values, shape, name="values of the wrench", finite=False
@@ -99,13 +101,17 @@ class Wrench:
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
         if np.isinf(self.values).any():
             raise InputError(
-                "a wrench holds an infinite value; expected numbers, or NaN if missing"
+                "the measured wrench contains an infinite value; expected numbers, or NaN if missing"
             )
         if not self.measured_components.any():
-            raise InputError("a wrench has no sample of any component")
+            raise InputError(
+                "all values of the measured wrench are missing; expected at least one component with "
+                "a number"
+            )
         if self.sigma_nm is None and self.measured_components[3:].any():
             raise InputError(
-                "a wrench with torques needs sigma_nm, the standard deviation of their noise [N m]"
+                "the measured wrench contains torques, but sigma_nm is missing; expected the standard "
+                "deviation of the noise of the torques [N m]"
             )
 
     def __repr__(self) -> str:

@@ -107,7 +107,7 @@ def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
         )
         if nodes.size == 0:
             raise InputError(
-                f"{what} needs at least one node; its selection found none"
+                f"{what} has an empty list of nodes; expected at least one node index"
             )
         nodes.setflags(write=False)
         return nodes

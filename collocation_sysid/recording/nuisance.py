@@ -51,7 +51,9 @@ ModelPart = Literal[
 ]
 # Scope of parameters that recordings share, as a pattern and in words for messages.
 SCOPE = r"shared( \S+)?"
-SCOPE_TEXT = '"shared", or "shared" and a word for each of several groups'
+SCOPE_TEXT = (
+    '"shared", or "shared" followed by the name of a group of recordings'
+)
 # Readable units: factor and text by SI unit.
 READABLE_UNITS = {
     "m": (1e3, " mm"),
@@ -251,7 +253,7 @@ def _camera_sharing_key(experiment: Any) -> dict[str, Any]:
     (the same object), and the pose of each camera in order.
     """
     places = [tuple(d.camera.pose.ravel()) for d in experiment.depths]
-    return {"body": id(experiment.body), "pose of its cameras": places}
+    return {"body": id(experiment.body), "pose of its depth cameras": places}
 
 
 def _is_motion(experiment: Any) -> bool:
@@ -286,7 +288,7 @@ def _hand_eye_sharing_key(experiment: Any) -> dict[str, Any]:
     nodes = {
         int(node) for grasp in experiment.body_grasps for node in grasp.nodes
     }
-    return {"body": id(experiment.body), "nodes in its grasps": nodes}
+    return {"body": id(experiment.body), "set of nodes in its grasps": nodes}
 
 
 PLACE = NuisanceRow(
@@ -302,7 +304,10 @@ PLACE = NuisanceRow(
     label="place of {which}, {axis}",
     description="errors of the positions in reference_m without a reference_sigma_m; they rotate "
     "with the body",
-    same=lambda e: {"body": id(e.body), "kind of places": e.markers.on_surface},
+    same=lambda e: {
+        "body": id(e.body),
+        "value of places (on_surface in Python)": e.markers.on_surface,
+    },
 )
 OFFSET = NuisanceRow(
     "camera_offset_m",
@@ -937,7 +942,8 @@ class Nuisance:
         for name, word in self.scope.items():
             if name not in names:
                 raise InputError(
-                    f"found the scope of {name!r}; expected one of {listed(names)}"
+                    f"scope contains {name!r}, which is not a nuisance parameter; expected one of "
+                    f"{listed(names)}"
                 )
             if not re.fullmatch(SCOPE, word):
                 raise InputError(
@@ -985,5 +991,5 @@ def _check_custom_kind(row: NuisanceRow) -> None:
         raise InputError(
             f"the nuisance parameter {row.name!r} has "
             f"{'a reading and a clock' if row.reading else 'neither a reading nor a clock'}; "
-            "expected exactly one of them"
+            "expected exactly one of these two functions"
         )

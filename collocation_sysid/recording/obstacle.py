@@ -44,7 +44,7 @@ def _require_selection(faces: Any) -> Selection:
     """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
     if not isinstance(faces, Selection):
         raise InputError(
-            f"faces of an obstacle is {faces!r}; expected a selection"
+            f"faces of an obstacle is {faces!r}; expected a selection, such as cs.Named(…)"
         )
     return faces
 
@@ -152,7 +152,7 @@ class Obstacle(Grasp):
         self._check_times_and_axes()
         if self.axes != "xyz":
             raise InputError(
-                f"axes of {self.name} is {self.axes!r}; expected none: it is rigid"
+                f"axes of {self.name} is {self.axes!r}; expected no axes, because an obstacle is rigid"
             )
         least, largest = FRICTION.bounds
         if isinstance(self.friction, float) and self.friction > largest:

@@ -14,7 +14,7 @@ from ..common.declarations import declaration, key
 from ..common.schema_tables import Vector
 from ..common.validated_types import NotNegative, Positive
 from ..errors import InputError
-from .checked_arrays import float_converter
+from .checked_arrays import float_converter, point_text
 
 # Added to squared distances [m²]: the square root has no derivative at zero.
 SMALLEST_SQUARE_M2 = 1e-24
@@ -173,7 +173,7 @@ def _checked_ends(value: Any) -> Array:
     ends = float_converter((2, 3), "ends_m")(value)
     if (ends[0] == ends[1]).all():
         raise InputError(
-            "the ends of an axis are at the same place; expected two places"
+            f"both ends of the axis are at {point_text(ends[0])} m; expected two different points"
         )
     return ends
 

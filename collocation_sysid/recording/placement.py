@@ -61,7 +61,8 @@ class Placement:
         )
         if nodes.size and nodes.max() >= self.node_count:
             raise InputError(
-                f"the placement refers to node {nodes.max()}, but the body has {self.node_count}"
+                f"the placement refers to node {nodes.max()}; expected node indices from 0 to "
+                f"{self.node_count - 1}"
             )
         weights = read_only_floats(
             self.weights, nodes.shape, name="weights of the placement"
@@ -121,7 +122,8 @@ def place_markers(
     )
     if len(labels) != len(points):
         raise InputError(
-            f"{len(labels)} marker names for {len(points)} marker positions"
+            f"found {len(labels)} marker names for {len(points)} marker positions; expected one "
+            "name for each position"
         )
     if attach not in get_args(AttachmentRule):
         raise InputError(

@@ -262,7 +262,7 @@ def _read_archive(path: str | Path) -> tuple[Array, Array]:
         raise
     except (*DAMAGE, OSError) as error:
         raise InputError(
-            f"is not a NumPy archive of numbers: {error}"
+            f"this is not a NumPy archive of numbers: {error}"
         ) from error
     shapes = {key: array.shape for key, array in arrays.items()}
     shape = shapes.get("t_s", ())
@@ -272,8 +272,9 @@ def _read_archive(path: str | Path) -> tuple[Array, Array]:
         or not shape[0]
     ):
         raise InputError(
-            f"holds {', '.join(f'{key} {size}' for key, size in shapes.items()) or 'nothing'}; "
-            "expected t_s (T,) and matrices (T, 4, 4)"
+            "the archive contains "
+            f"{', '.join(f'{key} {size}' for key, size in shapes.items()) or 'nothing'}; expected "
+            "t_s (T,) and matrices (T, 4, 4)"
         )
     try:
         return arrays["t_s"].astype(np.float64), arrays["matrices"].astype(

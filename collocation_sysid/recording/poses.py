@@ -453,8 +453,8 @@ def require_determined_motion(
     lasts = f"the recording lasts from {first_s:.6g} s to {last_s:.6g} s"
     if len(poses.t_s) == 1:
         raise InputError(
-            f"holds one pose, and {lasts}; expected poses over all of it, or the same pose at "
-            "both times if the grasp stands still",
+            f"found only one pose, but {lasts}; expected poses over all of it. If the grasp stands "
+            "still, state the same pose at the start and at the end",
             file,
         )
     step_s = _typical_step_s(poses, first_s, last_s=last_s)
@@ -473,7 +473,7 @@ def require_determined_motion(
     if shared > 2 and (start_s > first_s + slack_s or end_s < last_s - slack_s):
         window = f"[{max(start_s, t_s[0]):.6g}, {min(end_s, t_s[-1]):.6g}]"
         raise InputError(
-            f"the poses run from {start_s:.6g} s to {end_s:.6g} s, and {lasts}; expected poses "
+            f"the poses run from {start_s:.6g} s to {end_s:.6g} s, but {lasts}; expected poses "
             f"over all of it, in seconds of the same clock: add rows, or set window_s = {window}",
             file,
         )

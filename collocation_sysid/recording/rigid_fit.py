@@ -66,7 +66,8 @@ class RigidFit:
         there = np.flatnonzero(~self.missing)
         if not there.size:
             raise InputError(
-                "no frame contains three markers of the grasp that are not on one line"
+                "no frame contains three markers of the grasp that are not on one line; expected at "
+                "least one such frame: check the names of these markers and their missing samples"
             )
         known = PoseSequence(
             times[there],
@@ -210,8 +211,9 @@ def align_to_template(
     )
     if not inside.any():
         raise InputError(
-            f"the window [{window_s[0]:g}, {window_s[1]:g}] s of the template holds no sample; the "
-            f"markers run from {table.t_s[0]:.9g} s to {table.t_s[-1]:.9g} s"
+            f"the window [{window_s[0]:g}, {window_s[1]:g}] s of the template contains no sample; "
+            f"expected a window within the times of the markers, from {table.t_s[0]:.9g} s to "
+            f"{table.t_s[-1]:.9g} s"
         )
     places = np.array([template[name] for name in template], dtype=np.float64)
     chosen = [table.names.index(name) for name in template]

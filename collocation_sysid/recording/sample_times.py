@@ -47,7 +47,9 @@ def sample_interval_s(
     times = np.asarray(t_s, dtype=np.float64)
     if times.ndim != 1 or len(times) < 2:
         raise InputError(
-            f"{what}: a sample interval needs at least two samples", source
+            f"{what}: found {times.size} samples; expected at least two, because the interval "
+            "between samples is needed",
+            source,
         )
     if fault := first_unordered_time(times):
         raise InputError(

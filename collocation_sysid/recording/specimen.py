@@ -158,7 +158,8 @@ class Specimen:
             values = getattr(self, name)
             if values is not None and len(values) != len(self.strain):
                 raise InputError(
-                    f"found {len(values)} values for {len(self.strain)} strains; expected as many",
+                    f"found {len(values)} values for {len(self.strain)} strains; expected one value "
+                    "for each strain",
                     None,
                     where=name,
                 )
@@ -192,7 +193,7 @@ class Specimen:
             and not self.find_deformation().second_stress
         ):
             raise InputError(
-                f"{of} does not have a second stress",
+                f"{of} does not have a second stress; leave it out",
                 None,
                 where="second_stress_pa",
             )
@@ -201,7 +202,8 @@ class Specimen:
             and not self.find_deformation().lateral
         ):
             raise InputError(
-                f"{of} has no free direction, and no lateral stretch",
+                f"{of} has no direction in which the specimen is free to contract; leave the lateral "
+                "stretch out",
                 None,
                 where="lateral_stretch",
             )

@@ -373,8 +373,8 @@ def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
     if quantity == DISPLACEMENT:
         if layout.length_m is None:
             raise table.grid.error_at(
-                "a displacement needs length_m, the undeformed length of the specimen, or the gap "
-                "of a shear test"
+                "found a column of displacements, but not length_m; expected length_m, the undeformed "
+                "length of the specimen, or the gap of a shear test"
             )
         values = values / layout.length_m
     strain = layout.strain_sign * values
@@ -392,11 +392,14 @@ def _require_positive(
     if (ratio > 0).all():
         return
     row = int(np.argmax(ratio <= 0))
+    name = quantity.key.replace("_", " ")
     likely = {
-        STRETCH.key: "a stretch is 1 without load; if the column has strains, call it strain",
-        STRAIN.key: 'if these are percent, call the column "strain (%)"',
-        DISPLACEMENT.key: "check length_m, strain_sign and the unit of the displacement",
-    }.get(quantity.key, "a volume ratio is 1 without load")
+        DISPLACEMENT: "check length_m, strain_sign and the unit of the displacement",
+        VOLUME_RATIO: "a volume ratio is 1 without load",
+        STRETCH: "a stretch is 1 without load; if the column has strains, call it strain",
+        SECOND_STRETCH: "a stretch is 1 without load; if the column has strains, call it second "
+        "strain",
+    }.get(quantity, f'if these are percent, call the column "{name} (%)"')
     raise table.grid.error_at(
         f"the {quantity.key} makes the specimen {ratio[row]:.4g} times as large as without load; "
         f"expected a positive ratio: {likely}",
@@ -424,12 +427,11 @@ def _second_strain(
         layout=layout,
     )
     values = _complete(table, quantity)
-    strain = (
-        values - 1
-        if quantity == SECOND_STRETCH
-        else layout.strain_sign * values
-    )
-    _require_positive(table, STRETCH, ratio=1 + strain)
+    if quantity == SECOND_STRETCH:
+        _require_positive(table, quantity, ratio=values)
+        return values - 1
+    strain = layout.strain_sign * values
+    _require_positive(table, quantity, ratio=1 + strain)
     return strain
 
 
@@ -465,11 +467,13 @@ def _stress_pa(table: QuantityTable, layout: SpecimenLayout) -> Array:
     if quantity == FORCE:
         if layout.stress == "true":
             raise table.grid.error_at(
-                'a force has no area; expected no stress = "true"'
+                'found a column of forces and stress = "true"; expected a column of true stresses, or '
+                'no stress = "true": the deformed area on which the force acts is not known'
             )
         if layout.area_m2 is None:
             raise table.grid.error_at(
-                "a force needs area_m2, the undeformed area it acts on"
+                "found a column of forces, but not area_m2; expected area_m2, the undeformed area on "
+                "which the force acts"
             )
         values = values / layout.area_m2
     return layout.stress_sign * values

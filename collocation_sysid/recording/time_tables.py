@@ -107,9 +107,9 @@ def _read_limited(
     ]:
         is_so = f"{quantity.column} is {values[row]:g}"
         if abs(values[row]) > largest:
-            why = ", which is too large for a soft body; check the unit of the column"
+            why = f", too large for a soft body; expected at most {largest:g}: check the unit of the column"
         else:
-            why = "; expected 0 or more, since a tendon only pulls: take the sensor's offset off"
+            why = "; expected 0 or more, because a tendon only pulls: subtract the offset of the sensor"
         raise table.grid.error_at(is_so + why, int(row))
     return table.t_s, values
 

@@ -33,10 +33,10 @@ from .figure_style import (
     add_legend_above,
     style_axes,
 )
+from .pictures.camera_pictures import LEGEND_ENTRY
 from .pictures.over_time import rms_over_markers
 from .pictures.projection import ParallelCamera
 from .pictures.scene import (
-    CAMERA_ENTRY,
     BodyDrawing,
     SheetView,
     aspect_ratio,
@@ -221,7 +221,8 @@ def experiment_named(
     }
     if not available:
         raise InputError(
-            "no experiment of this run has a stored motion of a body; expected one with a mesh",
+            "no experiment of this run has a stored motion of a body with a mesh; expected a run "
+            "with such an experiment",
             run,
         )
     if experiment is None:
@@ -514,13 +515,19 @@ class FilmFigure:
         draw_directions(axes, camera, origin_mm=(7.0, 4.0))
         draw_scale(axes, mm_per_m, corner_mm=(FILM_WIDTH_MM * 0.17, 4.0))
         named = ["grasped", "measured", "behind the body"]
+        camera_points = ""
         if self.replay.visible_points:
             markers = named[1:] if len(self.replay.marker_names) else []
-            named = ["grasped", *markers, CAMERA_ENTRY]
+            named = ["grasped", *markers]
+            camera_points = LEGEND_ENTRY
+        handles = legend_handles(*named, camera_points=camera_points)
         draw_legend(
             axes,
-            legend_handles(*named),
-            corner_mm=(FILM_WIDTH_MM * (0.42 if len(named) < 4 else 0.35), 5.5),
+            handles,
+            corner_mm=(
+                FILM_WIDTH_MM * (0.42 if len(handles) < 4 else 0.35),
+                5.5,
+            ),
         )
 
     def show_sample(self, sample: int) -> None:

@@ -1,7 +1,10 @@
 """Points of depth cameras and outlines of the body's surface, as pictures and films need them.
 
 `visible_points` and `surface_rows` are for a fitted or simulated surface, `undeformed_rows` for the
-undeformed body before anything is fitted. All give the rows of `MotionRecord.visible_points`.
+undeformed body before anything is fitted. All give the rows of `MotionRecord.visible_points`: time
+[s], image coordinates u and v (pixels, or mm for a point cloud), depth [m], distance behind the
+surface [m] (NaN for points that do not count), and position in the world [m]. For some samples,
+rows of outlines follow: time, u, v, and NaN else; a row without u and v ends each face.
 """
 
 from __future__ import annotations
@@ -22,9 +25,11 @@ from ..recording.experiment import Experiment
 from ..runs.forward_simulation import ForwardSimulation
 from ..runs.solved_problem import SolvedProblem
 from .pictures.album import save_pictures, with_unique_names
-from .pictures.depth_comparison_picture import depth_picture
+from .pictures.camera_pictures import KIND, depth_picture
 from .pictures.projection import ParallelCamera
 
+# Description of the pictures of `save_overlays`, for the terminal.
+OVERLAY_TEXT = "depth over the undeformed body"
 # Number of samples whose outlines are drawn.
 MAX_OUTLINED_SAMPLES = 4
 # Distance of the viewer from a point cloud, over the size of the body: nearly parallel rays.
@@ -325,7 +330,7 @@ def save_overlays(
     return save_pictures(
         folder,
         with_unique_names(
-            (f"depth_{experiment.name}_{name}", depth_picture(rows))
+            (f"{KIND}_{experiment.name}_{name}", depth_picture(rows))
             for experiment in experiments
             for name, rows in undeformed_rows(experiment).items()
         ),

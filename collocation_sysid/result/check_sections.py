@@ -78,7 +78,8 @@ def _check_verdict(findings: CheckResult) -> Line:
     """Return the conclusion of a check: valid, wrong derivatives, or a suspect description."""
     if not findings.derivatives_agree:
         return Line(
-            "The derivatives do not agree with finite differences at the guess.",
+            "The derivatives do not agree with finite differences at the guess: check your own "
+            "materials, forces and sensors with the functions of collocation_sysid.testing.",
             "doubtful",
         )
     if findings.causes:
@@ -160,7 +161,10 @@ def _rest_shape(body: BodyCheck) -> str:
     if body.rest_shape is None:
         return "not stated; set object.rest_shape"
     if np.isnan(body.rest_shape_change_m):
-        return "the mesh was made under gravity; no stress-free shape was found at the guess"
+        return (
+            "the mesh was made under gravity; no stress-free shape was found at the guess: give "
+            "stiffer guesses"
+        )
     change = f"{1e3 * body.rest_shape_change_m:.3g} mm"
     return f"the mesh was made under gravity; the stress-free shape differs from it by up to {change}"
 

@@ -150,10 +150,9 @@ class MotionRecord:
         For each spatially varying constant: the estimate, the ends of its 95 % interval, and its
         posterior over its prior standard deviation; NaN in elements of other regions.
     visible_points : mapping of name to (k, 8)
-        For each depth camera, rows of points: time [s], image coordinates u and v (pixels, or mm
-        for a point cloud), depth [m], distance behind the surface [m] (NaN for points that do not
-        count), and position in the world [m]. For some samples, rows of outlines follow: time, u,
-        v, and NaN else; a row without u and v ends each face.
+        For each camera, rows of its points, with the time [s] in column 0, the distance behind the
+        surface [m] (NaN for points that do not count) in column 4 and the position in the world [m]
+        from column 5, and rows of outlines; `camera_overlays` describes them completely.
     reading_units : mapping of name to str
         Units of the custom sensors that state one.
     strain : (T,), or None
@@ -276,7 +275,7 @@ class MotionRecord:
         )
 
     def camera_points_m(self, sample: int) -> Array:
-        """Return the points (P, 3) [m] of all depth cameras at the time of the sample with index
+        """Return the points (P, 3) [m] of all cameras at the time of the sample with index
         `sample`.
 
         Of each camera, the image nearest in time counts if it is at most half of the largest

@@ -78,10 +78,14 @@ def refine_run(
     before = Result.read(folder)
     file = run / RESULT_FILE
     levels_file = run / REFINEMENT_FILE
-    home = before.problem_folder(file, "use collocation_sysid.refine")
+    home = before.problem_folder(
+        file, "which refine needs: in Python, use collocation_sysid.refine"
+    )
     if not before.converged:
         raise InputError(
-            "the run did not converge: there is no result to refine", file
+            "the run did not converge, so that there is no result to refine; solve the problem "
+            "again first",
+            file,
         )
     problem = Problem.read(
         run / "problem.toml", allow_code=allow_code, folder=home

@@ -590,7 +590,7 @@ def _simulation_lines(
             f"{_errors_text(copied.error, units)}"
         )
     elif simulated.not_copied:
-        yield f"  no copied measurements for comparison: {simulated.not_copied}"
+        yield f"  no comparison with measurements of another recording: {simulated.not_copied}"
 
 
 def _errors_text(

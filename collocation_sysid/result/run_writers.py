@@ -393,26 +393,26 @@ def require_replaceable(
         return
     if not target.is_dir():
         raise InputError(
-            "is a file, expected a folder for the run; choose another", target
+            "this is a file; expected a folder for the run: choose another path",
+            target,
         )
     if os.path.ismount(target):
         raise InputError(
-            "is a mount point and cannot be replaced; choose a folder in it",
+            "this is a mount point and cannot be replaced; choose a folder in it",
             target,
         )
     if not any(target.iterdir()):
         return
     if not (target / marker_file).is_file():
         raise InputError(
-            f"the folder has files but no {marker_file}, "
-            f"so it is not an earlier {content_word} and is left "
-            "alone; choose another folder",
+            f"the folder has files but no {marker_file}, so that it is not an earlier "
+            f"{content_word} and is not replaced; choose another folder",
             target,
         )
     if not overwrite:
         raise InputError(
-            f"the folder holds an earlier {content_word}, and overwrite is false; choose another "
-            "folder, or pass overwrite=True",
+            f"the folder contains an earlier {content_word}, and overwrite is false; choose "
+            "another folder, or pass overwrite=True",
             target,
         )
     require_only_written(target)
@@ -422,8 +422,8 @@ def require_no_link(folder: Path) -> None:
     """Raise an `InputError`, naming the link, if `folder` is a link; a missing folder passes."""
     if folder.is_symlink():
         raise InputError(
-            f"is a link to {os.readlink(folder)}, and nothing is written through links; use the "
-            "folder itself or another one, or remove the link",
+            f"this is a link to {os.readlink(folder)}, and nothing is written through links; use "
+            "the folder itself or another one, or remove the link",
             folder,
         )
 
@@ -442,13 +442,17 @@ def require_only_written(folder: Path) -> None:
         return
     name = file.relative_to(folder).as_posix()
     if file.is_symlink():
-        why = f"{name} in it is a link"
+        why = f"{name} in this folder is a link"
     elif (folder / LIST_FILE).is_file():
-        why = f"{name} in it was not written by this program, or was changed since"
+        why = f"{name} in this folder was not written by this program, or was changed since"
     else:
-        why = f"it has no {LIST_FILE}, which lists what this program wrote, but it contains {name}"
+        why = (
+            f"this folder has no {LIST_FILE}, which lists what this program wrote, but it contains "
+            f"{name}"
+        )
     raise InputError(
-        f"{why}, so the folder is left alone; choose another, or move that away",
+        f"{why}, so that the folder is not replaced; choose another folder, or move {name} to "
+        "another place",
         folder,
     )
 

@@ -386,7 +386,8 @@ def _require_guesses(problem: Problem) -> None:
     if names := problem.parameters.list_names_without_guess():
         key = f"parameters.{names[0]}"
         raise InputError(
-            f"has no guess, and a simulation needs a value; expected --set {key}.guess=VALUE",
+            "this parameter has no guess, and a simulation needs a value; expected --set "
+            f"{key}.guess=VALUE",
             problem.path,
             where=key,
         )
@@ -527,8 +528,8 @@ def _require_separate_files(
         for name in files.values():
             if name in owners:
                 raise InputError(
-                    f"is read by '{owners[name]}' too, but a simulation writes a file for each; "
-                    f"expected another file than {name}",
+                    f"the file {name} is read by '{owners[name]}' too, but a simulation writes a file for "
+                    "each experiment; expected different files",
                     problem.path,
                     where=f"experiment '{experiment.name}': file",
                 )

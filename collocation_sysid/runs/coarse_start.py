@@ -187,7 +187,7 @@ def plan_coarse_start(
         return None
     if problem.find_two_phase_fields():
         raise NoCoarseStartError(
-            "the phases of a two-phase field belong to the elements"
+            "the phases of a two-phase field belong to the elements of the given mesh"
         )
     try:
         coarse = {

@@ -167,7 +167,7 @@ def nearest_recording_error(
         explanation = "; ".join(
             f"{name}: {reason}" for name, reason in reasons.items()
         )
-        return f"no fitted recording can be copied ({explanation})"
+        return f"no fitted recording has the same samples ({explanation})"
     return min(
         copies,
         key=lambda each: main_error(each.error),

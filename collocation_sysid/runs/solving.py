@@ -361,7 +361,9 @@ def _solve_once(
             )
         except NoCoarseStartError as reason:
             solution = None
-            notes.append(f"no coarse start: {reason}")
+            notes.append(
+                f"the search was not started on a coarser mesh: {reason}"
+            )
         if solution is not None:
             return solution
         try:
@@ -369,7 +371,9 @@ def _solve_once(
                 problem, solver, watch=watch, workers=workers
             )
         except NoThinnedStartError as reason:
-            notes.append(f"no start with fewer points: {reason}")
+            notes.append(
+                f"the search was not started with fewer points: {reason}"
+            )
         if solution is not None:
             return replace(solution, notes=(*notes, *solution.notes))
     warm_start = (

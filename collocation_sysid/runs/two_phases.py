@@ -323,7 +323,7 @@ def _two_phase_search(problem: Problem) -> _PhaseSearch:
     if len(modes.phase) > MOST_ELEMENTS:
         raise InputError(
             f"the two-phase field of {name} has {len(modes.phase)} elements; expected at most "
-            f"{MOST_ELEMENTS}: take a coarser mesh, or a region around the inclusion"
+            f"{MOST_ELEMENTS}: use a coarser mesh, or a region around the inclusion"
         )
     parts = next(
         body.parts

@@ -151,7 +151,7 @@ class WarmStart:
         known = {i: self.values[i.name] for i in free if i.name in self.values}
         if not known:
             raise InputError(
-                f"found {', '.join(self.values)}; expected at least one of the parameters that are "
+                f"found the parameters {', '.join(self.values)}; expected at least one of those that are "
                 f"estimated, {', '.join(i.name for i in problem.parameters.free_scalars)}",
                 self.folder / RESULT_FILE,
             )

@@ -91,8 +91,8 @@ TOPICS: dict[str, Topic] = {
             "robot use different world frames; set markers.template_m and template_window_s",
             "frames": "{fault}",
             "clock": "the markers' clock is {when} by about {by_ms:.3g} ms relative to that of the "
-            "poses: {do} this to t_s of the poses, or estimate it with nuisance.time_shift",
-            "grasp-layer": "the fit is better if the grasp holds one layer of nodes {deep}: "
+            "poses: {do} t_s of the poses, or estimate it with nuisance.time_shift",
+            "grasp-layer": "the fit is better if the grasp holds one layer of nodes {deep} than stated: "
             "compare the box of grasp.nodes with the ends of the fingers",
             "grasp": "the box of the grasp of '{experiment}' selects {nodes} nodes, but "
             "{nearly_grasped} more if it is enlarged by a tenth of an element's edge, or "
@@ -127,8 +127,8 @@ TOPICS: dict[str, Topic] = {
             "{within_ms:.3g} ms, in which the grasp moves by {grasp_mm:.2g} mm: the body was not at "
             'rest at the beginning, as start = "equilibrium" assumes, or the clocks of markers and '
             "poses differ; begin window_s, or the recording, when the body is at rest",
-            "unlike": "the tracks do not move like a grasped body: for every stiffness they are "
-            "{by_mm:.3g} mm (RMS) away from markers that move with the grasp, on a body of "
+            "unlike": "the tracks do not move like a grasped body: for every stiffness, the markers "
+            "of a simulated body are {by_mm:.3g} mm (RMS) away from them, on a body of "
             "{size_mm:.3g} mm, and no single common mistake explains this; check frames, "
             "poses and labels, and if the tracks were simulated, that the simulation was "
             "stable",
@@ -148,30 +148,6 @@ TOPICS: dict[str, Topic] = {
             '"strain (%)"',
             "specimen-unit": "its stresses fit if multiplied by {factor:g}: the unit of the column "
             "is probably {unit}",
-            "camera": "only {percent:.0f} % of the body's visible surface have measured points "
-            "within {within_mm:.3g} mm: check camera.pose (camera frame: x to the right, y down, "
-            "z forward) and the unit of the depth; check draws a picture of both",
-            "camera/likely": "hardly any points are near the body; they would be if {mistakes}",
-            "camera-image": "the points fit with rows and columns of the image read {order}: the "
-            "image was flipped or rotated after the camera took it; undo that, or describe the "
-            "camera as it took the image",
-            "camera-matrix/focal": "the points fit with focal lengths {factor:g} times as large: "
-            "check fx and fy of camera.matrix, which are in pixels of these images",
-            "camera-matrix/size": "the points fit with camera.matrix multiplied by {factor:g}, "
-            "except for its last row: it is that of images of another size; state the matrix of "
-            "these images",
-            "camera-matrix/centre": "the points fit with the principal point {centre}, {how}: "
-            "state cx and cy of camera.matrix from the upper left corner, cx along the columns",
-            "camera-rays": "the points fit if the depths are distances along the rays: convert "
-            "them to depths along the optical axis, dividing by the length of K⁻¹ (u, v, 1)",
-            "camera-pose": "the points fit only if the camera is turned by {degrees:.2g}° and "
-            "shifted by {by_mm:.2g} mm, {deviations:.2g} standard deviations of its prior: "
-            "measure camera.pose again, or state nuisance.depth_pose",
-            "camera-clock": "its images fit {by_ms:.3g} ms away from their times: its clock is "
-            "{when} relative to that of the poses; {do} this",
-            "camera-order": "its images fit in reverse order: sort their files by time",
-            "camera-constant": "all its images show the same moment, although the body moves by "
-            "{by_mm:.3g} mm: check that the images are those of this recording",
         },
     ),
     "noise": Topic(
@@ -181,14 +157,18 @@ TOPICS: dict[str, Topic] = {
         "if it is known. If a single marker deviates, look for exchanged labels and "
         "reflections in its track.",
         messages={
-            "larger": "the residuals are {factor:.2g} times as large as expected from {stated}",
-            "smaller": "{stated} seems {factor:.2g} times too large for these residuals",
-            "marker": "the residuals of {marker} are {factor:.2g} times sigma_m",
+            "larger": "the residuals are {factor:.2g} times as large as expected from {stated}: "
+            "check {stated}, and what the model or the description of the experiment lacks",
+            "smaller": "{stated} seems {factor:.2g} times too large for these residuals: state "
+            "the noise of the sensor",
+            "marker": "the residuals of {marker} are {factor:.2g} times sigma_m: check its label, "
+            "its reference_m and reflections in its track",
             "markers": "the residuals of {count} markers are larger than sigma_m, most of all "
-            "those of {marker} ({factor:.2g} times)",
+            "those of {marker} ({factor:.2g} times): check their labels, reference_m and sigma_m",
             "allowance": "sigma_m = {sigma_mm:.3g} mm is {share:.2g} of the body's size, more "
             "than the error of cameras: if it is an allowance for model errors, the error bars "
-            "are too short, because they assume independent errors",
+            "are too short, because they assume independent errors; state the noise of the "
+            "cameras",
         },
     ),
     "residuals": Topic(
@@ -199,22 +179,21 @@ TOPICS: dict[str, Topic] = {
         "wrong stiffness or damping. The command compare-models --materials tests whether another "
         "material law predicts better.",
         messages={
-            "outline": "{percent:.0f} % of the model's outline are more than {pixels:.0f} pixels "
-            "away from the edge of the body in the images of {camera}: the body may be grasped "
-            "at another place, be partly hidden, or have another stiffness; if depths are "
-            'missing on the body itself, state background = "unknown"',
             "outlier": f"{SAMPLE}remove it, or set solver.huber",
             "first": f"{SAMPLE}the body is assumed to be relaxed at the first sample; start the "
             "recording before the load, or remove the sample",
             "persist": "the residuals are not independent noise: consecutive samples are "
-            "correlated (autocorrelation {autocorrelation:.2f})",
+            "correlated (autocorrelation {autocorrelation:.2f}). The model or the description of "
+            "the experiment lacks an effect: look at the residuals over time",
             "shared": "the residuals are not independent noise: they are correlated between "
-            "markers or axes",
-            "recordings": "the recordings disagree on {names}: model errors exceed the noise",
+            "markers or axes. The model or the description of the experiment lacks an effect: "
+            "look at the residuals over time",
+            "recordings": "the recordings disagree on {names}: model errors exceed the noise; "
+            "find out what differs between the recordings, such as temperature or clamping",
             "wild": "{percent:.0f} % of the samples are outliers, beyond the threshold of the "
-            "Huber loss",
+            "Huber loss: look for exchanged labels and wrong samples in the residuals over time",
             "far": "{percent:.0f} % of the marker samples are outliers, implausibly far from the "
-            "body or from the prediction",
+            "body or from the prediction: check labels, the frame, and reflections",
         },
     ),
     "assumption": Topic(
@@ -228,7 +207,7 @@ TOPICS: dict[str, Topic] = {
         "the other assumptions.",
         messages={
             "contradicted": "the data contradict the assumption that {assumption}: with {name} = "
-            "{size} ± {size_error} χ² decreases by {chi_squared:.3g}, and the estimates become "
+            "{size} ± {size_error}, χ² decreases by {chi_squared:.3g}, and the estimates become "
             "{estimates}{instead}",
         },
     ),
@@ -238,14 +217,15 @@ TOPICS: dict[str, Topic] = {
         remedy="Fix such a parameter at a known value, give it a prior or wider bounds, or record a "
         "motion that depends on it.",
         messages={
-            "bound": "{names} ended at its bound",
-            "bounds": "{names} ended at their bounds",
-            "none": "the data do not determine {names}",
+            "bound": "{names} ended at its bound: widen the bound, or fix the parameter",
+            "bounds": "{names} ended at their bounds: widen the bounds, or fix the parameters",
+            "none": "the data do not determine {names}: state known values or priors, or record a "
+            "motion on which these parameters have a larger influence",
             "combined": "{name} is not determined: its combined 95 % interval, {low:.3g} to "
             "{high:.3g}, is wider than its value; largest contribution "
             "{source} ({share:.0%}): {remedy}",
-            "at-bound": "{name} is at a bound",
-            "not-yet": "{name} is not known yet: {reason}",
+            "at-bound": "{name} is at a bound: widen the bound, or fix the parameter",
+            "not-yet": "{name} is not known yet, because {reason}: wait for more frames",
             "static": f"{{names}} {{verb}} static: {NO_DAMPING}; {FIX_DAMPING}",
             "still": f"nothing moves in {{names}}: {NO_DAMPING}, and only the deflection under "
             f"gravity determines the stiffness; {FIX_DAMPING}",
@@ -263,9 +243,9 @@ TOPICS: dict[str, Topic] = {
             "off": "marker '{marker}' of '{experiment}' lies {by_mm:.3g} mm outside the body, so "
             "that its motion is extrapolated: give its reference_m, or check the frame and "
             "unit",
-            "unseen": "marker '{marker}' of '{experiment}' is never visible: leave it out of names",
+            "unseen": "marker '{marker}' of '{experiment}' is never visible: leave it out of markers.names",
             "missing": "marker '{marker}' of '{experiment}' is missing in {missing} of {frames} "
-            "samples: shorten window_s to where it is visible, or leave it out of names",
+            "samples: shorten window_s to where it is visible, or leave it out of markers.names",
             "astray": "marker '{marker}' of '{experiment}' is first measured {by_mm:.3g} mm away "
             "from its position simulated at the guess: check length_unit, the frame of the "
             "poses, reference_m, and whether the guess is far too soft",
@@ -278,13 +258,14 @@ TOPICS: dict[str, Topic] = {
         "stated in the problem file? If it is possible, widen its prior in "
         "[experiment.nuisance].",
         messages={
-            "limit": "{name} ended at the largest value allowed",
-            "far": "{name} is {deviations:.1f} standard deviations of its prior away from zero",
-            "camera": "{name} is {deviations:.1f} standard deviations of its prior away from the "
-            "stated pose: another stiffness may fit equally well with another pose of the "
-            "camera; measure the pose, or state how well it is known (nuisance.depth_pose)",
+            "limit": "{name} ended at the largest value allowed: check whether this value is "
+            "possible, and if it is, widen its prior in [experiment.nuisance]",
+            "far": "{name} is {deviations:.1f} standard deviations of its prior away from zero: "
+            "check whether this value is possible, and if it is, widen its prior in "
+            "[experiment.nuisance]",
             "clock": "the markers of '{experiment}' were measured {shift_ms:.2g} ms {when} than "
-            "their times state: the estimates are corrected for this, but find the cause",
+            "their times state: the estimates are corrected for this, but find the cause of the "
+            "difference",
         },
     ),
     "specimen": Topic(
@@ -295,8 +276,11 @@ TOPICS: dict[str, Topic] = {
         "prior in the [[experiment]], for example strain_zero = 0.02. A law that does not fit the "
         "material has the same effect: compare-models --materials.",
         messages={
-            "limit": "{name} ended at the largest value allowed",
-            "far": "{name} is {deviations:.1f} standard deviations of its prior away from zero",
+            "limit": "{name} ended at the largest value allowed: check whether this value is "
+            "possible, and if it is, widen its prior in the [[experiment]]",
+            "far": "{name} is {deviations:.1f} standard deviations of its prior away from zero: "
+            "check whether this value is possible, and if it is, widen its prior in the "
+            "[[experiment]]",
         },
     ),
     "scheme": Topic(
@@ -308,16 +292,18 @@ TOPICS: dict[str, Topic] = {
             "step": "the estimated time-step error dominates the uncertainty of {name}: it was "
             "corrected by {percent:+.2g} %, {errors:.2g} standard uncertainties; raise "
             "transcription.substeps, or run refine to measure the error",
-            "damping": "the scheme adds a damping ratio of {added:.2g} to the {damping:.2g} of the "
-            "first mode of '{experiment}'",
-            "period": "the scheme changes the first period of '{experiment}' by {change:+.1%}",
+            "damping": "the time-stepping scheme adds a damping ratio of {added:.2g} to the "
+            "{damping:.2g} of the first mode of '{experiment}': raise transcription.substeps, or "
+            "use the midpoint scheme",
+            "period": "the time-stepping scheme changes the period of the first mode of "
+            "'{experiment}' by {change:+.1%}: raise transcription.substeps",
             "adds": "{scheme} at {step_ms:.3g} ms adds a damping ratio of {ratio:.2g} to "
             f"{MODE}, which makes the estimated damping too low: {{remedy}}",
             "takes": "{scheme} at {step_ms:.3g} ms removes a damping ratio of {ratio:.2g} "
             f"from {MODE}, which makes the estimated damping too high: {{remedy}}",
             "coarse": f"{MODE} has only {{steps:.1f}} time steps per period, which makes its "
             "period {error:.0%} too long: {remedy}",
-            "turn": TURN,
+            "turn": f"{TURN}: raise transcription.substeps",
             "turns": f"{TURN} at t = {{time_s:.4g}} s ({{rate_rad_s:.3g}} rad/s). Steps follow "
             "the chord of a rotation instead of its arc, which biases the estimates, especially "
             "damping: {remedy}",
@@ -330,10 +316,11 @@ TOPICS: dict[str, Topic] = {
         '"kelvin-voigt", which cannot, and make sure that moduli and densities are plausible.',
         messages={
             "grows": "the motion of '{experiment}' is unstable at t = {time_s:.3g} s: disturbances "
-            "grow at a rate of {growth_1_s:.2g} 1/s",
+            "grow at a rate of {growth_1_s:.2g} 1/s. If the body does not buckle there, use "
+            'damping = "kelvin-voigt", and check moduli and densities',
             "material": "the material {material}{where} is unstable at strains of '{experiment}' "
             "(Drucker): at {time_s:.3g} s and the principal stretches {stretches} a further strain "
-            "lowers its stress; take a law with fewer terms, or bound its constants",
+            "lowers its stress; use a law with fewer terms, or bound its constants",
             "rest": "the material {material} of {where} is unstable without any strain: its shear "
             "modulus is {mu_pa:.3g} Pa and its bulk modulus {kappa_pa:.3g} Pa; both must be "
             "positive. In Ogden's law the shear modulus is half the sum of mu_p alpha_p",
@@ -348,7 +335,8 @@ TOPICS: dict[str, Topic] = {
         'damping_law = "none" in [uncertainty.assumptions].',
         messages={
             "refined": "step and mesh dominate the uncertainty of {name}: it was corrected by "
-            "{percent:+.2g} %, {errors:.2g} standard uncertainties",
+            "{percent:+.2g} %, {errors:.2g} standard uncertainties; use smaller steps "
+            "(transcription.substeps) or a finer mesh",
             "flat": "element {number} is nearly flat (mean-ratio quality {quality:.2g}, aspect "
             "ratio {aspect_ratio:.0f}), which makes the body stiffer and Newton's steps short: "
             "improve the mesh there",
@@ -368,9 +356,11 @@ TOPICS: dict[str, Topic] = {
         messages={
             "failed": "the forward simulation of '{experiment}' failed: {why}",
             "misses": "the forward simulation of '{experiment}' deviates from the measurements by "
-            "{rms_mm:.2g} mm, the fit by {fit_mm:.2g} mm",
+            "{rms_mm:.2g} mm, but the fit only by {fit_mm:.2g} mm: the time step is too long; raise "
+            "transcription.substeps",
             "predicted": "the prediction error of '{experiment}' is {times:.2g} times the fit "
-            "error of the other recordings",
+            "error of the other recordings: the model lacks an effect that this recording "
+            "contains",
         },
     ),
     "prediction": Topic(
@@ -381,9 +371,7 @@ TOPICS: dict[str, Topic] = {
         "parameter.",
         messages={
             "misses": "the prediction of '{experiment}' deviates from {what} by {size}{sigmas:.2g} "
-            "times {stated}",
-            "unseen": "none of the {seen} points of {camera} is near the predicted surface of "
-            "'{experiment}'",
+            "times {stated}: check the stated parameters, {stated}, and what the model lacks",
         },
     ),
     "memory": Topic(
@@ -410,7 +398,8 @@ TOPICS: dict[str, Topic] = {
             "reduction of the contrast {reduction:.2g}): its intervals are inaccurate; measure "
             "more deformation near the inclusion or, if the boundary is known, use regions",
             "linear": "intervals of the two phases of {name} may be too narrow: they follow from "
-            "linearised measurements only, because their samples could not be simulated",
+            "linearised measurements only, because their samples could not be simulated; take "
+            "the intervals as lower limits",
             "few": "the smaller phase of {name} has only {elements} elements: its intervals have "
             "been verified for inclusions of some 80 elements, not for fewer than {fewest}; refine "
             "the mesh there",
@@ -435,16 +424,22 @@ TOPICS: dict[str, Topic] = {
         "reports no mistake.",
         messages={
             "lost": "the solve did not converge: {why}",
-            "no-start": "there is no initial state yet: the first frame needs a pose",
-            "not-simulable": "the body cannot be simulated with these parameters",
-            "grasp-lost": "the grasp is lost",
-            "seeking": "initial values are still being searched for",
-            "acceptable": "the solve converged to the acceptable tolerance only",
-            "no-error-bars": "no error bars could be computed",
+            "no-start": "there is no initial state yet: send a frame with a pose of the grasp",
+            "not-simulable": "the body cannot be simulated with these parameters: give stiffer "
+            "guesses, and check mass, units and grasps",
+            "grasp-lost": "the pose of the grasp has been missing for too many samples, so that "
+            "its motion is unknown: send poses, with increasing times",
+            "seeking": "initial values are still being searched for: wait for the end of the "
+            "search",
+            "acceptable": "the solve converged to the acceptable tolerance, but not to the desired "
+            "one: start from another guess, or raise max_iterations",
+            "no-error-bars": "no error bars could be computed; the notes of the run "
+            'state the reason, after "no error bars"',
             "interrupted": "interrupted: {left_out}",
-            "moves": "the estimate is not settled: it differs by more than its error bar from the "
-            "parameters of the last simulation",
-            "anew": "restarted {times}, assuming that the body was at rest there",
+            "moves": "the estimate has not settled: it differs by more than its error bar from the "
+            "parameters of the last simulation; wait for more frames",
+            "anew": "the estimation restarted {times} after a gap in the poses, assuming that the "
+            "body was at rest at that time: check that poses arrive without gaps",
         },
     ),
 }

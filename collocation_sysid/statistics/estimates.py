@@ -442,7 +442,7 @@ def parameter_notes(
             notes.append(
                 f"{name} ended at its {nearest} bound {getattr(item, nearest):g}: it has no "
                 "error bar, and the error bars of the others include its uncertainty; widen "
-                "the bound, or fix it if it is known"
+                "the bound, or fix the parameter if it is known"
             )
         elif estimate.statistical95 is None:
             damping = is_damping(name)
@@ -452,8 +452,8 @@ def parameter_notes(
                 else " by these data"
             )
             notes.append(
-                f"{name} is not determined{by}; fix it, give it a prior, or record a "
-                f"motion{'' if damping else ' differently'}"
+                f"{name} is not determined{by}; fix it, give it a prior, or record "
+                f"{'a motion' if damping else 'another motion'}"
             )
         elif estimate.statistical_std_error is None:
             reasons[name] = str(estimate.reason)
@@ -628,8 +628,8 @@ def correlation_notes(
             "model of autocorrelated errors, but do not cover a bias"
         ]
     return [
-        f"the residuals {pattern}, but error bars for independent errors were requested: they "
-        "are too small"
+        f"the residuals {pattern}, but error bars for independent errors were requested, which "
+        "are too small; use errors = 'auto'"
     ]
 
 
@@ -648,7 +648,8 @@ def disagreement_notes(
     return [
         f"the recordings disagree on {names[k]} (χ² "
         f"{scatter.compute_chi_squared()[k]:.3g} for {scatter.count_degrees_of_freedom()[k]} degrees of "
-        "freedom): model errors exceed the noise, and its interval includes the disagreement"
+        f"freedom): model errors exceed the noise, and the interval of {names[k]} includes the "
+        "disagreement"
         for k in np.flatnonzero(scatter.find_disagreements()).tolist()
     ]
 

@@ -263,8 +263,9 @@ def uncertainty_from_fit(
     freedom = fit.count_measurements() - round(factored.count_determined(), 9)
     if error_model.noise == "estimated" and freedom < 1:
         raise InputError(
-            f"the noise cannot be estimated from {fit.count_measurements()} measurements of "
-            f"{len(fit.names)} parameters; give sigma_m and use noise = 'given'"
+            f"the noise cannot be estimated from {fit.count_measurements()} measurements, which are not "
+            "more than the parameters that they determine; state the standard deviation of the noise "
+            "(sigma_m) and noise = 'given'"
         )
     bars = _error_bars(fit, factored, requested=error_model)
     basis = bars.basis

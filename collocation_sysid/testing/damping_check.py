@@ -85,7 +85,9 @@ def check_damping(
     check = PropertyCheck(f"damping law {made.name!r}")
     if made.stress is not None and made.potential is not None:
         check.fail(
-            "it has both a stress and a potential", made, expected="one of both"
+            "it has both a stress and a potential",
+            made,
+            expected="only one of them",
         )
     _check_evaluation(check, made, known)
     values = usual_constants((*known.constants, *made.constants), constants)

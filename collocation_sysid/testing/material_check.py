@@ -373,7 +373,7 @@ def _check_kernel_derivatives(
         check.require_equal(
             value,
             expected,
-            statement=f"{name} of kernels differs from the energy's {where}",
+            statement=f"{name} of the compiled kernels differs from that of the energy {where}",
             tolerance=CHAIN_RULE,
             scale=stiffness,
         )

@@ -81,7 +81,7 @@ def check_nuisance(
     size = NuisanceMap.from_experiment(changed).size
     if size == NuisanceMap.from_experiment(base).size:
         check.fail(
-            f"the recording {base.name!r} does not have it",
+            f"the recording {base.name!r} has no value of this parameter",
             "no value",
             expected="at least one value",
         )
@@ -169,7 +169,7 @@ def _check_reading(
     check.require_equal(
         _read(row, y, values=np.zeros(count), t_s=t_s, data=data),
         y,
-        statement="zero changes the reading of a marker",
+        statement="the value zero changes the reading of a marker",
     )
     symbol = ca.SX.sym("u", 3 + count)
     weights = check.rng.standard_normal(3)
@@ -274,7 +274,10 @@ def _check_clock(
         data=data,
     )
     check.require_equal(
-        late, np.zeros(1), statement="zero changes the clock", scale=1.0
+        late,
+        np.zeros(1),
+        statement="the value zero changes the clock",
+        scale=1.0,
     )
     indices = np.array(
         [k for k, entry in enumerate(data.entries) if entry.row == row]
@@ -292,8 +295,10 @@ def _check_clock(
         check.require_equal(
             predicted[sample, 0],
             residual.predict_positions(later, np.zeros(data.size))[sample, 0],
-            statement=f"the marker {residual.names[0]} is not seen at the time of the clock "
-            f"at t = {t_s:.4g} s",
+            statement=(
+                f"the prediction of the marker {residual.names[0]} is not its position at the time "
+                f"that the clock gives for t = {t_s:.4g} s"
+            ),
             tolerance=1e-7,
         )
 

@@ -104,7 +104,7 @@ def check_problem_file(
     check.require_equal(
         evaluate(load(loader, written)),
         evaluate(extension),
-        statement=f"{Path(file).name} gives another one in a problem file",
+        statement=f"the one that a problem file reads from {Path(file).name} has other values",
     )
     misspelt = f"no_{table[key]}"
     check.require_refusal(

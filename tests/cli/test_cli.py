@@ -682,7 +682,7 @@ def test_a_simulation_is_not_written_through_a_link(tiny: Path):
         "simulate", "problem.toml", "--out", "data", *settings(*AT_TRUTH)
     )
     assert outcome.code == 2
-    assert "data: is a link to theirs" in outcome.err
+    assert "data: this is a link to theirs" in outcome.err
     assert not list((tiny / "theirs").iterdir())
 
 
@@ -952,7 +952,7 @@ def test_an_output_that_cannot_be_written_is_explained(tiny, monkeypatch):
     assert outcome.code == 2
     assert (
         outcome.err
-        == f"error: {tiny / 'run'}: cannot be written: No space left on device\n"
+        == f"error: {tiny / 'run'}: this cannot be written: No space left on device\n"
     )
     assert not (tiny / "run").exists()
     assert not list(tiny.glob(".run*"))

@@ -243,7 +243,8 @@ def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
     assert outcome.code == 130
     assert outcome.out == ""
     assert (
-        "interrupted: 1 of 2 runs are kept in out; go on with: " in outcome.err
+        "interrupted: 1 of 2 runs are kept in out; continue with: "
+        in outcome.err
     )
     assert outcome.err.endswith("--out out --starts 2 --workers 2\n")
     assert [row["status"] for row in table(tiny / "out" / "runs.csv")] == [

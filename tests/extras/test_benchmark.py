@@ -180,8 +180,8 @@ def with_hole(header: list[str], values: np.ndarray):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (without_column, "the column 'middle_3_z' is not in it"),
-        (with_wrong_name, "the column 'middle_3_z' is not in it"),
+        (without_column, "the column 'middle_3_z' is missing"),
+        (with_wrong_name, "the column 'middle_3_z' is missing"),
         (without_row, "there is no row with t_s = 0.05"),
         (with_hole, "line 4, column 'tip_1_z': found 'nan'; expected a finite"),
     ],
@@ -220,7 +220,7 @@ def test_a_file_that_is_no_table_is_refused(
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"values": np.zeros((3, 18))}, "the array 't_s' is not in it"),
+        ({"values": np.zeros((3, 18))}, "the array 't_s' is missing"),
         ({"t_s": np.zeros(3), "values": np.zeros((3, 4))}, "found t_s"),
         ({"t_s": np.zeros(0), "values": np.zeros((0, 18))}, "has no rows"),
         (
@@ -288,8 +288,8 @@ def test_a_folder_with_predictions_is_not_replaced(folder: Path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--write",), "--write: needs a folder"),
-        (("--body", RUBBER), "--body: needs a folder"),
+        (("--write",), "--write: this option needs a folder"),
+        (("--body", RUBBER), "--body: this option needs a folder"),
         (("bodies", "--write", "--body", "isoprene"), "found 'isoprene'"),
     ],
 )

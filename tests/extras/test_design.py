@@ -264,7 +264,11 @@ BAD_LIMITS = {
         "frequency_hz = 51.0\nspeed_m_s = 1.0",
         "at most 50 Hz, half the",
     ),
-    "no toml": ("speed_m_s =", "speed_m_s", "line 2: not valid TOML"),
+    "no toml": (
+        "speed_m_s =",
+        "speed_m_s",
+        "line 2: the file is not valid TOML",
+    ),
 }
 
 
@@ -451,7 +455,9 @@ def test_what_is_not_to_be_designed_is_refused():
     unguessed = Parameters(
         (Parameter("lambda_pa", None, 10.0, 1e5), *AT.items[1:])
     )
-    with pytest.raises(InputError, match="lambda_pa: has no guess"):
+    with pytest.raises(
+        InputError, match="lambda_pa: this parameter has no guess"
+    ):
         design_motion(Problem([hung_cube(4)], unguessed), LIMITS, 0.1)
 
 

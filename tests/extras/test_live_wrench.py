@@ -322,7 +322,7 @@ def test_tables_of_frames_have_wrenches_in_their_columns():
         (
             1,
             {"t_s": 1},
-            "a sample of the wrench of grasp 1 has 't_s'; expected t_s and values",
+            "a sample of the wrench of grasp 1 has the keys 't_s'; expected t_s and values",
         ),
         (
             1,

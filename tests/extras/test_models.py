@@ -229,7 +229,7 @@ def test_files_with_other_data_are_no_models_of_one_another(tmp_path: Path):
     with pytest.raises(InputError, match="given twice"):
         file_variants([both, both], ())
     with pytest.raises(
-        InputError, match=r"it fits 'a' .* expected the same recordings"
+        InputError, match=r"this file fits 'a' .* expected the same recordings"
     ):
         file_variants([both, held], ())
     assert [
@@ -486,7 +486,8 @@ def test_bad_models_are_refused_in_one_line(bar, tiny):
     with pytest.raises(InputError, match="yeoh alone; expected two or more"):
         models([Problem.read(bar)], (), ("yeoh",))
     with pytest.raises(
-        InputError, match="found 'core'; expected none: it has no regions"
+        InputError,
+        match="found the region 'core', but the object has no regions",
     ):
         variants(bar, (), BOTH, (), TIMES_S, "core")
     TWO_REGIONS(tiny)
@@ -496,7 +497,7 @@ def test_bad_models_are_refused_in_one_line(bar, tiny):
         variants(bar, (), BOTH, (), TIMES_S, "stif")
     of_all = ('object.prony=[{"name" = "prony_1"}]',)
     with pytest.raises(
-        InputError, match="all parts without their own; expected none with"
+        InputError, match="all parts without their own; expected no --region"
     ):
         variants(bar, of_all, (), (0, 1), TIMES_S, "stiff")
 
@@ -854,7 +855,7 @@ def test_a_model_that_cannot_be_simulated_elsewhere_is_named():
         "small", 4, {"a": STEADY.tolist(), "b": STEADY.tolist()}, 900
     )
     large = row_of(
-        "large", 6, {"a": [], "b": []}, 700, failure="the step at row 7 failed"
+        "large", 6, {"a": [], "b": []}, 700, failure="time step 7 failed"
     )
     said = advice(rows_of(small, large))
     assert said.startswith(

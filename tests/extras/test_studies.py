@@ -12,7 +12,14 @@ import study_methods
 import study_mismatch
 import study_noise
 import study_table1
-from studies import HEADS, TRUTH, Variant, markdown, run_variants, worst_error
+from studies import (
+    PARAMETER_SYMBOLS,
+    TRUTH,
+    Variant,
+    markdown,
+    run_variants,
+    worst_error,
+)
 
 pytestmark = pytest.mark.long
 
@@ -60,10 +67,8 @@ def test_a_variant_is_solved_from_every_start(small_problem):
     rows = run_variants(
         small_problem, variants, small_problem.parent, starts=2, spread=1.5
     )
-    (result,) = (
-        study_methods.compute_score()(name, each) for name, each in rows.items()
-    )
-    assert (result.runs, result.hits, result.converged, result.misled) == (
+    (result,) = (study_methods.score(name, each) for name, each in rows.items())
+    assert (result.runs, result.successes, result.converged, result.misled) == (
         2,
         2,
         2,
@@ -98,8 +103,8 @@ def test_a_run_without_an_answer_counts_as_a_failure():
         **{f"error_{name}": None for name in TRUTH},
     )
     far = row(error_mu_pa=0.5)
-    result = study_methods.compute_score()("some", [row(), far, lost])
-    assert (result.hits, result.converged, result.misled) == (1, 2, 1)
+    result = study_methods.score("some", [row(), far, lost])
+    assert (result.successes, result.converged, result.misled) == (1, 2, 1)
     assert worst_error(lost) == np.inf
     low, high = result.interval
     assert 0 < low < 1 / 3 < high < 1
@@ -128,8 +133,10 @@ def test_table_1_names_options_that_the_methods_have(monkeypatch, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def fits() -> dict[str, list[study_mismatch.Fit]]:
-    experiment = study_mismatch.measured(layers=2, samples=15, fine_s=1e-3)
+def fits() -> dict[str, list[study_mismatch.SchemeFit]]:
+    experiment = study_mismatch.exact_recording(
+        layers=2, samples=15, fine_s=1e-3
+    )
     return {
         scheme: [study_mismatch.identify(experiment, scheme, m) for m in (2, 4)]
         for scheme in ("backward-euler", "midpoint")
@@ -151,7 +158,7 @@ def test_the_midpoint_rule_biases_stiffness_by_the_square_of_the_step(fits):
 
 def test_steps_with_an_estimate_at_its_bound_say_nothing_of_the_order():
     fits = [
-        study_mismatch.Fit(
+        study_mismatch.SchemeFit(
             "midpoint",
             h,
             True,
@@ -190,7 +197,7 @@ def test_methods_turn_the_same_noise_into_the_same_error():
 def test_noise_is_summed_up_over_converged_runs():
     errors = [np.full(4, 0.01), np.full(4, -0.01), np.full(4, 9.0)]
     outcomes = [
-        study_noise.Outcome(converged, each, 1.0)
+        study_noise.NoiseOutcome(converged, each, 1.0)
         for converged, each in zip((True, True, False), errors, strict=True)
     ]
     predicted, line = cells(study_noise.table({"some": outcomes}, [0.02] * 4))
@@ -200,7 +207,7 @@ def test_noise_is_summed_up_over_converged_runs():
 
 def test_tables_are_markdown():
     assert (
-        markdown(("a", *HEADS[:1]), [("x", "1")])
+        markdown(("a", *PARAMETER_SYMBOLS[:1]), [("x", "1")])
         == "| a | λ |\n| --- | ---: |\n| x | 1 |"
     )
 
@@ -211,7 +218,7 @@ def test_tables_are_markdown():
 def test_a_twin_with_noisy_poses_is_identified_and_listed():
     found = study_faults.run("poses 0.1 mm, 0.06°, judged", (0, 1))
     assert found.converged
-    assert found.held.sum() >= 3
+    assert found.contains_truth.sum() >= 3
     (line,) = cells(
         f"{study_faults.table_head()}\n{study_faults.table_row('poses', [found])}"
     )
@@ -223,12 +230,12 @@ def test_a_twin_with_noisy_poses_is_identified_and_listed():
 def test_a_twin_of_which_all_that_is_assumed_is_wrong_is_in_the_whole_intervals():
     found = study_faults.run("assumed: all of these", (0, 1))
     assert found.converged
-    assert found.held.sum() < found.whole.sum()
-    assert found.whole.sum() >= 5
+    assert found.contains_truth.sum() < found.combined_contains_truth.sum()
+    assert found.combined_contains_truth.sum() >= 5
 
 
 def test_faults_are_as_large_as_they_are_called():
-    rng, measured = np.random.default_rng(0), study_faults.measured()
+    rng, measured = np.random.default_rng(0), study_faults.exact_recording()
     before = measured.markers.positions_m
     late, stated = study_faults.FAULTS["clock 2 ms late"](measured, rng)
     speed = np.gradient(before, measured.timestep_s, axis=0)
@@ -253,10 +260,10 @@ def test_faults_are_as_large_as_they_are_called():
     ("count", "shown"), [(190, "95"), (182, "91*"), (199, "99.5*")]
 )
 def test_shares_beyond_chance_are_starred(count, shown):
-    outcome = study_faults.Outcome(
+    outcome = study_faults.FaultOutcome(
         True, *(np.ones(6) for _ in range(4)), correlated=False
     )
-    missed = replace(outcome, held=np.zeros(6))
+    missed = replace(outcome, contains_truth=np.zeros(6))
     row = study_faults.table_row(
         "none", [outcome] * count + [missed] * (200 - count)
     )

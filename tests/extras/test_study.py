@@ -362,7 +362,7 @@ def test_a_process_that_always_dies_is_a_record(stand_in):
     tries = stand_in("dies")
     record = run_execution.execute(planned_runs(1)[0].as_dict(), retries=2)
     assert (record["outcome"], tries("key0")) == ("crashed", 3)
-    assert record["message"] == "its process ended with code 3: Bus error"
+    assert record["message"] == "the process ended with code 3: Bus error"
 
 
 def test_a_late_run_is_killed(stand_in):

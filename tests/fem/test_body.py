@@ -209,10 +209,10 @@ def test_weighed_mass_is_kept(small_mesh):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({}, "exactly one of density_kg_m3 and mass_kg"),
+        ({}, "of density_kg_m3 and mass_kg; expected exactly one"),
         (
             {"density_kg_m3": 30.0, "mass_kg": 0.02},
-            "exactly one of density_kg_m3 and mass_kg",
+            "of density_kg_m3 and mass_kg; expected exactly one",
         ),
         ({"density_kg_m3": -30.0}, "density_kg_m3 is -30; expected a positive"),
         ({"mass_kg": 0.0}, "mass_kg is 0; expected a positive"),
@@ -227,7 +227,7 @@ def test_weighed_mass_is_kept(small_mesh):
         ),
         (
             {"mass_kg": 1.0, "evaluator": "gpu"},
-            "no evaluator 'gpu'; available: auto, simd, casadi",
+            "is 'gpu'; expected one of auto, simd, casadi",
         ),
     ],
 )
@@ -245,9 +245,11 @@ def test_fields_of_the_wrong_shape_are_refused(make_body):
         match=r"shapes \(26, 3\); expected \(27, 3\) or \(T, 27, 3\)",
     ):
         body.energy(x[:-1], **elastic(body))
-    with pytest.raises(InputError, match="hold 2 states; expected one"):
+    with pytest.raises(
+        InputError, match="positions at 2 times; expected those at one time"
+    ):
         body.elastic_force(np.stack([x, x]), **elastic(body))
-    with pytest.raises(InputError, match="with the same T in all"):
+    with pytest.raises(InputError, match="with the same number T of times"):
         body.force(np.stack([x, x]), np.zeros_like(x), theta)
 
 

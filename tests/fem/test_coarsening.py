@@ -122,5 +122,7 @@ def test_a_field_has_the_values_of_the_same_places():
 def test_phases_of_elements_are_refused():
     field = Field(0.05, modes=3, prior="two-phase")
     body = Body(BOX, density_kg_m3=1000.0, field=field)
-    with pytest.raises(InputError, match="a value of its own in each element"):
+    with pytest.raises(
+        InputError, match="values that belong to the elements of its own mesh"
+    ):
         coarsen_body(body, len(BOX.points_m) // 6, [])

@@ -455,14 +455,17 @@ def test_cells_are_told_in_any_of_these_ways(slab, how):
         ),
         (
             Named("tag"),
-            'cell array "tag" holds 2; a selection needs only 0 and 1',
+            'cell array "tag" contains the value 2; expected only 0 and 1',
         ),
-        (np.zeros(12, bool), "mask .12,. that is true somewhere"),
-        (np.ones(7, bool), "expected cell numbers, or a mask .12,."),
-        ([0.5, 1.5], "expected cell numbers, or a mask"),
-        ([3, 12], "cell 12 does not exist; the mesh has 12, from 0 on"),
+        (np.zeros(12, bool), "boolean array .12,. that is true somewhere"),
+        (
+            np.ones(7, bool),
+            "expected indices of cells from 0, or a boolean array .12,.",
+        ),
+        ([0.5, 1.5], "expected indices of cells from 0, or a boolean array"),
+        ([3, 12], "cell 12 does not exist; expected indices of the 12 cells"),
         ([-1, 3], "cell -1 does not exist"),
-        ([], "expected cell numbers, or a mask"),
+        ([], "expected indices of cells from 0, or a boolean array"),
     ],
 )
 def test_cells_that_are_not_there_are_refused_with_the_region(
@@ -502,7 +505,7 @@ def test_names_that_cannot_be_told_apart_are_refused(slab):
             r"mass_kg is 0\.001; expected more than 0\.1 kg, the mass of the regions",
         ),
         ({"density_kg_m3": 0.0}, "density_kg_m3 is 0; expected a positive"),
-        ({}, "exactly one of density_kg_m3 and mass_kg"),
+        ({}, "of density_kg_m3 and mass_kg; expected exactly one"),
     ],
 )
 def test_regions_that_leave_no_mass_are_refused(slab, given, message):
@@ -524,7 +527,8 @@ def test_a_mass_that_says_nothing_is_refused(slab):
 
 def test_a_regions_density_must_be_positive(slab):
     with pytest.raises(
-        InputError, match=r"region 'core'.*density_kg_m3 must be positive"
+        InputError,
+        match=r"region 'core'.*density_kg_m3 is -3; expected a positive number",
     ):
         Body(
             slab,

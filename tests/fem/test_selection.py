@@ -73,7 +73,7 @@ def test_an_unknown_name_lists_the_names_there_are(box):
 def test_a_named_array_must_be_a_mask():
     arrays = {"heat": [0.0, 1, 2, 3], "velocity": np.zeros((4, 3))}
     mesh = TetMesh(CORNERS, [[0, 1, 2, 3]], arrays)
-    with pytest.raises(InputError, match=r'"heat" holds 2\.0'):
+    with pytest.raises(InputError, match=r'"heat" contains the value 2\.0'):
         mesh.select(Named("heat"))
     with pytest.raises(InputError, match='"velocity" has 3 values per node'):
         mesh.select(Named("velocity"))

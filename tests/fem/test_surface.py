@@ -43,8 +43,8 @@ def test_a_doubled_triangle_is_not_closed_either():
 @pytest.mark.parametrize(
     ("edge_length_m", "message"),
     [
-        (0.5, "over half the surface's diagonal"),
-        (1e-4, "more than 2e"),
+        (0.5, "more than half the diagonal of the surface"),
+        (1e-4, "expected at most 2e"),
         (-1, "positive number"),
     ],
 )

@@ -168,7 +168,7 @@ PROBLEM_FILE = [
         edit=replace_text(MU, 'mu_pa = "soft"'),
     ),
     bad(
-        "unknown-parameter", "parameters.mu_p: no such parameter", "did you mean 'mu_pa'?",
+        "unknown-parameter", "parameters.mu_p: the model has no such parameter", "did you mean 'mu_pa'?",
         edit=replace_text("mu_pa  ", "mu_p"),
     ),
     bad(
@@ -232,7 +232,10 @@ OBJECT = [
         options=settings("object.element=hex8"),
     ),
     bad(
-        "mesh-missing", "object.mesh", "body.vtu does not exist", "problem file's folder",
+        "mesh-missing",
+        "object.mesh",
+        "body.vtu does not exist",
+        "relative to the folder of the problem file",
         edit=remove("body.vtu"),
     ),
     bad("mesh-is-a-folder", "object.mesh", "is a folder", options=settings("object.mesh=.")),
@@ -248,7 +251,7 @@ OBJECT = [
         edit=write_mesh(BODY.points_m, {"triangle": BODY.surface}),
     ),
     bad(
-        "mesh-with-a-flat-element", "body.vtu", "element 5", "degenerate", "remesh",
+        "mesh-with-a-flat-element", "body.vtu", "element 5", "degenerate", "mesh the body again",
         edit=write_mesh(flattened_points(), {"tetra": BODY.tetrahedra}),
     ),
     bad(
@@ -380,7 +383,7 @@ POSE_FILES = [
         edit=replace_text("x_m", "x_mm", POSES),
     ),
     bad(
-        "ragged-row", f"{POSES}: line 4", "9 cells", "8 columns",
+        "ragged-row", f"{POSES}: line 4", "9 cells", "expected 8",
         edit=replace_line(POSES, 4, lambda row: row + ",1"),
     ),
     bad(
@@ -396,7 +399,7 @@ POSE_FILES = [
         edit=replace_cell(POSES, 5, 7, "0.5"),
     ),
     bad(
-        "one-pose-of-a-motion", f"{POSES}: holds one pose", "0 s to 0.08 s", "the same pose at",
+        "one-pose-of-a-motion", f"{POSES}: found only one pose", "0 s to 0.08 s", "the same pose at",
         edit=keep_lines(POSES, 2),
     ),
     bad(
@@ -488,7 +491,7 @@ MARKER_FILES = [
         options=settings("experiment.0.window_s=[0.06, 0.01]"),
     ),
     bad(
-        "window-too-short", "2 samples", "at least 3", "window_s",
+        "window-too-short", "2 sample times", "at least 3", "window_s",
         options=settings("experiment.0.window_s=[0, 0.01]"),
     ),
     bad(
@@ -535,7 +538,7 @@ MARKER_FILES = [
         options=settings("experiment.0.markers.sigma_m={ low = 1e-3, mid = 0.0, side = 1e-3 }"),
     ),
     bad(
-        "sigma-of-one-marker-missing", "markers.sigma_m", "no value for 'mid'",
+        "sigma-of-one-marker-missing", "markers.sigma_m", "no value for the marker 'mid'",
         options=settings("experiment.0.markers.sigma_m={ low = 1e-3, side = 1e-3 }"),
     ),
     bad(
@@ -620,7 +623,7 @@ OPTIONS = [
     ),
     bad("endless-substeps", "transcription.substeps", "10000",
         options=settings("transcription.substeps=1000000000")),
-    bad("endless-roll-out", "experiment 'swing'", "found steps of 1e-90 s", "at most 10000",
+    bad("endless-roll-out", "experiment 'swing'", "found a time step of 1e-90 s", "at most 10000",
         options=settings("rollout.timestep_s=1e-90")),
     bad("name-with-nul", "name", "expected a valid file name",
         options=settings('experiment.swing.name="a\\u0000b"')),
@@ -696,7 +699,7 @@ def test_a_slip_is_explained_and_nothing_is_written(tiny, edit, options, words):
             ),
             (
                 "simulate problem.toml --out s --timestep-s 1e-60",
-                "found steps of",
+                "found a time step of",
                 "at most 10000",
             ),
             (
@@ -734,7 +737,9 @@ def test_simulation_without_a_marker_file_needs_places(tiny):
 def test_a_damaged_run_cannot_be_drawn(tiny):
     (tiny / "result.json").write_text('{"history": [')
     np.savez(tiny / "trajectory.npz", t_s=np.zeros(3))
-    assert_refused(tiny, ("damaged", "run what wrote it again"), "plot", ".")
+    assert_refused(
+        tiny, ("damaged", "run the command that wrote it again"), "plot", "."
+    )
     (tiny / "result.json").write_text('{"schema": 4}')
     assert_refused(tiny, ("damaged", "solve the problem again"), "plot", ".")
 

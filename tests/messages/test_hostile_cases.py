@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("resource", reason="limits of POSIX")
 
 import hostile
-from hostile import Ended
+from hostile import CommandEnd
 
 TRACEBACK = "Traceback (most recent call last):\n  ...\nKeyError: 3\n"
 
@@ -20,25 +20,25 @@ TRACEBACK = "Traceback (most recent call last):\n  ...\nKeyError: 3\n"
 @pytest.mark.parametrize(
     ("ended", "is_clean", "outcome"),
     [
-        (Ended(2, "", "error: a.csv: no number\n"), True, "refused"),
-        (Ended(2, "", "error: a.csv: no number\n"), False, "unclear"),
+        (CommandEnd(2, "", "error: a.csv: no number\n"), True, "refused"),
+        (CommandEnd(2, "", "error: a.csv: no number\n"), False, "unclear"),
         (
-            Ended(2, "", "a library's line\nerror: a.csv: no number\n"),
+            CommandEnd(2, "", "a library's line\nerror: a.csv: no number\n"),
             True,
             "unclear",
         ),
-        (Ended(2, "", "error: \x1b[31m\n"), True, "unclear"),
-        (Ended(0, "valid\n", ""), True, "accepted"),
-        (Ended(1, "found 2\n", ""), True, "accepted"),
-        (Ended(0, "\x1b[31m\n", ""), True, "unclear"),
-        (Ended(1, "", TRACEBACK), True, "traceback"),
-        (Ended(-signal.SIGSEGV, "", ""), True, "crash"),
-        (Ended(-signal.SIGXCPU, "", ""), True, "hang"),
-        (Ended(None, "", ""), True, "hang"),
+        (CommandEnd(2, "", "error: \x1b[31m\n"), True, "unclear"),
+        (CommandEnd(0, "valid\n", ""), True, "accepted"),
+        (CommandEnd(1, "found 2\n", ""), True, "accepted"),
+        (CommandEnd(0, "\x1b[31m\n", ""), True, "unclear"),
+        (CommandEnd(1, "", TRACEBACK), True, "traceback"),
+        (CommandEnd(-signal.SIGSEGV, "", ""), True, "crash"),
+        (CommandEnd(-signal.SIGXCPU, "", ""), True, "hang"),
+        (CommandEnd(None, "", ""), True, "hang"),
     ],
 )
 def test_an_end_has_the_outcome_that_a_user_sees(
-    ended: Ended, is_clean: bool, outcome: str
+    ended: CommandEnd, is_clean: bool, outcome: str
 ):
     assert ended.outcome(is_clean) == outcome
 
@@ -85,7 +85,9 @@ def test_damage_is_drawn_from_the_seed():
 @pytest.mark.long
 @pytest.mark.parametrize("kind", list(hostile.KINDS))
 def test_no_case_ends_without_a_message(kind: str, tmp_path: Path):
-    table = hostile.table(2, seed=0, only=[kind], limit_s=60.0, kept=tmp_path)
+    table = hostile.table(
+        2, seed=0, only=[kind], limit_s=60.0, failure_folder=tmp_path
+    )
     cells = [
         cell.strip() for cell in table.splitlines()[-1].strip("|").split("|")
     ]

@@ -136,7 +136,9 @@ def test_readers_that_do_not_find_the_end_of_a_mesh_are_stopped(tmp_path: Path):
     assert len(lines) == len(ENDLESS)
     for line, name in zip(lines, ENDLESS, strict=True):
         assert line.startswith(f"{name}: the file cannot be read as a mesh (")
-    assert "it was not finished after 3 s of processor time" in lines[0]
+    assert (
+        "the process was not finished after 3 s of processor time" in lines[0]
+    )
     assert done.stderr == ""
 
 
@@ -159,7 +161,7 @@ def test_a_damaged_cloud_is_refused_in_one_line(
 ):
     (tmp_path / "a.ply").write_text(content)
     with pytest.raises(
-        InputError, match=r"a\.ply: .*expected \.ply"
+        InputError, match=r"a\.ply: .*expected a (complete|valid) \.ply"
     ) as refusal:
         read_depth(tmp_path / "a.ply", None, 1.0)
     assert "SystemExit" not in str(refusal.value)
@@ -178,7 +180,8 @@ def test_a_depth_file_with_a_length_beyond_all_measures_is_refused(
         key = "points_m" if name == "cloud.npz" else "depth_m"
         np.savez(tmp_path / name, **{key: points_m})
     with pytest.raises(
-        InputError, match=rf"{name}: contains the length 1e\+30 m; expected at"
+        InputError,
+        match=rf"{name}: the largest length in the file is 1e\+30 m; expected at",
     ):
         read_depth(tmp_path / name, None, 1.0)
 
@@ -311,16 +314,16 @@ def test_so_is_such_an_override(tiny: Path, value: str):
     [
         (
             ("compare-methods", "--methods", "shooting", "--starts", "1000000"),
-            "asks for 1,000,000 starts",
+            "found 1,000,000 starts",
         ),
         (("compare-models", "--prony", "0,1000000"), "whole numbers up to 20"),
         (
             ("sweep", "--over", "solver.huber=1:2:1000000"),
-            "asks for 1,000,000 values",
+            "found 1,000,000 values",
         ),
         (
             ("sweep", "--over", f"solver.huber=1:2:1{'0' * 30}"),
-            "asks for more than 10",
+            "found more than 10",
         ),
         (
             (
@@ -330,7 +333,7 @@ def test_so_is_such_an_override(tiny: Path, value: str):
                 "--over",
                 "transcription.substeps=1:900:900",
             ),
-            "asks for 810,000 runs",
+            "found 810,000 runs",
         ),
         (
             ("sweep", "--over", "solver.huber=1:1e999:3"),

@@ -285,7 +285,7 @@ def test_a_c3d_that_crashes_its_reader_is_refused(
         "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
     )
     with pytest.raises(
-        InputError, match=r"damaged C3D file.*killed by SIGSEGV"
+        InputError, match=r"C3D file is damaged.*killed by SIGSEGV"
     ):
         read_markers(file)
 

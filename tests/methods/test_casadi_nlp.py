@@ -265,7 +265,7 @@ def test_every_plugin_of_casadi_is_offered_or_refused_with_a_reason():
             "not offered: it needs a library, and usually a licence, that are not part of CasADi",
         ),
         ("casadi:uno", "aborts the process"),
-        ("casadi:ipopt", 'its own method is "interior-point"'),
+        ("casadi:ipopt", 'IPOPT is available as the method "interior-point"'),
         (
             "casadi:sqpmetod",
             "did you mean 'casadi:sqpmethod'? expected one of casadi:sqpmethod, ",

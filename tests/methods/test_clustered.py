@@ -216,7 +216,7 @@ def test_without_a_scheduler_left_the_best_is_kept(there, monkeypatch):
         )
     with dask.config.set({"distributed.comm.timeouts.connect": "0.5s"}):
         there.close()  # which looks for the scheduler
-    assert_best_is_kept(solution, "Its scheduler no longer responds.")
+    assert_best_is_kept(solution, "The scheduler no longer responds.")
 
 
 FAULTS = """
@@ -311,7 +311,7 @@ def apart(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen]]]:
         (
             slice(0, 1),
             Status.CLUSTER_DISCONNECTED,
-            "Its scheduler no longer responds.",
+            "The scheduler no longer responds.",
         ),
     ],
     ids=["a worker", "all workers", "the scheduler"],

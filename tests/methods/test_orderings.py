@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from benchmark_orderings import SETTINGS, Factorisations, run_apart
+from benchmark_orderings import SETTINGS, Factorisations, run_in_own_process
 
 SIZE = 12
 # A quadratic program with a dense Hessian: its factor has n (n + 1) / 2 entries.
@@ -57,7 +57,7 @@ def test_output_without_a_factorisation_gives_none() -> None:
 
 def test_a_setting_is_measured_in_a_process_of_its_own() -> None:
     assert SETTINGS["amd"].ipopt == {"mumps_pivot_order": 0}
-    times, factors = run_apart("foam_cylinder", "amd", iterations=1)
+    times, factors = run_in_own_process("foam_cylinder", "amd", iterations=1)
     assert times is not None
     assert factors is not None
     assert factors.ordering == "AMD"
@@ -68,4 +68,7 @@ def test_a_setting_is_measured_in_a_process_of_its_own() -> None:
 
 
 def test_a_failed_process_gives_none() -> None:
-    assert run_apart("no_such_problem", "amd", iterations=1) == (None, None)
+    assert run_in_own_process("no_such_problem", "amd", iterations=1) == (
+        None,
+        None,
+    )

@@ -210,7 +210,7 @@ def test_budgets_end_it():
     assert short.status is Status.TIME_LIMIT
     stage = Penalty(schedule="constant", inner_iterations=5)(collocation)
     assert stage.status is Status.ITERATION_LIMIT
-    assert "raise inner_iterations" in stage.message
+    assert "Raise inner_iterations" in stage.message
 
 
 def test_an_interruption_keeps_the_last_and_best_iterate():

@@ -271,9 +271,11 @@ def test_a_start_whose_positions_lead_nowhere_is_simulated_at_its_parameters():
 
 @pytest.mark.long
 def test_few_starts_far_away_all_succeed():
-    from study_starts import Case, guesses, hanging_cylinder, study
+    from study_starts import SwungBody, guesses, hanging_cylinder, study
 
-    case = Case(hanging_cylinder(layers=4, steps=24, scheme="midpoint"), TRUTH)
+    case = SwungBody(
+        hanging_cylinder(layers=4, steps=24, scheme="midpoint"), TRUTH
+    )
     outcomes = study(case, guesses(8, 10.0, seed=0))
     assert [outcome.number for outcome in outcomes if not outcome.success] == []
     assert np.median([outcome.sweeps for outcome in outcomes]) < 14

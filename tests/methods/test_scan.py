@@ -172,7 +172,8 @@ def test_several_regions_are_scaled_together():
 
 def test_a_constant_of_which_nothing_is_known_needs_a_guess():
     with pytest.raises(
-        InputError, match="stiffening: there is no guess, and no usual value"
+        InputError,
+        match="stiffening: this parameter has no guess, and no usual value",
     ):
         Parameters.from_mapping({"stiffening": Unknown()})
     assert Parameters.from_mapping(
@@ -182,7 +183,8 @@ def test_a_constant_of_which_nothing_is_known_needs_a_guess():
 
 def test_without_a_guess_values_are_refused_by_name():
     with pytest.raises(
-        InputError, match="lambda_pa: it has no guess; expected guess = "
+        InputError,
+        match="lambda_pa: this parameter has no guess; expected guess = ",
     ):
         _ = Parameters.from_mapping(NOTHING).guesses
 
@@ -311,7 +313,7 @@ def test_a_guess_that_gives_more_force_than_there_is_is_replaced():
     )
     assert found is not None
     assert (
-        "the simulation is farther from the measurements than an undeformed body"
+        "the simulation is farther from the measurements than a body that moves"
         in found.sentence
     )
     assert collocation.parameters.guesses["mu_pa"] < 2 * TRUTH["mu_pa"]

@@ -146,7 +146,8 @@ def test_a_law_that_leaves_something_else_is_refused_in_words():
     ):
         cs.NodeForce.from_law(pull, carries=3)
     with pytest.raises(
-        InputError, match="returns three forces and the new internal variables"
+        InputError,
+        match="returns the three components of a force, and of the new internal",
     ):
         cs.NodeForce.from_law(
             lambda x, v, before, at, pull_n: -pull_n * x, carries=2, name="pull"
@@ -219,11 +220,13 @@ def test_a_strut_from_a_file_is_the_one_from_python(strutted):
             ("carries = 6", "carries = 4"),
             "force 'maxwell' returns 6 internal variables; expected 4",
         ),
-        (("carries = 6\n", ""), "force 'maxwell' has an argument before `at`"),
+        (
+            ("carries = 6\n", ""),
+            "force 'maxwell': the function has an argument between v and `at`",
+        ),
         (
             ('"maxwell"', '"made"'),
-            "object.force.0.carries: found 6, but the number of internal "
-            "variables of the force 'made' is",
+            "object.force.0.carries: found 6, but the force 'made' has ",
         ),
     ],
 )
@@ -235,3 +238,17 @@ def test_what_a_force_in_a_file_cannot_carry_is_one_message(
     done = run_command("check", "problem.toml", "--allow-code")
     assert done.code == 2
     assert said in " ".join(done.err.split())
+
+
+def test_an_obstacle_that_is_not_touched_does_not_change_the_reference_motion():
+    """Its force precedes the user's among the terms, and is apart while a step is solved."""
+    experiment = tied()
+    far = cs.Obstacle(shape=cs.Plane((0.0, 0.0, 1.0), (0.0, 0.0, -9.0)))
+    beside = replace(experiment, grasps=[*experiment.grasps, far])
+    alone, both = (
+        simulate(each, STATED, "newmark").positions_m
+        for each in (experiment, beside)
+    )
+    np.testing.assert_allclose(
+        both[:, : alone.shape[1]], alone, rtol=0, atol=1e-12
+    )

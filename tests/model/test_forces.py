@@ -393,7 +393,7 @@ def test_a_force_on_faces_that_are_not_there_is_refused():
     inside = Box((0.04, 0.04, 0.04), (0.06, 0.06, 0.06))
     force = NodeForce.from_law(breath, nodes=inside, on="faces")
     with pytest.raises(
-        InputError, match="'breath' is on faces, but none of the surface"
+        InputError, match="'breath' acts on faces of the surface, but no face"
     ):
         Forces.of_body_alone(
             Body(hung_cube(2).body.mesh, density_kg_m3=30.0, forces=[force]),

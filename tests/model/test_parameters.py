@@ -535,7 +535,9 @@ def test_a_mapping_is_checked_like_a_problem():
         resolve_theta(
             box(), {"young_pa": 1000.0, "poisson": 0.2, "gamma_r_s": 0.01}
         )
-    with pytest.raises(InputError, match="gama_r_s: no such parameter"):
+    with pytest.raises(
+        InputError, match="gama_r_s: the model has no such parameter"
+    ):
         resolve_theta(
             box(), {"young_pa": 1000.0, "poisson": 0.2, "gama_r_s": 0.01}
         )
@@ -602,11 +604,11 @@ def test_with_fixed_fixes_what_it_names():
         ({"lower": 1000.0, "guess": 1000.0}, "expected 0 < lower < upper"),
         (
             {"prior": (300.0, 0.0)},
-            "mu_pa: prior = .*, expected positive mean and deviation",
+            "mu_pa: prior = .*, expected a positive mean and a positive standard deviation",
         ),
         (
             {"prior": (-300.0, 0.1)},
-            "mu_pa: prior = .*, expected positive mean and deviation",
+            "mu_pa: prior = .*, expected a positive mean and a positive standard deviation",
         ),
         (
             {"is_fixed": True, "guess": -1.0},
@@ -682,15 +684,15 @@ SETS = {
     ),
     "misspelt": (
         {"lambda_pa": 1.0, "mu_p": 1.0, **GIVEN},
-        "mu_p: no such parameter; .* lambda_pa, mu_pa, .*; did you mean 'mu_pa'",
+        "mu_p: the model has no such parameter; .* lambda_pa, mu_pa, .*; did you mean 'mu_pa'",
     ),
     "of another material": (
         {"lambda_pa": 1.0, "mu_pa": 1.0, "gent_limit": 3.0, **GIVEN},
-        "gent_limit: no such parameter",
+        "gent_limit: the model has no such parameter",
     ),
     "of no region": (
         {"lambda_pa": 1.0, "mu_pa": 1.0, "core.mu_pa": 3.0, **GIVEN},
-        "core.mu_pa: no such parameter; .*; did you mean 'mu_pa'",
+        "core.mu_pa: the model has no such parameter; .*; did you mean 'mu_pa'",
     ),
 }
 
@@ -714,7 +716,7 @@ SETS_OF_TWO = {
             **OF_TWO,
             **{f"{region}.gamma_m_1_s": 2.0 for region in ("core", "skin")},
         },
-        "gamma_m_1_s: no part of the model uses it, because every region has its own value",
+        "gamma_m_1_s: no part of the model uses this parameter, because every region has its own value",
     ),
     "mixed in a region": (
         {**OF_TWO, "core.young_pa": 2.0},
@@ -743,7 +745,8 @@ def test_parameters_that_do_not_fit_the_regions_are_refused(name: str):
 
 def test_a_name_given_twice_is_refused():
     with pytest.raises(
-        InputError, match="mu_pa: given twice, expected one value"
+        InputError,
+        match="mu_pa: this parameter is given twice, expected one value",
     ):
         Parameters((IN_LAME.items[1], *IN_LAME.items))
 

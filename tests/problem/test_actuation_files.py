@@ -168,7 +168,7 @@ SLIPS = {
     ),
     "raw": (
         ("tension.csv", "t_s,tension_n\n0,1\n1,9e7\n"),
-        "which is too large for a soft body",
+        "too large for a soft body",
     ),
     "back in time": (
         ("tension.csv", "t_s,tension_n\n1,1\n0,1\n"),

@@ -681,7 +681,8 @@ def test_a_simulated_table_reads_back_as_what_was_simulated(
 def test_one_table_of_two_recordings_is_not_simulated(tmp_path):
     file = block_problem(tmp_path, SHARED.replace("second.csv", "first.csv"))
     with pytest.raises(
-        InputError, match=r"'second': file: is read by 'first' too"
+        InputError,
+        match=r"'second': file: the file first.csv is read by 'first' too",
     ):
         write_data(Problem.read(file, simulation=True), tmp_path / "twin")
     assert not (tmp_path / "twin").exists()
@@ -739,7 +740,7 @@ def test_a_machines_own_file_takes_the_examples_place(tmp_path, monkeypatch):
     [
         (
             "edge_length_m = 1e-5",
-            "object.edge_length_m: makes 4.5e+11 elements; expected at most",
+            "object.edge_length_m: with this length the mesh has 4.5e+11 elements; expected at most",
         ),
         (
             "mass_kg = 1.0",

@@ -116,7 +116,7 @@ def test_fields_of_assumptions_are_described_as_the_rows():
     section = inspect.cleandoc(Assumptions.__doc__ or "").partition(
         "Attributes\n----------\n"
     )[2]
-    blocks = re.findall(r"^(\w+)\n((?: +.*(?:\n|$))+)", section, re.M)
+    blocks = re.findall(r"^(\w+) : .*\n((?: +.*(?:\n|$))+)", section, re.M)
     described = {name: " ".join(text.split()) for name, text in blocks}
     expected = {
         row.name: f"{row.description} [{row.unit or 1}]" for row in ASSUMPTIONS

@@ -14,7 +14,7 @@ from collocation_sysid.common.schema_tables import Section
 from collocation_sysid.fem.spatial_field import Field
 from collocation_sysid.model.parameters import PARAMETER_KEYS, Unknown
 from collocation_sysid.problem import (
-    depth_section,
+    camera_section,
     load_schema,
     recording_schema,
     schema,
@@ -51,8 +51,8 @@ SECTIONS: dict[type, type[Section]] = {
     Obstacle: recording_schema.ObstacleSection,
     Markers: recording_schema.MarkersSection,
     Gauge: recording_schema.ReadingSection,
-    Depth: depth_section.DepthSection,
-    DepthCamera: depth_section.DepthCameraSection,
+    Depth: camera_section.DepthSection,
+    DepthCamera: camera_section.DepthCameraSection,
     Experiment: recording_schema.ExperimentSection,
     **{
         kind: getattr(load_schema, f"{kind.__name__}Section")

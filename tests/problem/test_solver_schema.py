@@ -97,11 +97,12 @@ def test_tables_of_several_methods_stand_side_by_side():
         ),
         (
             "solver.reduced-space.warm_up=0",
-            "solver.reduced-space: warm_up is an option of interior-point; reduced-space has",
+            "solver.reduced-space: found warm_up, which is an option of interior-point; "
+            "expected options of reduced-space",
         ),
         (
             "solver.reduced-space.ladde=[1]",
-            "'reduced-space' has no option 'ladde'; it has toler",
+            "'reduced-space' has no option 'ladde'; expected one of toler",
         ),
         ("solver.reduced-space.ladde=[1]", "did you mean 'ladder'?"),
         (

@@ -128,7 +128,7 @@ SLIPS = {
     "no sigma of torques": (
         lines(),
         'wrench = { file = "force.csv", sigma_n = 0.001 }',
-        ["grasp.wrench", "needs sigma_nm"],
+        ["grasp.wrench", "sigma_nm is missing"],
     ),
     "no sigma": (
         lines(),
@@ -170,8 +170,11 @@ def test_a_slip_in_the_problem_is_named(
     [
         ({"values": np.zeros((3, 4))}, "shape"),
         ({"t_s": [0.0, 0.2, 0.1]}, "time must increase"),
-        ({"values": np.full((3, 6), np.nan)}, "no sample"),
-        ({"sigma_nm": None}, "needs sigma_nm"),
+        (
+            {"values": np.full((3, 6), np.nan)},
+            "all values of the measured wrench are missing",
+        ),
+        ({"sigma_nm": None}, "sigma_nm is missing"),
         ({"sigma_n": -1.0}, "sigma_n of a wrench is -1"),
         ({"frame": "hand"}, "expected one of world, grasp"),
         ({"point_m": [0.0, 1.0]}, "point_m"),

@@ -209,11 +209,11 @@ def test_clouds_and_images_are_read_from_every_format(tmp_path):
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("flat.npy", "expected x, y, z"),
+        ("flat.npy", "expected 3 columns x, y, z"),
         ("colour.png", "16 bits"),
         ("packed.pcd", "ascii or binary"),
         ("image.tif", "expected one of"),
-        ("two.npz", "expected one of depth_m"),
+        ("two.npz", "expected exactly one of depth_m"),
         ("image.exr", "OpenEXR"),
     ],
 )

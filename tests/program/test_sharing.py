@@ -287,7 +287,7 @@ OTHERS = {
     "surface": (
         PLACES,
         lambda e: replace(e, markers=replace(e.markers, on_surface=True)),
-        "another kind of places",
+        "another value of places",
     ),
     "prior": (
         PLACES,
@@ -306,7 +306,7 @@ OTHERS = {
         lambda e: replace(
             e, grasps=[replace(e.grasps[0], nodes=e.grasps[0].nodes[1:])]
         ),
-        "another nodes in its grasps",
+        "another set of nodes in its grasps",
     ),
 }
 
@@ -328,11 +328,11 @@ def test_what_belongs_to_things_that_differ_is_not_shared(case: str):
     [
         (
             {"places": "shared"},
-            r"found the scope of 'places'; expected one of marker_offset_m, ",
+            r"scope contains 'places', which is not a nuisance parameter; expected one of marker_offset_m, ",
         ),
         (
             {"tare": "mine"},
-            r"the scope of tare is 'mine'; expected \"shared\", or \"shared\" and",
+            r"the scope of tare is 'mine'; expected \"shared\", or \"shared\" followed",
         ),
     ],
 )

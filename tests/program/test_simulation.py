@@ -127,7 +127,7 @@ def test_where_newton_fails_the_load_is_applied_in_steps():
     np.testing.assert_allclose(in_steps, direct, atol=1e-9)
     with pytest.raises(
         SimulationError,
-        match="rest state failed: Newton's method took more than 3",
+        match="initial equilibrium failed: Newton's method took more than 3",
     ):
         equilibrium(
             cube,
@@ -360,7 +360,7 @@ def test_a_scheme_moves_the_grasp_in_parts_where_a_step_is_too_large():
     )
     with pytest.raises(
         SimulationError,
-        match="the step at row 3 failed: an element is inverted",
+        match="time step 3 failed: an element is inverted",
     ):
         simulate_scheme(cube, dynamics, NewtonOptions(max_halvings=0))
 
@@ -383,8 +383,8 @@ def test_a_missing_rest_state_names_time_and_element():
 @pytest.mark.parametrize(
     ("integrator", "message"),
     [
-        ("newmark", "a Newmark step failed"),
-        ("backward-euler", "the step at row . failed"),
+        ("newmark", "a time step of the Newmark method failed"),
+        ("backward-euler", "time step . failed"),
     ],
 )
 def test_a_failed_step_names_time_and_element(integrator: str, message: str):

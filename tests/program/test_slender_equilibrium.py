@@ -89,7 +89,7 @@ def test_a_limit_on_the_iterations_ends_the_search_with_an_explanation():
     solver = NewtonSolver(bar, NewtonOptions(max_iterations=2, max_halvings=1))
     with pytest.raises(
         SimulationError,
-        match="finding the rest state failed: Newton's method took more",
+        match="the search for the initial equilibrium failed: Newton's method took more",
     ):
         equilibrium(bar, theta_of(bar.body, 0.45), solver=solver)
 

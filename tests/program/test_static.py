@@ -278,9 +278,11 @@ def test_a_static_problem_tells_nothing_of_damping_before_and_after():
     )
     found = run(problem, seek_causes=False)
     assert found.estimates["gamma_r_s"].statistical_std_error is None
-    assert (
-        "the data do not determine gamma_r_s and gamma_m_1_s"
-        in found.trust.reasons
+    assert any(
+        reason.startswith(
+            "the data do not determine gamma_r_s and gamma_m_1_s:"
+        )
+        for reason in found.trust.reasons
     )
     assert isinstance(found.rollouts["block"], ForwardSimulation)
     assert found.rollouts["block"].rms_m == pytest.approx(
@@ -355,7 +357,7 @@ def test_a_relaxing_block_between_platens_creeps_towards_its_rest():
         ),
         (
             {"markers": None},
-            "nothing is measured: there are no markers, no wrench and no reading",
+            "nothing is measured: there are no markers, no measured wrench",
         ),
     ],
 )
@@ -606,7 +608,7 @@ def test_a_run_without_markers_speaks_of_forces(tmp_path):
         (
             "[[experiment]]",
             "[transcription]\nsubsteps = 3\n[[experiment]]",
-            "no steps",
+            "no time steps between equilibria",
         ),
         ('"crosshead.csv"', '"lost.csv"', "lost.csv does not exist"),
     ],

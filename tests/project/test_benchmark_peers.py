@@ -24,9 +24,9 @@ from peer_case import (
     SAMPLE_S,
     TRUTH,
     cylinder,
+    grasped_nodes,
+    grasped_positions,
     hand_motion,
-    held_nodes,
-    held_positions,
 )
 
 
@@ -88,7 +88,7 @@ def test_candidates_that_are_missing_or_fail_do_not_stop_the_others(
         is_missing = candidate is CANDIDATES["warp"]
         return "`pip install warp-lang`" if is_missing else None
 
-    monkeypatch.setattr(benchmark_peers, "measure_alone", measure)
+    monkeypatch.setattr(benchmark_peers, "measure_in_own_process", measure)
     monkeypatch.setattr(Candidate, "missing_requirement", requirement)
     monkeypatch.setattr(Candidate, "version", lambda _: None)
     out = tmp_path / "new" / "peers.md"
@@ -130,8 +130,8 @@ def test_without_mujoco_a_message_says_how_to_install_it(monkeypatch, capsys):
 
 def test_held_nodes_follow_the_hand_and_rates_are_those_of_the_motion():
     mesh = cylinder()
-    held_m = held_positions(mesh, np.array([0.0, 0.3]))
-    rest_m = mesh.points_m[held_nodes(mesh)]
+    held_m = grasped_positions(mesh, np.array([0.0, 0.3]))
+    rest_m = mesh.points_m[grasped_nodes(mesh)]
     np.testing.assert_allclose(held_m[0], rest_m, atol=1e-15)
     np.testing.assert_allclose(rest_m[:, 2], HEIGHT_M)
     along_m, angle = hand_motion(0.3).coordinates

@@ -16,16 +16,31 @@ import pytest
 import collocation_sysid
 from collocation_sysid.features.feature import Feature
 from collocation_sysid.features.registry import FEATURES, merged_fields
+from collocation_sysid.statistics.concerns import (
+    TOPICS,
+    declare_messages,
+    declare_topics,
+)
 
 PACKAGE = Path(collocation_sysid.__file__).parent
 # Largest number of files that mention a feature.
-LIMITS = {"contact": 25, "depth": 42, "wrench": 25}
+LIMITS = {"contact": 25, "depth": 34, "wrench": 25}
 # Layers that iterate over features or use neutral interfaces, with the files in which a name is
 # part of the output.
 NEUTRAL = {
     "runs": {
         "check/__init__.py": {"wrench"},
     },
+    "extras/design": {},
+    "extras/studies": {},
+    "program/forward": {},
+    "program/lifted": {},
+    "program/linear_algebra": {},
+    "program/markers": {},
+    "program/modes": {},
+    "program/reactions": {},
+    "statistics/probes": {},
+    "statistics/residuals": {},
 }
 WORDS = re.compile("|".join(LIMITS), re.IGNORECASE)
 
@@ -88,6 +103,14 @@ def test_features_have_different_fields():
         merged_fields([{"a": 1, "b": 2}, {"a": 3}])
 
 
+def test_no_message_is_declared_twice():
+    with pytest.raises(ValueError, match="the topic 'contact' is declared"):
+        declare_topics({"contact": TOPICS["contact"]})
+    code = "description/wrench-sign"
+    with pytest.raises(ValueError, match=f"the message of '{code}' is"):
+        declare_messages({code: "it has the opposite sign"})
+
+
 def test_a_feature_without_functions_contributes_nothing():
     nothing = Feature("nothing")
     assert not [*nothing.hypotheses(None)]
@@ -96,6 +119,7 @@ def test_a_feature_without_functions_contributes_nothing():
     assert not [*nothing.live_limitations(None)]
     assert nothing.simulated_hypotheses(None) == ((), ())
     assert nothing.reason_against_copy(None, None) == ""
+    assert nothing.prediction_residuals(None, None, None) is None
     assert nothing.excluded_loss(None) == 0.0
     experiment = object()
     assert nothing.for_simulation(experiment) is experiment

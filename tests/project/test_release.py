@@ -75,7 +75,7 @@ def test_the_package_is_typed():
 
 def test_every_dependency_states_the_lowest_version():
     script = runpy.run_path(str(ROOT / "scripts" / "lowest_dependencies.py"))
-    lowest, pins = script["lowest"], script["of_project"]()
+    lowest, pins = script["lowest_pins"], script["project_pins"]()
     assert len(lowest(PROJECT["dependencies"])) == len(PROJECT["dependencies"])
     assert all(re.fullmatch(r"[\w-]+==[\d.]+", pin) for pin in pins)
     assert len({pin.partition("==")[0] for pin in pins}) == len(

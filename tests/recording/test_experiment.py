@@ -123,12 +123,18 @@ def test_a_given_start_is_at_rest_unless_velocities_are_given():
     [
         ({"t_s": TIMES[:2], "markers": markers(TIMES[:2])}, "at least 3"),
         ({"t_s": TIMES**2}, "evenly spaced"),
-        ({"markers": markers(TIMES[:4])}, "markers' times differ"),
-        ({"markers": markers(TIMES + 0.003)}, "markers' times differ"),
+        ({"markers": markers(TIMES[:4])}, "sample times of the markers differ"),
+        (
+            {"markers": markers(TIMES + 0.003)},
+            "sample times of the markers differ",
+        ),
         ({"markers": markers(present=False)}, "there is no marker sample"),
         ({"markers": markers(node_count=9)}, "body of 9 nodes"),
         ({"t_s": TIMES + 1, "markers": markers(TIMES + 1)}, "poses run from"),
-        ({"grasps": (lifted([0, 1, 7]),)}, "node 7, but the body has only 5"),
+        (
+            {"grasps": (lifted([0, 1, 7]),)},
+            "node 7; expected node indices from 0 to 4",
+        ),
         (
             {"grasps": (lifted([0, 1, 2]), lifted([2, 3]))},
             "node 2 is held by the grasps 1 and 2",
@@ -147,11 +153,11 @@ def test_a_given_start_is_at_rest_unless_velocities_are_given():
         ),
         (
             {"forces": (Force([5], [0, 0, 1]),)},
-            "force acts on node 5, but the body has only 5 nodes",
+            "force acts on node 5; expected node indices from 0 to 4",
         ),
         (
             {"masses": (PointMass([7], 0.1),)},
-            "mass is attached to node 7, but the body has only 5 nodes",
+            "mass is attached to node 7; expected node indices from 0 to 4",
         ),
     ],
 )
@@ -327,7 +333,7 @@ def test_poses_and_markers_are_cut_to_the_time_they_share():
     assert found.notes == (
         "the markers were cut to the time of the poses by 0.2 s at the start and 0.4 s at the "
         "end, 60 of 100 samples: poses run from 0.2 s to 0.59 s, markers ran from 0 s to 0.99 s; "
-        "start now refers to the state at 0.2 s now",
+        "start now refers to the state at 0.2 s",
     )
     resampled = align([moving_poses(t[20:60])], table, resample_hz=50)
     np.testing.assert_allclose(resampled.t_s, np.arange(0.2, 0.581, 0.02))
@@ -391,7 +397,8 @@ def test_gaps_and_jumps_of_poses_are_told():
     (note,) = align([jumping], moving_table(t)).notes
     assert (
         note
-        == "the poses jump after t = 0.5 s; the motion is linear there, not smooth"
+        == "the poses jump after t = 0.5 s; between the two poses of a jump the motion is "
+        "interpolated linearly, not smoothly"
     )
     assert (
         align([replace(jumping, interpolation="linear")], moving_table(t)).notes

@@ -336,7 +336,7 @@ def test_printed_times_may_be_coarse_and_frames_lost(
             "13O\t200",
             ["line 10", "column Tip 1 X", "'13O'", "a blank cell"],
         ),
-        ("130\t200", "200", ["line 10", "7 cells", "8 columns"]),
+        ("130\t200", "200", ["line 10", "7 cells", "expected 8"]),
         (
             "4\t0.030",
             "4\t0.020",
@@ -409,7 +409,7 @@ def test_a_frame_without_any_marker_is_a_frame(file):
         ("NO_OF_MARKERS\t2", "NO_OF_MARKERS\ttwo", ["line 3", "'two'"]),
         ("Tip 1\tbase", "base\tbase", ["two markers are labelled 'base'"]),
         ("430\t500", "43O\t500", ["line 15", "column base X", "'43O'"]),
-        ("430\t500", "430\t500\t7", ["line 15", "7 cells", "6 columns"]),
+        ("430\t500", "430\t500\t7", ["line 15", "7 cells", "expected 6"]),
         (
             "100\t200\t300\t400",
             "100\t200\t300\t400\t1",
@@ -438,7 +438,7 @@ def test_measured_markers_come_before_those_of_a_solved_body(file):
     assert table.names == ("base", "Tip 1", "foot")
     np.testing.assert_allclose(table.positions_m[:, 0], 0.009)
     assert table.notes[0].startswith(
-        "base: has no measured columns; those of Type 'Rigid Body Ma"
+        "marker base has no measured columns; those of Type 'Rigid Body Ma"
     )
 
 
@@ -485,7 +485,7 @@ def test_older_headers_do_not_say_which_row_is_which(file):
             "130,200,left",
             ["line 11", "column Tip 1 Position Z", "'left'"],
         ),
-        ("130,200,300", "130,200", ["line 11", "22 cells", "23 columns"]),
+        ("130,200,300", "130,200", ["line 11", "22 cells", "expected 23"]),
         (
             "Tip 1,Tip 1,Tip 1,base",
             "base,base,base,base",
@@ -507,7 +507,7 @@ def test_a_motive_file_with_bodies_only_has_no_markers(file):
     text = MOTIVE.replace("Rigid Body Marker", "Bone").replace(
         "Marker,", "Bone,"
     )
-    assert "holds no markers" in refusal(
+    assert "contains no markers" in refusal(
         file(text.replace(",Marker\n", ",Bone\n"))
     )
 
@@ -527,7 +527,7 @@ def test_a_motive_file_with_bodies_only_has_no_markers(file):
         ("0.02,base", "0.02,", ["line 6", "column marker is blank"]),
         ("430,500", "43O,500", ["line 8", "column x_mm", "'43O'"]),
         ("0.03,base", ",base", ["line 8", "column t_s"]),
-        ("430,500", "430", ["line 8", "4 cells", "5 columns"]),
+        ("430,500", "430", ["line 8", "4 cells", "expected 5"]),
     ],
 )
 def test_a_bad_long_file_is_named_by_its_line(file, old, new, words):

@@ -135,7 +135,7 @@ def test_a_force_is_linear_between_its_rows_and_nothing_outside():
     ("make", "message"),
     [
         (lambda: PointMass([0], 0.0), "expected a number above 0"),
-        (lambda: PointMass([], 1.0), "found none"),
+        (lambda: PointMass([], 1.0), "empty list of nodes"),
         (lambda: Force([0], [[0, 0, 0], [0, 0, 1]]), "expected t_s"),
         (
             lambda: Force([0], [[0, 0, 0], [0, 0, 1]], [1.0, 1.0]),

@@ -175,7 +175,7 @@ def test_an_episode_of_a_dataset_makes_poses_once_the_unit_of_its_joints_is_said
     )
     address = f"{folder}#observation.state#1#arm.urdf#base>upper"
     with pytest.raises(
-        InputError, match="unit of its joints; expected #rad or #deg"
+        InputError, match="unit of the joint positions; expected #rad or #deg"
     ):
         read_poses(address)
     poses = read_poses(f"{address}#deg")
@@ -187,11 +187,12 @@ def test_an_episode_of_a_dataset_makes_poses_once_the_unit_of_its_joints_is_said
     )
     alone = dataset(tmp_path / "one", degrees, episodes=1)
     with pytest.raises(
-        InputError, match="unit of its joints; expected #rad or #deg"
+        InputError, match="unit of the joint positions; expected #rad or #deg"
     ):
         read_poses(f"{alone}#observation.state#arm.urdf#base>upper")
     with pytest.raises(
-        InputError, match="has 2 episodes; expected one, as in pick#observation"
+        InputError,
+        match="has 2 episodes; expected the index of one of them after the topic",
     ):
         read_custom_sensor(f"{folder}#observation.state")
 
@@ -551,7 +552,8 @@ def test_clouds_of_a_topic_are_read_with_their_normals(tmp_path: Path) -> None:
         normal, np.hstack([points, np.tile([0.0, 0, 1], (4, 1))])
     )
     with pytest.raises(
-        InputError, match=r"/chamber has neither depth images \(16UC1"
+        InputError,
+        match=r"/chamber has other messages; expected depth images \(16UC1",
     ):
         read_depth(Path(f"{log}#/chamber"), None, 1.0)
     with pytest.raises(
@@ -625,15 +627,15 @@ def test_images_are_rectified_where_a_word_of_their_topic_says_so(
         ),
         (
             {"shape": (4, 6), "binned": 2},
-            r"binned by \[2, 2\], .* state camera.matrix",
+            r"with binning \[2, 2\] .* state camera.matrix",
         ),
         (
             {"shape": (4, 6), "corner": 8},
-            r"the offset \[8, 8\], .* state camera.matrix",
+            r"the offset \[8, 8\] .* state camera.matrix",
         ),
         (
             {"shape": (4, 6), "distortion": np.ones(8)},
-            "8 numbers; .* state camera.distortion",
+            "8 coefficients; .* state camera.distortion",
         ),
     ],
 )
@@ -674,7 +676,7 @@ def bad_messages(of: Messages) -> dict[str, tuple]:
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
-        ("short", "61 bytes in a message; expected 4 rows of 6 times 2"),
+        ("short", "message has 61 bytes; expected 4 rows of 6 times 2"),
         (
             "rvl",
             "'16UC1; compressedDepth rvl' that is not a PNG .*: use the topic of uncompressed",
@@ -682,11 +684,11 @@ def bad_messages(of: Messages) -> dict[str, tuple]:
         ("flat", "has the columns u, v, rgb; expected x, y and z among them"),
         (
             "unknown",
-            "has the columns x of type 11, .*; expected each once, of types 1 to 8",
+            "has the fields x of type 11, .*; expected each name once, of the types 1 to 8",
         ),
         (
             "beyond",
-            "in points of 16 bytes; expected each once, of types 1 to 8, within these",
+            "in points of 16 bytes; expected each name once, of the types 1 to 8 .*within these",
         ),
     ],
 )
@@ -755,7 +757,7 @@ def test_of_messages_of_one_time_the_first_counts(tmp_path: Path) -> None:
     [
         (
             "trial#/wrenhc",
-            "there is no topic '/wrenhc'; it has /tf, /wrench; did you mean",
+            "there is no topic '/wrenhc'; expected one of the topics of the log: /tf, /wrench; did you mean",
         ),
         (
             "trial#/tf",
@@ -763,7 +765,7 @@ def test_of_messages_of_one_time_the_first_counts(tmp_path: Path) -> None:
         ),
         (
             "trial#/tf#base>tol",
-            "there is no frame 'tol'; it has base, arm, tool; did you mean",
+            "there is no frame 'tol'; expected one of base, arm, tool; did you mean",
         ),
         (
             "trial#/tf#base>tool#fast",
@@ -800,7 +802,8 @@ def test_joints_beyond_their_limits_are_refused(tmp_path: Path) -> None:
     )
     (tmp_path / "arm.urdf").write_text(URDF)
     with pytest.raises(
-        InputError, match=r"turn is at 30, beyond its limits -1.5 to 1.5 .*#deg"
+        InputError,
+        match=r"turn is at 30, outside its limits -1.5 to 1.5 .*#deg",
     ):
         read_poses(f"{log}#/joint_states#arm.urdf#base>tool")
 

@@ -291,5 +291,7 @@ def test_inconsistent_markers_are_refused(changes, message):
 
 
 def test_a_placement_beyond_the_last_node_is_refused():
-    with pytest.raises(InputError, match="node 7, but the body has 5"):
+    with pytest.raises(
+        InputError, match="node 7; expected node indices from 0 to 4"
+    ):
         replace(vertex_placement(), node_count=5)

@@ -97,7 +97,7 @@ def test_wrong_pose_columns_list_found_and_expected(file, header):
         ("0.1,0.5", "0.1,inf", ["line 3", "'inf'"]),
         ("0.1,0.5", "0.0,0.5", ["line 3", "time must increase"]),
         ("0,0,1,0\n", "0,0,1,1\n", ["line 3", "norm 1.41421"]),
-        ("0.1,0.5", "0.5", ["line 3", "7 cells", "8 columns"]),
+        ("0.1,0.5", "0.5", ["line 3", "7 cells", "expected 8"]),
     ],
 )
 def test_a_bad_pose_is_named_by_its_line(file, found, replacement, words):
@@ -161,7 +161,7 @@ def test_columns_of_markers_not_asked_for_may_hold_anything(file):
         ("1.5,", "1.5e,", ["line 3", "column tip_x", "'1.5e'"]),
         ("0.2,", "0.05,", ["line 4", "t_s = 0.05 follows 0.1"]),
         ("0.2,", ",", ["line 4", "column t_s"]),
-        ("2,2,3", "2,2,3,3", ["line 4", "8 cells", "7 columns"]),
+        ("2,2,3", "2,2,3,3", ["line 4", "8 cells", "expected 7"]),
         ("base_z", "base_w", ["line 1", "unknown base_w", "missing base_z"]),
         ("base_x", "tip_x", ["line 1", "missing base_x", "repeated tip_x"]),
         ("t_s", "frame", ["line 1", "unknown frame", "missing t_s"]),
@@ -248,7 +248,7 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr("collocation_sysid.common.files.os.replace", fail)
     with pytest.raises(
-        InputError, match=r"poses\.csv: cannot be written: disk full"
+        InputError, match=r"poses\.csv: this cannot be written: disk full"
     ):
         write_poses_csv(path, PoseSequence.fixed())
     assert path.read_text() == "old"

@@ -215,7 +215,7 @@ def test_a_template_does_without_a_marker_that_is_not_seen(rng):
         (
             "abc",
             (5.0, 6.0),
-            "holds no sample; the markers run from 0 s to 0.99 s",
+            "contains no sample; expected a window within the times of the markers, from 0 s to 0.99 s",
         ),
         ("ab", (0.0, 0.5), "at least three"),
     ],

@@ -325,9 +325,13 @@ def test_nothing_is_written_through_a_link(tmp_path):
     (tmp_path / "later").symlink_to("missing")
     before = listing(tmp_path)
     for name, where in (("run", "precious"), ("later", "missing")):
-        with pytest.raises(InputError, match=f"{name}: is a link to {where}"):  # noqa: SIM117
-            with replaced_folder(tmp_path / name):
-                pytest.fail("the work was started")
+        with (
+            pytest.raises(
+                InputError, match=f"{name}: this is a link to {where}"
+            ),
+            replaced_folder(tmp_path / name),
+        ):
+            pytest.fail("the work was started")
     assert listing(tmp_path) == before
 
 
@@ -337,7 +341,7 @@ def test_a_link_in_an_earlier_run_keeps_it_from_being_replaced(tmp_path):
     (target / "old.png").rename(tmp_path / "old.png")
     (target / "old.png").symlink_to(tmp_path / "old.png")
     with (
-        pytest.raises(InputError, match=r"old\.png in it is a link"),
+        pytest.raises(InputError, match=r"old\.png in this folder is a link"),
         replaced_folder(target),
     ):
         pytest.fail("the work was started")

@@ -43,7 +43,7 @@ from collocation_sysid.result.camera_overlays import (
     undeformed_rows,
 )
 from collocation_sysid.result.pictures.album import all_pictures
-from collocation_sysid.result.pictures.depth_comparison_picture import (
+from collocation_sysid.result.pictures.camera_pictures import (
     depth_picture,
 )
 from collocation_sysid.result.replay import MotionRecord

@@ -148,7 +148,9 @@ def test_an_unsuccessful_coarse_start_is_noted_and_solved_directly():
     limit = replace(COARSE, max_iterations=2)
     solution = solve(problem, limit)
     assert solution.status is Status.ITERATION_LIMIT
-    assert solution.notes[0].startswith("no coarse start: the solve on ")
+    assert solution.notes[0].startswith(
+        "the search was not started on a coarser mesh: the solve on "
+    )
     direct = solve(problem, replace(limit, coarse_start=False))
     assert solution.q == pytest.approx(direct.q)
 
@@ -157,7 +159,9 @@ def test_a_mesh_that_cannot_be_coarser_is_noted():
     problem = problem_of(measured(hung_cube(10, divisions=(1, 1, 2))))
     solution = solve(problem, ReducedSpace(coarse_start_nodes=10))
     assert solution.status is Status.CONVERGED
-    assert solution.notes[0].startswith("no coarse start: only ")
+    assert solution.notes[0].startswith(
+        "the search was not started on a coarser mesh: only "
+    )
 
 
 def test_small_bodies_and_given_starts_have_no_coarse_start():

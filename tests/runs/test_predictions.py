@@ -321,7 +321,7 @@ def test_the_nearest_recording_is_copied_or_the_output_says_why_none_is():
     assert isinstance(found, CopyError)
     assert found.copied == "near"
     assert nearest_recording_error(new, [swing("long", 0.0, 2, steps=17)]) == (
-        "no fitted recording can be copied (long: 18 samples instead of 17)"
+        "no fitted recording has the same samples (long: 18 samples instead of 17)"
     )
     faster = replace(
         near,

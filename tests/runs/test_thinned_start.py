@@ -120,8 +120,9 @@ def test_a_thinned_start_that_fails_is_replaced_by_the_complete_search(
 
     monkeypatch.setattr(solving, "require_determined", fail)
     solution = cs.solve(problem())
-    assert "no start with fewer points: 300 depth points fail" in (
-        solution.notes
+    assert (
+        "the search was not started with fewer points: 300 depth points fail"
+        in (solution.notes)
     )
     assert solution.status.converged
     assert compared(solution) == len(depth().clouds[0])

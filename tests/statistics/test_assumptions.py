@@ -7,7 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from assumed_twins import wrong
+from assumed_twins import with_wrong_assumptions
 from kit.problems import EDGE_M, box, hung_cube, smooth_poses
 from kit.static import PRESSED_M, TIMES, block
 
@@ -68,7 +68,7 @@ def swung(air_density_kg_m3: float = 0.0) -> Experiment:
     """A cube hung from its top face, swayed and turned from rest, and its markers as simulated."""
     experiment = hung_cube(24, air_density_kg_m3=air_density_kg_m3)
     body = Body(experiment.body.mesh, density_kg_m3=60.0)
-    return wrong(replace(experiment, body=body), VALUES, {})
+    return with_wrong_assumptions(replace(experiment, body=body), VALUES, {})
 
 
 def parameters(**stated: float | Unknown | Tied) -> Parameters:
@@ -97,7 +97,9 @@ def changed(
 def test_markers_change_as_where_the_body_is_as_the_assumption_fears(name):
     experiment, off = swung(AIR_KG_M3 * (name in OF_AIR)), OFF[name]
     tracks = [
-        wrong(experiment, VALUES, {name: way}).markers.positions_m
+        with_wrong_assumptions(
+            experiment, VALUES, {name: way}
+        ).markers.positions_m
         for way in (off, 0.0)
     ]
     simulated = (tracks[0] - tracks[1]) / off

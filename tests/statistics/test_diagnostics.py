@@ -90,7 +90,7 @@ def test_an_oscillation_of_its_own_is_a_vibration():
     swing[:, 1] = 10 * np.sin(2 * np.pi * 31.0 * T_S)
     found = diagnosis(noise() + swing)
     assert found.frequency_hz == pytest.approx(31.0, abs=0.4)
-    assert "unlike the motion" in found.sentence
+    assert "not a frequency of the motion" in found.sentence
 
 
 def test_residuals_at_the_start_tell_of_the_release():

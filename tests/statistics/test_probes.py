@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from assumed_twins import wrong
+from assumed_twins import with_wrong_assumptions
 from kit.problem_files import run_command, write_problem
 from kit.problems import GUESS, hung_cube
 from kit.problems import TRUTH as LAME
@@ -45,7 +45,9 @@ def swung(fault: str = "", off: float = 0.0) -> Problem:
         body=Body(hung.body.mesh, density_kg_m3=60.0),
         nuisance=Nuisance.none(),
     )
-    recorded = wrong(hung, TRUTH, {} if fault == "clock_rate" else {fault: off})
+    recorded = with_wrong_assumptions(
+        hung, TRUTH, {} if fault == "clock_rate" else {fault: off}
+    )
     tracks = recorded.markers.positions_m
     if fault == "clock_rate":  # cameras' times are too large
         tracks = CubicSpline(recorded.t_s, tracks)(recorded.t_s * (1 - off))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from assumed_twins import wrong
+from assumed_twins import with_wrong_assumptions
 from kit.problems import (
     EDGE_M,
     IDEAL,
@@ -85,7 +85,9 @@ def swung(fault: str = "", off: float = 0.0, samples: int = 60) -> Problem:
         ),
         grasps=(Grasp(hung.grasps[0].nodes, smooth_poses(fine_s)),),
     )
-    recorded = wrong(fine, TRUTH, {fault: off} if fault == DRIFT else {})
+    recorded = with_wrong_assumptions(
+        fine, TRUTH, {fault: off} if fault == DRIFT else {}
+    )
     tracks = recorded.markers.positions_m[::FINER]
     if fault == CLOCK:  # the times of the cameras are too large
         tracks = CubicSpline(hung.t_s, tracks)(hung.t_s * (1 - off))

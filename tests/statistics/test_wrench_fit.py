@@ -262,5 +262,7 @@ def test_equilibria_under_gravity_tell_the_density_too():
     found = ReducedSpace()(Problem([felt], unknown).collocation()).parameters
     for name, true in {"mu_pa": TRUTH["mu_pa"], "density_kg_m3": 30.0}.items():
         assert found[name] == pytest.approx(true, rel=1e-6)
-    with pytest.raises(cs.InputError, match="density_kg_m3: there is no guess"):
+    with pytest.raises(
+        cs.InputError, match="density_kg_m3: this parameter has no guess"
+    ):
         cs.run(Problem([felt], unknown | {"density_kg_m3": cs.Unknown()}))

@@ -261,7 +261,10 @@ def test_a_force_across_the_velocity_is_found(method: str):
 @pytest.mark.parametrize(
     ("function", "said"),
     [
-        ("wild", r"force 'wild' has the shape \(2, 1\); expected \(3, 1\)"),
+        (
+            "wild",
+            r"force 'wild' returns an expression of the shape \(2, 1\); expected \(3, 1\)",
+        ),
         (
             "gone",
             "there is no function 'gone'; expected one of drag, lift, wild",
@@ -288,7 +291,7 @@ def test_a_force_on_faces_in_a_file_that_no_face_has_is_one_message(tiny):
     done = run_command("check", "problem.toml", "--allow-code")
     assert done.code == 2
     assert (
-        "force 'drag' is on faces, but none of the surface has all"
+        "force 'drag' acts on faces of the surface, but no face has all"
         in " ".join(done.err.split())
     )
 
@@ -307,7 +310,8 @@ def test_a_constant_that_the_body_has_is_refused():
         return -mu_pa * v
 
     with pytest.raises(
-        InputError, match="'mu_pa', whose name another part of the body uses"
+        InputError,
+        match="'mu_pa', but another constant of the body has the same name",
     ):
         cs.Body(
             hung_cube().body.mesh,

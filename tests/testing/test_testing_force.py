@@ -144,7 +144,8 @@ def test_a_problem_file_gives_the_same_force_or_the_check_fails(tmp_path):
     check_force(drag, file=file)
     file.write_text(MINE.replace("-0.6", "-0.5"))
     with pytest.raises(
-        AssertionError, match=r"'drag': mine.py gives another one in a"
+        AssertionError,
+        match=r"'drag': the one that a problem file reads from mine.py has other",
     ):
         check_force(drag, file=file)
     file.write_text(MINE.replace("def drag", "def drags"))

@@ -161,7 +161,7 @@ def test_a_problem_file_gives_the_same_material_or_the_check_fails(tmp_path):
     check_material(rubber, file=file)
     with pytest.raises(
         AssertionError,
-        match=r"mine.py gives another one in a problem file, entr",
+        match=r"the one that a problem file reads from mine.py has other values, entr",
     ):
         check_material(rubber, file=file, function="softer")
 

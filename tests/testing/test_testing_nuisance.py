@@ -119,7 +119,7 @@ def test_parameters_of_a_user_pass(name: str):
     [
         (
             {"reading": lambda y, values, t_s, data: 1.01 * y + values},
-            r"'mine': zero changes the reading of a marker, entry \(\d,\); found .*, expected",
+            r"'mine': the value zero changes the reading of a marker, entry \(\d,\); found .*, expected",
         ),
         (
             {
@@ -131,11 +131,11 @@ def test_parameters_of_a_user_pass(name: str):
         ),
         (
             {"reading": None, "clock": lambda values, t_s, data: values + 1e-3},
-            r"'mine': zero changes the clock, entry \(0,\); found 0.001, expected 0",
+            r"'mine': the value zero changes the clock, entry \(0,\); found 0.001, expected 0",
         ),
         (
             {"applies": lambda experiment: False},
-            "the recording 'check' does not have it; found no",
+            "the recording 'check' has no value of this parameter; found no",
         ),
     ],
 )
@@ -162,6 +162,6 @@ def test_a_problem_file_gives_the_same_parameter_or_the_check_fails(tmp_path):
     file.write_text(MINE.replace("0.02", "0.03"))
     with pytest.raises(
         AssertionError,
-        match=r"mine.py gives another one in a problem file, entry",
+        match=r"the one that a problem file reads from mine.py has other values, entry",
     ):
         check_nuisance(ROWS["scale"], file=file, name_in_file="scale")

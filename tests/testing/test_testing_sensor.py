@@ -125,6 +125,7 @@ def test_a_problem_file_gives_the_same_reading_or_the_check_fails(tmp_path):
     check_sensor(SENSORS["foil"], file=file)
     file.write_text(MINE.replace("0.06", "0.05"))
     with pytest.raises(
-        AssertionError, match=r"'foil': mine.py gives another one in a"
+        AssertionError,
+        match=r"'foil': the one that a problem file reads from mine.py has other",
     ):
         check_sensor(SENSORS["foil"], file=file)

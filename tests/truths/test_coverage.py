@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2, norm
-from study_coverage import CASES, KINDS, Outcome, run
+from study_coverage import CASES, ERROR_MODELS, CoverageOutcome, run
 
 from collocation_sysid.statistics.uncertainty import ErrorModel
 
@@ -18,13 +18,13 @@ SIGMA_M = 1e-3
 # What chance leaves out in one of a thousand tests.
 RARE = 1e-3
 NOISES = {"white": CASES[:2], "autoregressive": CASES[2:]}
-AUTO = KINDS.index(ErrorModel())
-ROBUST = KINDS.index(ErrorModel("estimated"))
-TEXTBOOK = KINDS.index(ErrorModel("estimated", "independent"))
+AUTO = ERROR_MODELS.index(ErrorModel())
+ROBUST = ERROR_MODELS.index(ErrorModel("estimated"))
+TEXTBOOK = ERROR_MODELS.index(ErrorModel("estimated", "independent"))
 
 
 @cache
-def outcomes(noise: str, twins: int = TWINS) -> list[Outcome]:
+def outcomes(noise: str, twins: int = TWINS) -> list[CoverageOutcome]:
     return [
         run(case, SIGMA_M, (number, twin))
         for number, case in enumerate(NOISES[noise])
@@ -35,7 +35,11 @@ def outcomes(noise: str, twins: int = TWINS) -> list[Outcome]:
 def held(noise: str, kind: int, twins: int = TWINS) -> np.ndarray:
     """Share of the intervals that hold the truth, by parameter."""
     return np.mean(
-        [outcome.held[kind, :4] for outcome in outcomes(noise, twins)], axis=0
+        [
+            outcome.contains_truth[kind, :4]
+            for outcome in outcomes(noise, twins)
+        ],
+        axis=0,
     )
 
 

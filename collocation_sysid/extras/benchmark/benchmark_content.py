@@ -93,7 +93,8 @@ def _unchanged(folder: Path, name: str) -> Path:
     file = folder / name
     if file.exists() and not is_written_here(file, folder):
         raise InputError(
-            f"was changed after it was written, so that scores would not be comparable; {REMEDY}",
+            "this file was changed after it was written, so that scores would not be comparable; "
+            f"{REMEDY}",
             file,
         )
     return file
@@ -152,7 +153,7 @@ def _read_signals(
             )
         except OSError as error:
             raise InputError(
-                f"cannot be read ({error.strerror}); {REMEDY}", file
+                f"this file cannot be read ({error.strerror}); {REMEDY}", file
             ) from error
     measured = Signal(
         recording["quantity"],

@@ -189,8 +189,8 @@ def _parameter_values(
         value = identified.get(item.name, item.guess if item.is_fixed else None)
         if value is None:
             raise InputError(
-                "is neither fixed nor among the constants of the body's catalogue entry; expected "
-                f"a fixed value, or one of {listed(identified)}",
+                "this parameter is neither fixed nor among the constants of the body's catalogue "
+                f"entry; expected a fixed value, or one of {listed(identified)}",
                 problem.path,
                 where=f"parameters.{item.name}",
             )

@@ -99,14 +99,15 @@ def _read_table(file: Path, measured: Signal) -> tuple[Array, Array]:
             rows = [row for row in csv.reader(lines)]
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(
-            f"cannot be read ({reason(error)}); expected a CSV table", file
+            f"this file cannot be read ({reason(error)}); expected a CSV table",
+            file,
         ) from error
     header = [name.strip() for name in rows[0]] if rows else []
     needed = (measured.key, *measured.columns)
     for name in needed:
         if header.count(name) != 1:
             found = excerpt(", ".join(header)) or "no columns"
-            what = "twice" if name in header else f"not in it: {found}"
+            what = "twice" if name in header else f"missing; found {found}"
             raise InputError(
                 f"the column {name!r} is {what}{hint_at(name, header)}; expected the columns "
                 f"{excerpt(','.join(needed))}, separated by commas",
@@ -178,13 +179,13 @@ def _read_archive(file: Path, measured: Signal) -> tuple[Array, Array]:
         if isinstance(error, InputError):
             raise error.located(file) from error
         raise InputError(
-            f"cannot be read ({reason(error)}); expected an archive of numpy.savez",
+            f"this file cannot be read ({reason(error)}); expected an archive of numpy.savez",
             file,
         ) from error
     for name in (measured.key, VALUES_NAME):
         if name not in arrays:
             raise InputError(
-                f"the array {name!r} is not in it; found {listed(arrays) or 'no arrays'}; expected "
+                f"the array {name!r} is missing; found {listed(arrays) or 'no arrays'}; expected "
                 f"{measured.key} and {VALUES_NAME}",
                 file,
             )
@@ -252,7 +253,8 @@ def _rows_of_samples(file: Path, keys: Array, measured: Signal) -> Index:
     needed = measured.keys
     if not keys.size:
         raise InputError(
-            f"has no rows; expected one for each of {needed.size} samples", file
+            f"the prediction has no rows; expected one for each of {needed.size} samples",
+            file,
         )
     rows = np.abs(keys[None, :] - needed[:, None]).argmin(axis=1)
     interval = np.diff(needed).min(initial=1.0)

@@ -400,7 +400,8 @@ def design_motion(
     recording.highest_hz(limits)
     if not problem.parameters.free:
         raise InputError(
-            "every parameter is fixed; expected one to estimate", problem.path
+            "every parameter is fixed; expected at least one that is estimated",
+            problem.path,
         )
     if add:
         say("identifying the parameters from the existing recordings")
@@ -601,7 +602,8 @@ def _select_experiment(problem: Problem, name: str | None) -> Experiment:
     moving = [each for each in problem.experiments if not each.is_static]
     if not moving:
         raise InputError(
-            "every experiment is static; expected one that moves", problem.path
+            "every experiment is static; expected at least one that moves",
+            problem.path,
         )
     if name is None:
         return moving[0]
@@ -615,8 +617,8 @@ def _require_guesses(problem: Problem) -> None:
     if names := problem.parameters.list_names_without_guess():
         key = f"parameters.{names[0]}"
         raise InputError(
-            "has no guess, but a motion is designed for a value of each parameter; expected "
-            f"--set {key}.guess=VALUE, or --add to identify it first",
+            "this parameter has no guess, but a motion is designed for a value of each parameter; "
+            f"expected --set {key}.guess=VALUE, or --add to identify the parameter first",
             problem.path,
             where=key,
         )

@@ -389,19 +389,20 @@ class FutureRecording:
         template = self.template
         if template.is_static:
             raise InputError(
-                "is static; expected one that moves, to design a motion for"
+                "the experiment is static; expected one that moves, to design a motion for"
             )
         if len(template.grasps) != 1:
             raise InputError(
-                f"has {len(template.grasps)} grasps; expected one, whose motion is designed"
+                f"the experiment has {len(template.grasps)} grasps; expected one, whose motion is "
+                "designed"
             )
         (grasp,) = template.grasps
         if grasp.axes != "xyz" or not (
             np.isinf(grasp.from_s) and np.isinf(grasp.until_s)
         ):
             raise InputError(
-                "has a grasp that holds only some axes, or a part of the time; expected one that "
-                "holds throughout"
+                "the grasp holds only some axes, or only a part of the time; expected one that holds "
+                "all axes throughout"
             )
         if not 3 <= self.count_samples() <= MOST_SAMPLES:
             raise InputError(

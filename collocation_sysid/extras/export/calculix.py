@@ -388,7 +388,9 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
             "no displacements written"
         ]
         raise InputError(
-            f"CalculiX failed: {messages[0].strip()}", folder / DECK
+            f"CalculiX could not compute the exported model ({messages[0].strip()}); run ccx on "
+            "this deck to see its output",
+            folder / DECK,
         )
     (*_, ours), (*_, forces) = equilibria(body, len(times))
     sag_m = longest_displacement_m(ours)

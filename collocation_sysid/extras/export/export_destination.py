@@ -199,7 +199,7 @@ def _require_replaceable(file: Path) -> None:
     """
     if file.is_dir() and not file.is_symlink():
         raise InputError(
-            "is a folder; expected a file to write", file, where="--to"
+            "this is a folder; expected a file to write", file, where="--to"
         )
     if (file.exists() or file.is_symlink()) and not is_written_here(file):
         raise InputError(

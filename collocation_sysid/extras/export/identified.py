@@ -577,9 +577,7 @@ class IdentifiedBody:
 
 def _not_fitted(experiment: str, names: Sequence[str]) -> str:
     """Return the message that an experiment is none of the fitted ones, whose `names` it lists."""
-    return (
-        f"no experiment {experiment!r} was fitted; expected {', '.join(names)}"
-    )
+    return f"no experiment {experiment!r} was fitted; expected one of {', '.join(names)}"
 
 
 def _require_stress_free(problem: Problem) -> None:

@@ -304,7 +304,9 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
         model = mujoco.MjModel.from_xml_path(str(folder / MODEL))
     except ValueError as error:
         raise InputError(
-            f"MuJoCo refuses the model: {error}", folder / MODEL
+            f"MuJoCo refuses the exported model ({error}); export to another format, such as "
+            "calculix or json",
+            folder / MODEL,
         ) from error
     compared = [_compare_first_frequency(body, mujoco, model=model)]
     if not body.experiment.is_static and body.simulated_m is not None:

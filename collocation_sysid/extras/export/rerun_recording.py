@@ -80,7 +80,8 @@ def write_rerun(
     replays = [replay for replay in replays if replay.has_shapes()]
     if not replays:
         raise InputError(
-            "no experiment of this run has a stored motion of a body; expected one with a mesh",
+            "no experiment of this run has a stored motion of a body with a mesh; expected a run "
+            "with such an experiment",
             run,
         )
     stresses = [_stress_on_faces(run, replay) for replay in replays]

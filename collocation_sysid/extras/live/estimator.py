@@ -368,7 +368,7 @@ class LiveEstimator:
             else:
                 self._restart()
                 notes.append(
-                    "restarted after a gap in the poses, assuming that the body is at rest"
+                    "the estimation restarted after a gap in the poses, assuming that the body is at rest"
                 )
         rows = self._rows_before_motion(frame, notes)
         buffered = self._buffered(frame)
@@ -579,7 +579,10 @@ class LiveEstimator:
         """
         self.counts["wild"] += int(is_outlier.sum())
         names = ", ".join(self.names[m] for m in np.flatnonzero(is_outlier))
-        return f"markers ignored as outliers: {names}"
+        return (
+            "markers ignored in this frame, because they are implausibly far from the grasp: "
+            f"{names}"
+        )
 
     def _compute_rows(
         self, rows: Sequence[LoggedRow], squares: list[Array]
@@ -1291,7 +1294,8 @@ class LiveEstimator:
             if p is None:
                 self.search = None
                 notes.append(
-                    "found no initial values over a range of stiffnesses"
+                    "no initial values were found over a range of stiffnesses: test the problem file and "
+                    "a recording with the command check"
                 )
                 return None
         elif first_pass.has_failed:

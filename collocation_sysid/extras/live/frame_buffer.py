@@ -189,7 +189,7 @@ class FrameBuffer:
                 [],
                 [],
                 notes=[
-                    f"a frame at {t_s:.6g} s was received before: this one is ignored"
+                    f"a frame at {t_s:.6g} s was received before: the second one is ignored"
                 ],
             )
         late = t_s < self.last_s
@@ -200,7 +200,9 @@ class FrameBuffer:
                 return BufferedFrame(
                     [],
                     [],
-                    notes=[f"the frame at {t_s:.6g} s is too late: ignored"],
+                    notes=[
+                        f"the frame at {t_s:.6g} s arrived too late and is ignored"
+                    ],
                 )
             self.counts["unordered"] += 1
             notes.append(
@@ -223,7 +225,7 @@ class FrameBuffer:
             if pose is not None and self._is_jump(t_s, pose[0]):
                 pose = None
                 notes.append(
-                    f"the pose at {t_s:.6g} s is implausibly far from the last one: ignored"
+                    f"the pose at {t_s:.6g} s is ignored, because it is implausibly far from the last one"
                 )
             notes += self._note_gaps(t_s)
             self.last_s = t_s
@@ -265,7 +267,8 @@ class FrameBuffer:
         if missing > 0:
             self.counts["dropped"] += missing
             notes.append(
-                f"{missing} frames before {t_s:.6g} s are missing: bridged by interpolation"
+                f"{missing} frames before {t_s:.6g} s are missing: the motion of the grasp is "
+                "interpolated there"
             )
         if abs(offset - round(offset)) > TIME_TOLERANCE_SAMPLES:
             if not self.counts["off the grid"]:

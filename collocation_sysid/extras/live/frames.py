@@ -224,7 +224,11 @@ def parse_custom_readings(
     collected = []
     for name, samples in readings.items():
         if name not in names:
-            known = ", ".join(names) or "none, as the problem has none"
+            known = (
+                f"one of {', '.join(names)}"
+                if names
+                else "none, because the problem has no readings"
+            )
             raise InputError(
                 f"found a reading {reprlib.repr(name)}; expected {known}"
             )
@@ -340,7 +344,7 @@ def _parse_samples(
             if set(sample) != set(_SAMPLE_KEYS):
                 keys = ", ".join(map(reprlib.repr, sample)) or "nothing"
                 raise InputError(
-                    f"a sample of {what} has {keys}; expected t_s and values"
+                    f"a sample of {what} has the keys {keys}; expected t_s and values"
                 )
             at_s = parse_time(sample["t_s"])
             values = sample["values"]
@@ -492,7 +496,7 @@ class FrameReader:
         """
         if unknown := [key for key in json_object if key not in _KEYS]:
             raise InputError(
-                f"found the key {reprlib.repr(unknown[0])}; expected {', '.join(_KEYS)}"
+                f"found the key {reprlib.repr(unknown[0])}; expected some of {', '.join(_KEYS)}"
             )
         if "t_s" not in json_object:
             raise InputError("there is no t_s; expected the time in seconds")
@@ -573,7 +577,8 @@ class FrameReader:
             return None
         if len(cells) != len(self._columns):
             raise InputError(
-                f"{len(cells)} cells; expected {len(self._columns)}"
+                f"the line has {len(cells)} cells; expected {len(self._columns)}, as many as the "
+                "header has columns"
             )
         by_name = dict(zip(self._columns, map(_parse_cell, cells), strict=True))
         poses = [
@@ -648,8 +653,8 @@ class FrameReader:
         ]
         if missing := [name for name in needed if name not in columns]:
             raise InputError(
-                f"neither a JSON object nor a header with the column {missing[0]!r}; "
-                f"expected {', '.join(needed)} and the markers' columns"
+                f"the first line is neither a JSON object nor a header with the column {missing[0]!r}; "
+                f"expected {', '.join(needed)} and the columns of the markers"
             )
         known = {
             *needed,
@@ -676,14 +681,16 @@ def _parse_json(text: str) -> Mapping[str, Any]:
         return json.loads(text)
     except json.JSONDecodeError as error:
         raise InputError(
-            f"not valid JSON: {error.msg} at column {error.colno}"
+            f"this line is not valid JSON ({error.msg} at column {error.colno}); expected one JSON "
+            "object per line"
         ) from error
     except (
         ValueError,
         RecursionError,
     ) as error:  # Python's limits of digits and of nesting
         raise InputError(
-            "not a frame: a number is too long, or brackets are nested too deeply"
+            "this line is not a frame: a number is too long, or brackets are nested too deeply; "
+            f"expected one JSON object with {', '.join(_KEYS)}"
         ) from error
 
 

@@ -56,8 +56,8 @@ def _only_experiment(problem: Problem) -> Experiment:
 
     if len(fitted) != 1:
         raise InputError(
-            f"{len(fitted)} experiments are fitted; a live estimate has one, expected the others "
-            "to be removed or validation = true",
+            f"found {len(fitted)} experiments that are fitted; expected one, because a live "
+            "estimate has one: remove the others, or give them validation = true",
             problem.path,
             where="experiment",
         )

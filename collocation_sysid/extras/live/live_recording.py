@@ -49,7 +49,7 @@ def require_recordable(file: Path) -> None:
         )
     if file.exists() or file.is_symlink():
         raise InputError(
-            "exists, and live recordings are not overwritten; choose another name",
+            "this file exists, and live recordings are not overwritten; choose another name",
             file,
             where="--rerun",
         )

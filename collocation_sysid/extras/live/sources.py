@@ -90,7 +90,8 @@ def read_problem(
     if not recording.is_dir():
         return Problem.read(recording, overrides, allow_code=allow_code)
     home = Result.read(recording).problem_folder(
-        recording, "which a replay needs"
+        recording,
+        "which a replay needs: replay its problem from a problem file",
     )
     return Problem.read(
         recording / "problem.toml",

@@ -314,7 +314,7 @@ def file_variants(
     for problem, measured in zip(problems[1:], others, strict=True):
         if measured != first:
             raise InputError(
-                f"it fits {_measured_text(measured)}, but {problems[0].path} fits "
+                f"this file fits {_measured_text(measured)}, but {problems[0].path} fits "
                 f"{_measured_text(first)}; expected the same recordings and samples in all files",
                 problem.path,
             )
@@ -374,7 +374,7 @@ def _require_region(
     """
     names = [each["name"] for each in body.get("region", [])]
     if region is not None and not names:
-        message = f"found {region!r}; expected none: it has no regions"
+        message = f"found the region {region!r}, but the object has no regions; leave out --region"
         raise InputError(message, path, where="--region")
     if region is not None:
         require_among(region, names, source=path, where="--region")
@@ -387,9 +387,9 @@ def _require_region(
             else f"region '{other_region}'"
         )
         expected = (
-            "none with --region"
+            "no --region, so that --prony varies these"
             if other_region is None
-            else f"--region {other_region}"
+            else f"--region {other_region}, so that --prony varies these"
         )
         raise InputError(
             f"found branches of {whose}; expected {expected}",

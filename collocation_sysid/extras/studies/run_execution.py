@@ -217,7 +217,7 @@ def _crash_message(code: int, stderr: IO[bytes]) -> str:
     its error output, if there is any. `stderr` is the file with that output, which is read from its
     start.
     """
-    cause = killed_by(code) or f"its process ended with code {code}"
+    cause = killed_by(code) or f"the process ended with code {code}"
     stderr.seek(0)
     lines = stderr.read()[-2000:].decode(errors="replace").split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), "")
@@ -427,7 +427,7 @@ def _result_record(
         return {
             **planned.as_dict(),
             "outcome": CRASHED,
-            "message": f"its worker was lost ({type(error).__name__}: {error})",
+            "message": f"the worker was lost ({type(error).__name__}: {error})",
             "attempts": 1,
             "time_limit_s": limits.time_limit_s,
             "wall_s": None,

@@ -118,7 +118,7 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
         ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            f"cannot be read: {error}", path, where="--truth"
+            f"this file cannot be read: {error}", path, where="--truth"
         ) from error
     table = content.get("parameters", content)
     if not isinstance(table, Mapping):
@@ -224,7 +224,7 @@ def require_few(count: int, option: str, noun: str) -> None:
     if count > MOST_RUNS:
         number = f"{count:,}" if count < 10**15 else "more than 10¹⁵"
         raise InputError(
-            f"asks for {number} {noun}; expected at most {MOST_RUNS:,}",
+            f"found {number} {noun}; expected at most {MOST_RUNS:,}: give fewer values",
             None,
             where=option,
         )

@@ -166,8 +166,8 @@ class Starts(Options):
             centre = truth.get(item.name, item.guess)
             if centre is None:
                 raise InputError(
-                    "has neither a guess nor a true value around which initial guesses could be "
-                    "distributed; expected one, or --starts 1",
+                    "this parameter has neither a guess nor a true value around which initial guesses "
+                    "could be distributed; expected one of them, or --starts 1",
                     problem.path,
                     where=f"parameters.{item.name}",
                 )

@@ -109,11 +109,14 @@ def _requested_evaluator(choice: str) -> str:
     InputError
         If choice or variable is unknown.
     """
+    origin = "evaluator"
     if choice == "auto":
-        choice = os.environ.get("COLLOCATION_SYSID_EVALUATOR", "auto")
+        variable = "COLLOCATION_SYSID_EVALUATOR"
+        choice = os.environ.get(variable, "auto")
+        origin = f"the environment variable {variable}"
     if choice not in EVALUATORS:
         raise InputError(
-            f"no evaluator {choice!r}; available: {', '.join(EVALUATORS)}"
+            f"{origin} is {choice!r}; expected one of {', '.join(EVALUATORS)}"
         )
     return choice
 
@@ -140,7 +143,7 @@ def make_evaluator(batch: KernelBatch, name: str) -> Evaluator:
     except RuntimeError as error:  # what llvmlite raises
         kernel = batch.kernel.pieces.name()
         raise VectorCodeError(
-            f"LLVM cannot compile the {kernel} kernel ({error})"
+            f"LLVM cannot compile the {kernel} function of the material ({error})"
         ) from error
 
 
@@ -209,9 +212,7 @@ class EvaluatorChoice:
         name.
         """
         if not self._may_yield:
-            message = (
-                f"{error.message}; choose evaluator='casadi' for this material"
-            )
+            message = f"{error.message}; choose evaluator = 'casadi' for this material"
             raise VectorCodeError(message) from error
         self.name = "casadi"
         self.notes += (

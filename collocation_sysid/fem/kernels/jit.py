@@ -346,8 +346,9 @@ def _is_trusted(folder: Path) -> bool:
 def _warn_once(fault: str) -> None:
     """Warn with a `RuntimeWarning` that compiled kernels are not stored, once for each reason."""
     warnings.warn(
-        f"compiled kernels are not cached: {fault}; set COLLOCATION_SYSID_CACHE to a folder of "
-        "your own (chmod 700)",
+        f"compiled code is not cached, so that each run compiles it again: {fault}; set the "
+        "environment variable COLLOCATION_SYSID_CACHE to a folder that only you can write "
+        "(chmod 700)",
         RuntimeWarning,
         stacklevel=2,
     )

@@ -79,8 +79,8 @@ def _require_own_names(damping: DampingLaw, material: Material) -> None:
     for constant in damping.constants:
         if constant.name in taken:
             raise InputError(
-                f"the damping law {damping.name!r} has the constant {constant.name!r}, whose name "
-                "another constant has; expected another name"
+                f"the damping law {damping.name!r} has the constant {constant.name!r}, but another "
+                "constant of the body has the same name; expected another name"
             )
         taken.add(constant.name)
 
@@ -124,8 +124,8 @@ def viscous_stress(
             ) from error
         if density.shape != (1, 1):
             raise InputError(
-                f"the potential of the damping law {damping.name!r} has the shape "
-                f"{density.shape}; expected one number"
+                f"the potential of the damping law {damping.name!r} returns an expression of the shape "
+                f"{density.shape}; expected one number, (1, 1)"
             )
         stress += ca.gradient(density, F)
     if damping.stress is not None:

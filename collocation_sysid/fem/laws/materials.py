@@ -93,7 +93,9 @@ class Material:
             )
         if unused := sorted(set(definitions) - set(arguments)):
             raise InputError(
-                f"material {name!r} has no constant {unused[0]!r}{hint_at(unused[0], arguments)}"
+                f"material {name!r}: the function has no argument for the given constant "
+                f"{unused[0]!r}; expected its name among the arguments "
+                f"{', '.join(arguments)}{hint_at(unused[0], arguments)}"
             )
         material = cls(
             name,
@@ -175,16 +177,20 @@ class Material:
             o.full() for o in law(np.eye(3).ravel(), sample_values)
         )
         scale = np.abs(stiffness).max()
-        for what, unit, residual in (
-            ("energy", "J/m³", energy),
-            ("stress", "Pa", force),
+        for what, unit, residual, remedy in (
+            ("energy", "J/m³", energy, "subtract this value"),
+            (
+                "stress",
+                "Pa",
+                force,
+                "correct the energy, such as by a term −μ ln J",
+            ),
         ):
             worst = np.abs(residual).max()
             if not worst <= REST_TOLERANCE * scale:
                 raise InputError(
-                    f"material {self.name!r} has the {what} {worst:.3g} {unit} in the undeformed "
-                    f"state, with {self._describe_values(sample_values)}; expected zero at F = I: "
-                    "subtract it"
+                    f"material {self.name!r} has the {what} {worst:.3g} {unit} in the undeformed state, "
+                    f"with {self._describe_values(sample_values)}; expected zero at F = I: {remedy}"
                 )
 
     def _describe_values(self, values: list[float]) -> str:
@@ -453,8 +459,8 @@ class DampingLaw:
             isinstance(constant, Constant) for constant in self.constants
         ):
             raise InputError(
-                f"constants of the damping law {self.name!r} is no tuple of Constant; expected one, "
-                "such as (viscosity,)"
+                f"constants of the damping law {self.name!r} are not a tuple of Constant; expected for "
+                "example (viscosity,)"
             )
 
 
@@ -601,7 +607,8 @@ def as_branches(branches_or_names: Sequence[str | Prony]) -> tuple[Prony, ...]:
     """
     if isinstance(branches_or_names, str):
         raise InputError(
-            f"prony is {branches_or_names!r}; expected a sequence of names"
+            f"prony is {branches_or_names!r}; expected a list of names of branches, such as "
+            f"[{branches_or_names!r}]"
         )
     branches = tuple(
         b if isinstance(b, Prony) else Prony(b) for b in branches_or_names
@@ -610,6 +617,7 @@ def as_branches(branches_or_names: Sequence[str | Prony]) -> tuple[Prony, ...]:
     for name in names:
         if names.count(name) > 1:
             raise InputError(
-                f"two branches of a part are named {name!r}; names must differ"
+                f"two Prony branches of the same part of the body are named {name!r}; expected a "
+                "different name for each"
             )
     return branches

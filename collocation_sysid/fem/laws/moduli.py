@@ -153,8 +153,8 @@ def find_source(
     if DENSITY.name in plain and MASS.name in known:
         if DENSITY.name in names:
             raise InputError(
-                f"{names[DENSITY.name]} and {MASS.name} both give the density of {where}; expected "
-                "one of them"
+                f"found {names[DENSITY.name]} and {MASS.name}, which both determine the density of "
+                f"{where}; expected only one of them"
             )
         names[DENSITY.name] = MASS.name
     if lacking := [own for own in plain if own not in names]:

@@ -42,14 +42,15 @@ def checked_points(points_m: ArrayLike) -> np.ndarray:
         points = np.array(points_m, dtype=np.float64)
     except (TypeError, ValueError):
         raise InputError(
-            "points_m must be an (n, 3) array of numbers"
+            "points_m cannot be converted to numbers; expected an (n, 3) array of coordinates in "
+            "metres"
         ) from None
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"points_m must have shape (n, 3), not {points.shape}")
     if (np.abs(points) > LARGEST_M).any():
         raise InputError(
-            f"a node lies {np.nanmax(np.abs(points)):.3g} m away from the origin: check the "
-            "file and its unit of length"
+            f"a node lies {np.nanmax(np.abs(points)):.3g} m away from the origin; expected at most "
+            f"{LARGEST_M:g} m: check the file and its unit of length"
         )
     return points
 
@@ -67,7 +68,8 @@ def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
         array = np.array(tetrahedra)
     except ValueError:
         raise InputError(
-            "tetrahedra must be an (E, 4) array of node indices from 0"
+            "tetrahedra have rows of different lengths; expected an (E, 4) array of node indices "
+            "from 0"
         ) from None
     if array.ndim != 2 or array.shape[1] != 4 or not len(array):
         raise InputError(
@@ -106,13 +108,13 @@ def require_known_nodes(cells: np.ndarray, node_count: int) -> None:
     bad = np.flatnonzero(((cells < 0) | (cells >= node_count)).any(axis=1))
     if len(bad):
         hint = (
-            "; they seem to count from 1"
+            "; the indices seem to count from 1: subtract 1"
             if (cells.min(), cells.max()) == (1, node_count)
             else ""
         )
         raise InputError(
-            f"element {bad[0]} has nodes {cells[bad[0]].tolist()}, but there are {node_count} "
-            f"nodes, counted from 0{hint} ({len(bad)} such in all)"
+            f"element {bad[0]} has nodes {cells[bad[0]].tolist()}; expected indices from 0 to "
+            f"{node_count - 1} of the {node_count} nodes{hint} (number of such elements: {len(bad)})"
         )
 
 
@@ -192,8 +194,8 @@ def clean_mesh(points_m: np.ndarray, tetrahedra: np.ndarray) -> CleanedMesh:
     dropped = np.setdiff1d(np.arange(len(points_m)), used)
     if len(dropped):
         notes.append(
-            f"{len(dropped)} of {len(points_m)} nodes were dropped (node {dropped[0]} is the "
-            "first): they are not the corner of any element."
+            f"{len(dropped)} of {len(points_m)} nodes were dropped (the first is node "
+            f"{dropped[0]}), because no tetrahedron has them as a corner."
         )
     if len(reversed_elements):
         notes.append(
@@ -278,8 +280,8 @@ def _require_finite(points: np.ndarray, used: np.ndarray) -> None:
     bad = used[~np.isfinite(points[used]).all(axis=1)]
     if len(bad):
         raise InputError(
-            f"node {bad[0]} lies at {points[bad[0]].tolist()}: "
-            f"coordinates must be finite ({len(bad)} such in all)"
+            f"node {bad[0]} lies at {points[bad[0]].tolist()}; expected finite coordinates "
+            f"(number of such nodes: {len(bad)})"
         )
 
 
@@ -310,8 +312,9 @@ def _require_not_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
     if len(bad):
         raise InputError(
             f"element {bad[0]} with nodes {tetrahedra[bad[0]].tolist()} is degenerate: its volume "
-            f"is {volumes[bad[0]]:.3g} m³, which must exceed {DEGENERATE_RATIO:g} of its mean edge "
-            f"length cubed, {cubes[bad[0]]:.3g} m³ ({len(bad)} such in all); remove it or remesh"
+            f"is {volumes[bad[0]]:.3g} m³; expected more than {DEGENERATE_RATIO:g} times the cube "
+            f"of its mean edge length, {cubes[bad[0]]:.3g} m³ (number of such elements: {len(bad)}): "
+            "remove it, or mesh the body again"
         )
 
 
@@ -326,12 +329,14 @@ def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
     sizes = ", ".join(str(size) for size in np.sort(np.bincount(label))[:-6:-1])
     twins = n - len(np.unique(points, axis=0))
     hint = (
-        f"; {twins} of {n} nodes coincide with others: merge them"
+        f"; {twins} of {n} nodes coincide with other nodes: merge these if the parts should be "
+        "connected"
         if twins
         else ""
     )
     return (
-        f"The mesh is in {parts} unconnected parts (the largest have {sizes} nodes){hint}.",
+        f"The mesh consists of {parts} unconnected parts (the largest have {sizes} "
+        f"nodes){hint}.",
     )
 
 
@@ -370,7 +375,7 @@ def straightening_notes(
         raise InputError(
             f"quadratic element {e}: mid node {mid} lies {offset[e, k]:.3g} m off the middle of "
             f"the edge from node {a} to node {b}, which is {length[e, k]:.3g} m long; expected at "
-            f"most {LARGEST_SIDE_CURVATURE:.0%} of that ({len(bad)} such in all), because sides "
+            f"most {LARGEST_SIDE_CURVATURE:.0%} of that (number of such nodes: {len(bad)}), because sides "
             "are assumed to be straight: refine the mesh, or save it with linear tetrahedra"
         )
     is_curved = offset > ROUND_OFF * length
@@ -379,6 +384,6 @@ def straightening_notes(
     largest = (offset[is_curved] / length[is_curved]).max()
     count = len(np.unique(cells[:, 4:][is_curved]))
     return (
-        f"Curved sides were straightened: {count} mid nodes lie off the middle of their edges, "
-        f"by up to {largest:.2g} of the edge's length.",
+        f"Curved sides of elements were straightened: {count} mid nodes lie off the middle of "
+        f"their edges, by up to {largest:.2g} of the edge's length.",
     )

@@ -124,10 +124,14 @@ def _tetrahedra(data: MeshContent, metres: float) -> TetrahedraContent:
         if block.type in _TETRAHEDRA and len(block.data)
     ]
     if not blocks:
-        filled = "; a closed surface can be filled by TetMesh.from_surface"
+        filled = (
+            "; a closed surface can be filled with tetrahedra: state it as surface, with "
+            "edge_length_m, in [object] (in Python TetMesh.from_surface)"
+        )
         hint = filled if "triangle" in counts else ""
         raise InputError(
-            f"no tetrahedra in this file, found {_listed(counts)}{hint}"
+            f"found {_listed(counts)}, but no tetrahedra; expected a mesh of the volume with cells "
+            f"of meshio's type tetra or tetra10{hint}"
         )
     notes = _note_omitted_cells(counts)
     quadratic = [block.data for block in blocks if block.type == "tetra10"]
@@ -185,7 +189,8 @@ def read_triangles(
         ]
         if not fans:
             raise InputError(
-                f"no triangles in this file, found {_listed(_cell_counts(data))}"
+                f"found {_listed(_cell_counts(data))}, but no triangles; expected a surface of "
+                "triangles, quadrilaterals or polygons"
             )
         # An OBJ vertex may carry a colour after its coordinates.
         return np.asarray(data.points, dtype=float)[
@@ -466,7 +471,11 @@ def _note_omitted_cells(counts: Mapping[str, int]) -> tuple[str, ...]:
     if not others:
         return ()
     solid = any(name.startswith(_SOLID_CELLS) for name in others)
-    warning = ": that part of the body is missing" if solid else ""
+    warning = (
+        ": this part of the body is missing. Mesh it with tetrahedra"
+        if solid
+        else ""
+    )
     return (
         f"Cells other than tetrahedra were left out ({_listed(others)}){warning}.",
     )

@@ -406,7 +406,7 @@ class Named:
         if inner := int((rows < 0).sum()):
             raise InputError(
                 f'{inner} of the {len(rows)} faces of "{self.name}" are not on the boundary of the '
-                "body; a pressure acts on faces that have the material on one side only"
+                "body; expected faces that have the material on one side only"
             )
         return np.sort(rows)
 
@@ -444,14 +444,14 @@ class Named:
         if values.size != count:
             each = {"point": "node", "cell": "cell"}[kind]
             raise InputError(
-                f"{what} has {values.size // count} values per {each}; a selection needs one, "
-                "0 or 1"
+                f"{what} has {values.size // count} values per {each}; expected one value per {each} in a "
+                "selection, 0 or 1"
             )
         values = values.ravel()
         odd = values[~np.isin(values, (0, 1))]
         if len(odd):
             raise InputError(
-                f"{what} holds {odd[0]}; a selection needs only 0 and 1"
+                f"{what} contains the value {odd[0]}; expected only 0 and 1 in a selection"
             )
         return values.astype(bool)
 

@@ -149,7 +149,8 @@ def _require_element_limit(elements: float) -> None:
     """Raise an `InputError` for more than a million elements."""
     if elements > _MOST_ELEMENTS:
         raise InputError(
-            f"makes {elements:.3g} elements; expected at most {_MOST_ELEMENTS:,}: a larger length",
+            f"with this length the mesh has {elements:.3g} elements; expected at most "
+            f"{_MOST_ELEMENTS:,}: give a larger length",
             None,
             where="edge_length_m",
         )
@@ -186,7 +187,8 @@ def box_mesh(
     cells = np.asarray(divisions)
     if size.shape != (3,) or origin.shape != (3,) or not (size > 0).all():
         raise InputError(
-            f"a box needs three positive lengths in metres, not {size_m!r}"
+            f"found size_m = {size_m!r} and origin_m = {origin_m!r}; expected three positive "
+            "lengths and three coordinates in metres"
         )
     if (
         cells.shape != (3,)

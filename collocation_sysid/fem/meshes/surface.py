@@ -134,8 +134,13 @@ def _checked_surface(
         or points.shape[1] != 3
         or not np.isfinite(points).all()
     ):
+        fault = (
+            f"are an array {points.shape}"
+            if points.ndim != 2 or points.shape[1] != 3
+            else "contain values that are not finite"
+        )
         raise InputError(
-            f"a surface needs (p, 3) finite vertex coordinates, not {points.shape}"
+            f"the vertices of the surface {fault}; expected finite coordinates, an array (p, 3)"
         )
     if (
         faces.ndim != 2
@@ -144,12 +149,13 @@ def _checked_surface(
         or faces.dtype.kind not in "iu"
     ):
         raise InputError(
-            f"a surface needs (F, 3) integer triangles, F > 0, not {faces.shape}"
+            f"the triangles are an array {faces.shape} of {faces.dtype}; expected indices of "
+            "vertices, an integer array (F, 3) with F > 0"
         )
     if faces.min() < 0 or faces.max() >= len(points):
         raise InputError(
-            f"the triangles name vertices {faces.min()} to {faces.max()}, "
-            f"but there are {len(points)}, counted from 0"
+            f"the triangles have vertex indices from {faces.min()} to {faces.max()}; expected "
+            f"indices from 0 to {len(points) - 1} of the {len(points)} vertices"
         )
     return points, faces
 
@@ -180,14 +186,15 @@ def _require_suitable_edge_length(
     """
     if not 0 < edge_length_m < np.inf:
         raise InputError(
-            f"the edge length must be a positive number of metres: {edge_length_m!r}"
+            f"edge_length_m is {edge_length_m!r}; expected a positive number of metres"
         )
     extent = " × ".join(f"{length:.4g}" for length in np.ptp(points, axis=0))
     remedy = f"the surface measures {extent} m: check the edge length and the length unit"
     # fTetWild takes minutes, or forever, over edges longer than the body.
     if edge_length_m > np.linalg.norm(np.ptp(points, axis=0)) / 2:
         raise InputError(
-            f"the edge length {edge_length_m:g} m is over half the surface's diagonal; {remedy}"
+            f"the edge length {edge_length_m:g} m is more than half the diagonal of the surface; "
+            f"{remedy}"
         )
     volume = (
         abs(np.linalg.det(points[triangles] - points.mean(axis=0)).sum()) / 6
@@ -195,8 +202,8 @@ def _require_suitable_edge_length(
     elements = 6 * np.sqrt(2) * volume / edge_length_m**3
     if elements > MOST_ELEMENTS:
         raise InputError(
-            f"the edge length {edge_length_m:g} m would take about {elements:.1g} tetrahedra, more "
-            f"than {MOST_ELEMENTS:.1g}; {remedy}"
+            f"the edge length {edge_length_m:g} m would give about {elements:.1g} tetrahedra; "
+            f"expected at most {MOST_ELEMENTS:.1g}; {remedy}"
         )
 
 
@@ -239,6 +246,7 @@ def run_ftetwild(
         ) from error
     if not len(mesh["tetrahedra"]):
         raise InputError(
-            "pytetwild found no interior: the surface encloses no volume"
+            "pytetwild found no interior: the surface encloses no volume; expected triangles that "
+            "close around the body: check the surface in a mesh editor"
         )
     return mesh["points_m"], mesh["tetrahedra"].astype(np.int64)

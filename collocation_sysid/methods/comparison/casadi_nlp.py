@@ -203,7 +203,7 @@ _LIBRARY = (
     "it needs a library, and usually a licence, that are not part of CasADi"
 )
 REFUSED: dict[str, str] = {
-    "ipopt": 'its own method is "interior-point"',
+    "ipopt": 'IPOPT is available as the method "interior-point"',
     "alpaqa": "it derives an augmented Lagrangian from expressions, and the NLP has only callbacks",
     "blocksqp": "it derives its Hessian's structure from expressions, and the NLP has only "
     "callbacks; its QP solver needs MA27",

@@ -271,8 +271,9 @@ class Penalty(PenaltyOptions):
                 raise SearchEnded(Status.STALLED, message)
             raise SearchEnded(
                 Status.ITERATION_LIMIT,
-                f"The last stage ended before its minimum, with a gradient of {stage.gradient:.2g};"
-                " raise inner_iterations or choose another inner solver.",
+                f"The last stage ended before its minimum: its gradient is {stage.gradient:.2g}, above "
+                f"the tolerance {stage.tolerance:.2g}. Raise inner_iterations or choose another inner "
+                "solver.",
             )
         if is_increase_due or stage.is_minimum:
             rho = min(self.rho_factor * rho, self.last_rho)
@@ -315,13 +316,13 @@ class AugmentedLagrangian(PenaltyOptions):
             if stage.is_minimum:
                 raise SearchEnded(
                     Status.STALLED,
-                    "The equations of motion are violated although "
-                    "ρ reached rho_max; raise rho_max.",
+                    "The equations of motion are violated although the penalty ρ reached rho_max; raise "
+                    "rho_max.",
                 )
             raise SearchEnded(
                 Status.STALLED,
-                f"The last stage ended with a gradient of {stage.gradient:.2g}, above its "
-                f"tolerance {tolerance:.2g}; another inner solver may get farther.",
+                f"The last stage ended with a gradient of {stage.gradient:.2g}, above its tolerance "
+                f"{tolerance:.2g}; choose another inner solver, which may reach the tolerance.",
             )
         if not is_feasible and slack.scaled > FALL * previous_violation.scaled:
             rho = min(self.rho_factor * rho, self.rho_max)
@@ -376,7 +377,7 @@ class _PenaltySolve:
         self.variables = np.clip(began, self.problem.lower, self.problem.upper)
         if not self.problem.has_valid_elements(self.variables):
             raise InputError(
-                "elements are inverted at the initial point; start from another guess"
+                "elements are inverted at the initial point; give another guess"
             )
         no_weights = np.zeros(nlp.constraint_count)
         merit = MeritFunction(self.problem, options.rho, multipliers=no_weights)
@@ -415,7 +416,8 @@ class _PenaltySolve:
                 and ended_stage.tolerance <= options.tolerance
             ):
                 message = (
-                    "Converged: gradient and slack are within their tolerances."
+                    "Converged: the gradient and the violation of the equations of motion are within "
+                    "their tolerances."
                 )
                 return Status.CONVERGED, message
             self.stage = options.next_stage(

@@ -156,6 +156,33 @@ class GriddedCloud:
         return np.take_along_axis(candidates, best[..., None], axis=-1)[..., 0]
 
 
+class AlignmentClouds(NamedTuple):
+    """Points of an image for the two halves of an alignment.
+
+    Attributes
+    ----------
+    wide : NearestPoints
+        With the wider half of the gates.
+    narrow : ExactCloud
+        With the narrower half.
+    """
+
+    wide: NearestPoints
+    narrow: ExactCloud
+
+    @classmethod
+    def from_points(cls, points_m: Array, reach_m: float) -> AlignmentClouds:
+        """Return the clouds of points (P, 3) [m]. The grid of the wide one extends by the first
+        gate `reach_m` [m] beyond them; if it has too many cells, for example with a background
+        far away, the wide cloud is the narrow one.
+        """
+        exact = ExactCloud(points_m)
+        grid = {"cell_m": reach_m / CELLS_OF_REACH, "margin_m": reach_m}
+        if GriddedCloud.is_possible(points_m, **grid):
+            return cls(GriddedCloud(points_m, **grid), exact)
+        return cls(exact, exact)
+
+
 def thinned(cloud: Array) -> Array:
     """Return every k-th point of a cloud (P, c), evenly spread over its order, so that at most
     `ENOUGH` remain; the complete cloud (k = 1) if it has fewer.
@@ -213,7 +240,11 @@ def align_camera(
     )
     normals = sides[chosen] / area[chosen, None]
     size_m = float(np.linalg.norm(np.ptp(x, axis=0)))
-    cloud = ExactCloud(thinned(camera.depth.points_m[image]))
+    if image not in camera.alignment_clouds:
+        camera.alignment_clouds[image] = AlignmentClouds.from_points(
+            thinned(camera.depth.points_m[image]), reach_m=REACH * size_m
+        )
+    clouds = camera.alignment_clouds[image]
     gates = np.geomspace(REACH * size_m, camera.depth.gate_m, ITERATIONS)
     wide_gates, narrow_gates = np.array_split(gates, 2)
     iterate = partial(
@@ -221,12 +252,11 @@ def align_camera(
     )
     if start is None:
         candidates = _first_candidates(
-            cloud.points_m, places, gate_m=float(gates[0])
+            clouds.narrow.points_m, places, gate_m=float(gates[0])
         )
-        wide_cloud = _nearly_nearest(cloud, reach_m=float(gates[0]))
         for some_gates in np.array_split(wide_gates, CHOICES):
             candidates = distinct_poses(
-                iterate(cloud=wide_cloud, gates=some_gates, starts=candidates),
+                iterate(cloud=clouds.wide, gates=some_gates, starts=candidates),
                 size_m=size_m,
                 same_m=SAME_POSE * some_gates[-1],
             )
@@ -235,23 +265,13 @@ def align_camera(
         candidates = [AlignedPose(Rotation.from_rotvec(turn), shift_m)]
     best = min(
         iterate(
-            cloud=cloud,
+            cloud=clouds.narrow,
             gates=narrow_gates,
             starts=candidates[:CONTINUED_STARTS],
         ),
         key=lambda each: each.mismatch,
     )
     return best.rotation.as_rotvec(), best.translation_m
-
-
-def _nearly_nearest(cloud: ExactCloud, reach_m: float) -> NearestPoints:
-    """Return the cloud in a grid that extends by the first gate `reach_m` [m] beyond its points;
-    the cloud itself if that has too many cells, for example with a background far away.
-    """
-    grid = {"cell_m": reach_m / CELLS_OF_REACH, "margin_m": reach_m}
-    if GriddedCloud.is_possible(cloud.points_m, **grid):
-        return GriddedCloud(cloud.points_m, **grid)
-    return cloud
 
 
 def _first_candidates(

@@ -103,6 +103,11 @@ class DepthCameraModel:
         return []
 
     @cached_property
+    def alignment_clouds(self) -> dict[int, Any]:
+        """Points of images for alignments, by index of the image; empty at first."""
+        return {}
+
+    @cached_property
     def outline_expressions(self) -> dict[tuple[int, int], Any]:
         """Cache of the generated functions of its outline residuals, shared by all copies of the
         measurement model; empty at first.
@@ -148,6 +153,7 @@ class DepthCameraModel:
         )
         if is_same:
             vars(self)["alignments"] = other.alignments
+            vars(self)["alignment_clouds"] = other.alignment_clouds
 
     def corrected_expression(
         self, point: ca.SX, ray: ca.SX, values: Mapping[NuisanceRow, ca.SX]

@@ -148,6 +148,7 @@ class SurfaceCorrespondences(Correspondences):
         phi: Array,
         gate_m: float,
         settled: bool = False,
+        surface: VisibleSurface | None = None,
     ) -> SurfaceCorrespondences:
         """Find the correspondences for given shapes.
 
@@ -165,8 +166,10 @@ class SurfaceCorrespondences(Correspondences):
             Largest distance of points from the surface [m].
         settled : bool
             Whether to leave out points that the body hides; stored as `has_converged`.
+        surface : VisibleSurface, optional
+            Surface of the body, if it is known.
         """
-        skin = VisibleSurface.from_body(body, camera.depth)
+        skin = surface or VisibleSurface.from_body(body, camera.depth)
         images = [
             _match_image(
                 camera,
@@ -330,6 +333,7 @@ class SurfaceCorrespondences(Correspondences):
             phi=phi,
             gate_m=gate_m,
             settled=settled,
+            surface=self.surface,
         )
 
     def with_depth(

@@ -139,7 +139,7 @@ def _solve_equilibrium(
                 solver,
                 failure,
                 time_s=at_s,
-                what="finding the rest state",
+                what="the search for the initial equilibrium",
                 static=True,
             ) from failure
         path.accept(solution)

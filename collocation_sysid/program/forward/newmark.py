@@ -369,7 +369,10 @@ class _Stepper:
                 step /= 2
                 if step < smallest:
                     raise simulation_error(
-                        solver, failure, time_s=state.t_s, what="a Newmark step"
+                        solver,
+                        failure,
+                        time_s=state.t_s,
+                        what="a time step of the Newmark method",
                     ) from failure
         return state
 

@@ -849,9 +849,10 @@ def simulation_error(
     """
     element = solver.worst_element(failure.x)
     ratio = float(solver.body.volume_ratios(failure.x)[0, element].min())
+    remedy = "smaller loads" if static else "a smaller time step"
     return SimulationError(
-        f"{what} failed: {failure.reason}; the worst element has det F = {ratio:.3g}. "
-        "Stiffer parameters, a smaller timestep or a finer mesh may help",
+        f"{what} failed: {failure.reason}; the most deformed element has the volume ratio "
+        f"det F = {ratio:.3g}. Stiffer parameters, {remedy} or a finer mesh may help",
         time_s,
         element=element,
         state_m=failure.x if static else None,

@@ -164,7 +164,7 @@ def continue_simulation(
                 solver,
                 failure,
                 time_s=float(dynamics.t_s[t]),
-                what=f"the step at row {t}",
+                what=f"time step {t}",
                 static=dynamics.is_static,
             )
         forces[t] = row.force(x[t])

@@ -46,8 +46,8 @@ SEQUENTIAL = 1
 # Interface layer of MKL with 32-bit integers.
 INTS_OF_32_BITS = 0
 MISSING = (
-    'factorisation = "supernodal" needs the mkl package (Intel and AMD processors): '
-    "pip install 'collocation-sysid[large]'; or take \"auto\""
+    'factorisation = "supernodal" needs the mkl package (Intel and AMD processors): pip '
+    "install 'collocation-sysid[large]'; or use factorisation = \"auto\""
 )
 
 

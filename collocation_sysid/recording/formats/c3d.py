@@ -69,7 +69,8 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
         )
     except Failed as error:
         raise InputError(
-            f"is a damaged C3D file: ezc3d says '{error}'"
+            f"the C3D file is damaged (message of ezc3d: '{error}'); expected a complete file: "
+            "export it again"
         ) from error
     points = read.pop("points")  # (3, points, frames)
     for what, declared, count in (
@@ -78,7 +79,8 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
     ):
         if declared is not None and count != declared:
             raise InputError(
-                f"the header states {declared} {what}, but the file contains {count}"
+                f"the header states {declared} {what}, but the file contains {count}; expected equal "
+                "numbers: the file may be truncated, export it again"
             )
     labels = _labels(read)
     if len(labels) != points.shape[1]:
@@ -112,7 +114,9 @@ def _header_counts(content: bytes) -> tuple[int, int | None]:
     """
     start = _BLOCK * (content[0] - 1)
     if len(content) < max(start + 4, _BLOCK):
-        raise InputError("is truncated: the C3D header is incomplete")
+        raise InputError(
+            "the file is truncated: the C3D header is incomplete; export it again"
+        )
     processor = content[start + 3]
     order = ">" if processor == _SGI else "<"
     points, analog, first, last = struct.unpack_from(f"{order}4H", content, 2)
@@ -127,12 +131,12 @@ def _header_counts(content: bytes) -> tuple[int, int | None]:
     size = _BLOCK * (data_block - 1) + frames * (4 * points + analog) * width
     if len(content) < size:
         raise InputError(
-            f"has {len(content)} bytes, but {frames} frames of {points} points need {size}; is "
-            "the file truncated?"
+            f"the file has {len(content)} bytes, but {frames} frames of {points} points need "
+            f"{size}; it may be truncated: export it again"
         )
     if frames < 1 or not points:
         raise InputError(
-            f"contains {points} points and {frames} frames; expected at least one of each"
+            f"the file contains {points} points and {frames} frames; expected at least one of each"
         )
     return points, frames
 

@@ -146,7 +146,8 @@ def read_depth(
     if kind not in _READERS:
         expected = ", ".join(_READERS)
         raise InputError(
-            f"is a {kind or 'file without an ending'}; expected one of {expected}",
+            f"the file has {'the ending ' + kind if kind else 'no ending'}; expected one of "
+            f"{expected}",
             path,
         )
     try:
@@ -155,7 +156,8 @@ def read_depth(
         raise error.located(path) from error
     except (Exception, SystemExit) as error:
         raise InputError(
-            f"cannot be read ({reason(error)}); expected {kind}", path
+            f"the file cannot be read ({reason(error)}); expected a valid {kind} file",
+            path,
         ) from error
     if isinstance(content, DepthFileContent):
         return content
@@ -200,10 +202,12 @@ def _read_topic(
             list(log.messages(address.topic)), log.start_ns
         )
         camera = _camera_of_topic(log, address.topic)
-    if not messages or not (kind := depth_kind(messages[0])):
+    kind = depth_kind(messages[0]) if messages else ""
+    if not kind:
+        content = "other messages" if messages else "no messages"
         raise InputError(
-            f"the topic {address.topic} has neither depth images ({', '.join(ENCODINGS)}, "
-            "compressedDepth) nor clouds of points"
+            f"the topic {address.topic} has {content}; expected depth images "
+            f"({', '.join(ENCODINGS)}, compressedDepth) or clouds of points"
         )
     if "images" not in kind:
         clouds = [
@@ -273,12 +277,14 @@ def _read_folder(
     )
     if not files:
         raise InputError(
-            f"has no {', '.join((*IMAGES, *CLOUDS))}; expected images or clouds",
+            f"the folder contains no files {', '.join((*IMAGES, *CLOUDS))}; expected depth images "
+            "or point clouds of one of these types",
             path,
         )
     if len(kinds := {each.suffix.lower() for each in files}) > 1:
         raise InputError(
-            f"contains {', '.join(sorted(kinds))}; expected files of one kind",
+            f"the folder contains {', '.join(sorted(kinds))} files; expected files of one type "
+            "only",
             path,
         )
     parts = [read_depth(each, count_m, length_m=length_m) for each in files]
@@ -289,8 +295,8 @@ def _read_folder(
             t_s = times_in_column(read_table(decode(read_bytes(times))), 0)
         if len(t_s) != len(files):
             raise InputError(
-                f"has {len(t_s)} times for {len(files)} files of the folder; expected one for "
-                "each",
+                f"found {len(t_s)} times for the {len(files)} images or clouds of the folder; expected "
+                "one time for each file",
                 times,
             )
     images = [image for part in parts for image in part.images_m]
@@ -310,7 +316,8 @@ def _in_metres(image: Array, count_m: float | None) -> Array:
     """
     if image.ndim != 2:
         raise InputError(
-            f"has the shape {image.shape}; expected one channel of depths"
+            f"the image has the shape {image.shape}; expected (rows, columns): one channel with "
+            "depths"
         )
     if image.dtype.kind in "iu":
         return image * (USUAL_COUNT_M if count_m is None else count_m)
@@ -328,8 +335,9 @@ def _require_possible_lengths(values_m: Array) -> None:
     )
     if largest_m > LARGEST_LENGTH_M:
         raise InputError(
-            f"contains the length {largest_m:.3g} m; expected at most {LARGEST_LENGTH_M:,.0f} m: "
-            "the file is damaged, or its unit is another one (length_unit, count_m)"
+            f"the largest length in the file is {largest_m:.3g} m; expected at most "
+            f"{LARGEST_LENGTH_M:,.0f} m: the file is damaged, or its unit differs from the stated "
+            "one (length_unit, count_m)"
         )
 
 
@@ -356,8 +364,8 @@ def _scaled_cloud(points: Array, path: Path, length_m: float) -> Array:
         points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise InputError(
-            f"has the shape {points.shape}; expected x, y, z of each point, and after them nx, "
-            "ny, nz if normals are known",
+            f"a cloud has the shape {points.shape}; expected 3 columns x, y, z, or 6 columns with "
+            "the normals nx, ny, nz",
             path,
         )
     places_m = length_m * points[:, :3]
@@ -385,8 +393,9 @@ def _read_npz(path: Path) -> DepthFileContent:
     ]
     if len(names) != 1:
         raise InputError(
-            f"has {', '.join(arrays) or 'nothing'}; expected one of depth_m, depth_counts with "
-            "count_m, and points_m; and optionally t_s, camera_matrix, camera_pose"
+            f"the archive contains {', '.join(arrays) or 'nothing'}; expected exactly one of "
+            "depth_m, depth_counts (with count_m) and points_m, and optionally t_s, "
+            "camera_matrix, camera_pose"
         )
     values = arrays[names[0]]
     if names[0] == "depth_counts":
@@ -438,8 +447,8 @@ def _read_exr(path: Path) -> Array:
         library = import_module("OpenEXR")
     except ImportError as missing:
         raise InputError(
-            "needs the package OpenEXR, which is not installed: pip install "
-            "'collocation-sysid[exr]', or convert it to .npz"
+            "reading .exr images needs the package OpenEXR, which is not installed: pip install "
+            "'collocation-sysid[exr]', or convert the images to .npz"
         ) from missing
     # What the library writes on both streams it also raises.
     with redirect_stdout(None), _standard_error_silenced():
@@ -460,7 +469,7 @@ def _points_from_columns(columns: Mapping[str, Array]) -> Array:
     """
     if not {*"xyz"} <= {*columns}:
         raise InputError(
-            f"has the columns {', '.join(columns)}; expected x, y and z among them"
+            f"the point cloud has the columns {', '.join(columns)}; expected x, y and z among them"
         )
     return _with_normals(
         np.column_stack([columns[axis] for axis in "xyz"]), columns
@@ -493,7 +502,7 @@ def _read_pcd(path: Path) -> Array:
         ends = raw.find(b"\n", begins)
         if ends < 0:
             raise InputError(
-                "has no line that begins with DATA; expected a PCD file"
+                "the file has no line that begins with DATA; expected a PCD file"
             )
         words = raw[begins:ends].decode("ascii", "replace").split()
         head |= {words[0]: words[1:]} if words and words[0] != "#" else {}
@@ -512,8 +521,8 @@ def _read_pcd(path: Path) -> Array:
         columns = dict(zip(head["FIELDS"], values.T, strict=True))
     else:
         raise InputError(
-            f"has DATA {' '.join(head['DATA'])}; expected ascii or binary: convert it, for example "
-            "by pcl_convert_pcd_ascii_binary"
+            f"the PCD file has DATA {' '.join(head['DATA'])}; expected ascii or binary: convert "
+            "it, for example with pcl_convert_pcd_ascii_binary"
         )
     return _points_from_columns(columns)
 

@@ -88,9 +88,10 @@ def camera_matrix(
     if size != [*shape] or max(binned) > 1 or any(offset):
         rows, columns = size
         raise InputError(
-            f"describes images of {columns} x {rows} pixels, binned by {binned}, with the offset "
-            f"{offset}, but the images have {shape[1]} x {shape[0]} pixels; expected a camera of "
-            "complete images of that size: state camera.matrix"
+            f"the camera info describes images of {columns} x {rows} pixels, with binning {binned} "
+            f"and the offset {offset} of a region of interest, but the images have {shape[1]} x "
+            f"{shape[0]} pixels; expected a camera info for complete images of this size: state "
+            "camera.matrix instead"
         )
     projection = np.asarray(_field(message, "p"), dtype=float)
     if rectified and projection.size == 12 and projection.any():
@@ -113,8 +114,9 @@ def distortion_coefficients(message: Any, rectified: bool) -> Array:
     kind = getattr(message, "distortion_model", "plumb_bob")
     if kind != "plumb_bob" or len(coefficients) > 5:
         raise InputError(
-            f"has the lens {kind} with {len(coefficients)} numbers; expected plumb_bob with five: "
-            "use the topic of rectified images, or state camera.distortion"
+            f"the camera info has the distortion model {kind} with {len(coefficients)} "
+            "coefficients; expected plumb_bob with at most five: use the topic of rectified "
+            "images, or state camera.distortion"
         )
     return coefficients
 
@@ -167,8 +169,8 @@ def _decode_compressed(kind: str, data: bytes) -> Any:
         raise
     except Exception as error:  # the library has exceptions of its own
         raise InputError(
-            f"has an image of the format {kind!r} that is not a PNG ({reason(error)}): use the "
-            "topic of uncompressed images, or compress them as PNG"
+            f"the topic has an image of the format {kind!r} that is not a PNG ({reason(error)}); "
+            "expected PNG: use the topic of uncompressed images, or compress the images as PNG"
         ) from error
     if not packed or "32FC1" not in kind:
         return counts
@@ -196,7 +198,8 @@ def read_png(source: Path | BytesIO) -> Any:
     image = opened(source)
     if image.mode not in ("I;16", "I;16B", "I"):
         raise InputError(
-            f"has the mode {image.mode}; expected depths of 16 bits in one channel"
+            f"the image has the mode {image.mode}; expected depths of 16 bits in one channel (mode "
+            "I;16)"
         )
     return np.asarray(image).astype(np.int64)
 
@@ -226,8 +229,8 @@ def decode_cloud(message: Any) -> dict[str, Array]:
             f"{each.name} of type {each.datatype}" for each in fields
         )
         raise InputError(
-            f"has the columns {columns} in points of {message.point_step} bytes; expected each "
-            "once, of types 1 to 8, within these"
+            f"a cloud has the fields {columns} in points of {message.point_step} bytes; expected "
+            "each name once, of the types 1 to 8 of sensor_msgs/PointField, within these bytes"
         ) from error
     rows = _unpadded_rows(message, message.row_step, size=message.point_step)
     points = np.frombuffer(rows.tobytes(), form)
@@ -254,8 +257,8 @@ def _unpadded_rows(message: Any, step: int, size: int) -> Any:
     height = message.height
     if len(data) != height * step or step < message.width * size:
         raise InputError(
-            f"has {len(data)} bytes in a message; expected {height} rows of {message.width} times "
-            f"{size} bytes, {step} from row to row"
+            f"a message has {len(data)} bytes; expected {height} rows of {message.width} times "
+            f"{size} bytes, with {step} bytes from row to row"
         )
     return np.ascontiguousarray(
         data.reshape(height, step)[:, : message.width * size]

@@ -81,7 +81,10 @@ class TopicAddress:
             elif part.isdecimal():
                 options["episode"] = int(part)
             else:
-                expected = "two frames PARENT>CHILD, a robot.urdf, rad or deg, or an episode"
+                expected = (
+                    "two frames PARENT>CHILD, the file of a robot (.urdf), rad or deg, or the index of an "
+                    "episode"
+                )
                 raise InputError(
                     f"found {part!r} after the topic; expected {expected}"
                 )
@@ -150,8 +153,8 @@ def open_log(path: Path, episode: int | None = None) -> Iterator[Log]:
         log = partial(_Bag, path)
     else:
         raise InputError(
-            "is not a log; expected a ROS bag (a folder with metadata.yaml, .db3 or .bag), an "
-            ".mcap file, or a LeRobot dataset (a folder with meta/info.json)"
+            "this is not a log; expected a ROS bag (a folder with metadata.yaml, .db3 or .bag), "
+            "an .mcap file, or a LeRobot dataset (a folder with meta/info.json)"
         )
     try:
         with log() as each:
@@ -160,7 +163,8 @@ def open_log(path: Path, episode: int | None = None) -> Iterator[Log]:
         raise
     except Exception as error:  # the libraries have exceptions of their own
         raise InputError(
-            f"is damaged, or a file of another type: {reason(error)}"
+            f"the log is damaged, or a file of another type ({reason(error)}); expected a log that "
+            "its own tools can open"
         ) from error
 
 
@@ -169,7 +173,8 @@ def require_topic(log: Log, topic: str) -> None:
     if topic not in log.topics:
         there = ", ".join(log.topics)
         raise InputError(
-            f"there is no topic {topic!r}; it has {there}{hint_at(topic, log.topics)}"
+            f"there is no topic {topic!r}; expected one of the topics of the log: "
+            f"{there}{hint_at(topic, log.topics)}"
         )
 
 
@@ -242,7 +247,7 @@ class _Mcap:
         summary = self._reader.get_summary()
         if summary is None or summary.statistics is None:
             raise InputError(
-                "is truncated: it has no summary; `mcap recover` creates one"
+                "the log is truncated: it has no summary; `mcap recover` creates one"
             )
         counts = summary.statistics.channel_message_counts
         self.topics = {}
@@ -337,12 +342,13 @@ class _Dataset:
 
         if self.episode is None and self._episodes > 1:
             raise InputError(
-                f"has {self._episodes} episodes; expected one, as in {self.path.name}#{topic}#0"
+                f"the dataset has {self._episodes} episodes; expected the index of one of them after "
+                f"the topic, as in {self.path.name}#{topic}#0"
             )
         episode = self.episode or 0
         if episode >= self._episodes:
             raise InputError(
-                f"has the episodes 0 to {self._episodes - 1}; found {episode}"
+                f"found the episode {episode}; expected an index from 0 to {self._episodes - 1}"
             )
         frames = dataset.dataset(self.path / "data", format="parquet").to_table(
             columns=["timestamp", topic],

@@ -54,8 +54,8 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
         or not "".join(rows[top].cells[1:2]).startswith("Time")
     ):
         raise InputError(
-            "is not a Motive CSV with markers: expected rows of Type, Name, ID and Position, "
-            "then 'Frame,Time (Seconds),X,Y,Z,…'"
+            "this is not a Motive CSV file with markers; expected rows of Type, Name, ID and "
+            "Position, then 'Frame,Time (Seconds),X,Y,Z,…'"
         )
     heads = _column_headings(rows[1:top], rows[top])
     columns = _marker_columns(heads, rows[top].line)
@@ -87,7 +87,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     )
     solved = {label: columns[label].kind for label in raw.labels}
     notes = (
-        f"{label}: has no measured columns; those of Type '{kind}' were used, which Motive "
+        f"marker {label} has no measured columns; those of Type '{kind}' were used, which Motive "
         "computes from a fitted rigid body"
         for label, kind in solved.items()
         if kind != _MEASURED

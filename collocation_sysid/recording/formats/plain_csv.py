@@ -91,9 +91,9 @@ def _wide_labels(table: TextTable) -> list[str]:
     if not faults and labels:
         return list(labels)
     raise InputError(
-        f"columns {'; '.join(faults) or 'hold no markers'}; expected t_s and, for each marker, "
-        f"<name>_x, <name>_y, <name>_z; found {', '.join(header)}; or a C3D, TRC, Qualisys TSV or "
-        "Motive CSV file",
+        f"the columns are {', '.join(header)} ({'; '.join(faults) or 'no markers'}); expected t_s "
+        "and, for each marker, <name>_x, <name>_y, <name>_z; or a C3D, TRC, Qualisys TSV or Motive "
+        "CSV file",
         where="line 1",
     )
 

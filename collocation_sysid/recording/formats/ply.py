@@ -44,12 +44,15 @@ def read_columns(path: Path) -> Mapping[str, Array]:
     if columns is not None:
         return columns
     if b"end_header" not in content[:LONGEST_HEADER]:
-        raise InputError("has no line end_header; expected .ply")
+        raise InputError(
+            "the file has no line end_header; expected a complete .ply file"
+        )
     try:
         mesh = read_content(path)
     except InputError as error:
         raise InputError(
-            f"cannot be read ({error.message}); expected .ply", path
+            f"the file cannot be read ({error.message}); expected a valid .ply file",
+            path,
         ) from error
     points = np.asarray(mesh.points, dtype=float)
     return {**mesh.point_data, **dict(zip("xyz", points.T, strict=False))}
@@ -120,5 +123,6 @@ def _plain_columns(content: bytes) -> Mapping[str, Array] | None:
 def _refuse_short(expected: int, count: int) -> None:
     """Raise an `InputError` that a file has `count` points instead of the `expected` ones."""
     raise InputError(
-        f"has {count} points; expected {expected}, as its header states: is the file truncated?"
+        f"the file has {count} points; expected {expected}, as its header states: it may be "
+        "truncated"
     )

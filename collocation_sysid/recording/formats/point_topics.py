@@ -83,7 +83,9 @@ def _track(log: Log, topic: str) -> tuple[Array, Array, set[str]]:
     require_topic(log, topic)
     messages = list(log.messages(topic))
     if not messages:
-        raise InputError(f"the topic {topic} has no messages")
+        raise InputError(
+            f"the topic {topic} has no messages; expected a topic with points"
+        )
     t_s, ordered = sort_by_time(messages, log.start_ns)
     points = [point_of_message(message) for message in ordered]
     if any(point is None for point in points):

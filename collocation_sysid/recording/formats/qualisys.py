@@ -95,8 +95,8 @@ def _leading_columns(frames: list[Row], coordinates: int) -> list[str]:
         extra = 2
     if extra not in (0, 2):
         raise InputError(
-            f"{len(first.cells)} cells; expected {coordinates} coordinates, or Frame and Time "
-            "before them",
+            f"the line has {len(first.cells)} cells; expected {coordinates} coordinates, or Frame "
+            "and Time and then these",
             where=f"line {first.line}",
         )
     return ["Frame", "Time"][:extra]

@@ -165,7 +165,10 @@ class Header:
         """
         declared = self.number(key)
         if declared is not None and declared != count:
-            message = f"{key} is {declared:g}, but the file contains {count} {what}; is it truncated?"
+            message = (
+                f"{key} is {declared:g}, but the file contains {count} {what}; expected equal numbers: "
+                "the file may be truncated"
+            )
             raise InputError(
                 message, where=f"line {line or self.entries[key][1]}"
             )

@@ -36,7 +36,9 @@ _SEPARATOR = re.compile("[,;\t]")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _POINTED = re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
-_EMPTY = "is empty; expected a line of column names, then rows of numbers"
+_EMPTY = (
+    "the file is empty; expected a line of column names, then rows of numbers"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +97,9 @@ def read_bytes(path: str | Path) -> bytes:
     try:
         return Path(path).read_bytes()
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}") from error
+        raise InputError(
+            f"the file cannot be read: {error.strerror}"
+        ) from error
 
 
 def decode(content: bytes) -> str:
@@ -112,7 +116,8 @@ def decode(content: bytes) -> str:
     )
     if text is None and content:
         raise InputError(
-            "is not a CSV text file (UTF-8), nor any other format known here"
+            "this is not a CSV text file (UTF-8), nor a file of another known format; expected a "
+            "table with column names, or a supported export format"
         )
     if not text or not text.strip():
         raise InputError(_EMPTY)
@@ -174,7 +179,7 @@ def separated_rows(text: str, separator: str | None = None) -> list[Row]:
             for cells in reader
         ]
     except csv.Error as error:
-        raise InputError(f"is not a CSV text file: {error}") from error
+        raise InputError(f"this is not a CSV text file: {error}") from error
     rows = [row for row in rows if any(row.cells)]
     if not rows:
         raise InputError(_EMPTY)
@@ -222,7 +227,9 @@ def table_of_rows(
         If there is no row, or one is of another length.
     """
     if not rows:
-        raise InputError("has column names but no rows of numbers")
+        raise InputError(
+            "the file has column names but no rows of numbers; expected at least one row"
+        )
     width = len(columns)
     common = len(rows[0].cells)
     if common > width and all(
@@ -233,7 +240,9 @@ def table_of_rows(
     for k, row in enumerate(rows):
         if len(row.cells) != width:
             raise table.error_at(
-                f"{len(row.cells)} cells, but the header has {width} columns", k
+                f"the row has {len(row.cells)} cells; expected {width}, as many as the header has "
+                "columns",
+                k,
             )
     return table
 

@@ -143,7 +143,9 @@ def topic_as_csv(address: TopicAddress) -> bytes:
         require_topic(log, address.topic)
         messages = list(log.messages(address.topic))
         if not messages:
-            raise InputError(f"the topic {address.topic} has no messages")
+            raise InputError(
+                f"the topic {address.topic} has no messages; expected a topic with numbers"
+            )
         if kind := depth_kind(messages[0][1]):
             raise InputError(
                 f"the topic {address.topic} contains {kind}; expected a topic with numbers"
@@ -165,7 +167,7 @@ def topic_as_csv(address: TopicAddress) -> bytes:
     if not columns:
         raise InputError(
             f"the topic {address.topic} contains neither poses, points, wrenches, joint positions "
-            "nor numbers"
+            "nor numbers; expected a topic with one of these"
         )
     values = np.array(
         [[row.get(name, np.nan) for name in columns] for row in rows]
@@ -685,7 +687,8 @@ def _poses_through_frames(
     ]
     if not moving:
         raise InputError(
-            f"nothing moves between {parent} and {child}; omit the poses instead"
+            f"{child} does not move relative to {parent} in this log; expected two frames that "
+            "move relative to each other. If the grasp stands still, omit the poses"
         )
     first = max(t[0] for t in moving)
     last = min(t[-1] for t in moving)
@@ -727,12 +730,13 @@ def requested_frames(
             return next(iter(edges))
         example = f"{address.log.name}#{address.topic}#{frames[0]}>{frames[-1]}"
         raise InputError(
-            f"has the frames {', '.join(frames)}; expected two of them, as in {example}"
+            f"the topic has the frames {', '.join(frames)}; expected two of them, as in {example}"
         )
     for frame in address.frames:
         if frame not in frames:
             raise InputError(
-                f"there is no frame {frame!r}; it has {', '.join(frames)}{hint_at(frame, frames)}"
+                f"there is no frame {frame!r}; expected one of "
+                f"{', '.join(frames)}{hint_at(frame, frames)}"
             )
     return address.frames
 
@@ -806,26 +810,29 @@ def _poses_from_joints(
     require_regular(address.robot)
     if address.frames is None:
         raise InputError(
-            f"expected two frames after {address.robot.name}, as in #base>tool"
+            f"found no frames after {address.robot.name}; expected two, as in "
+            f"{address.robot.name}#base>tool"
         )
     robot = UrdfTransformManager(check=False)
     try:
         robot.load_urdf(address.robot.read_text(encoding="utf-8"))
     except Exception as error:  # lxml's and the library's own
         raise InputError(
-            f"is not a URDF file: {error}", address.robot
+            f"this is not a valid URDF file: {error}", address.robot
         ) from error
     parent, child = address.frames
     for frame in address.frames:
         if not robot.has_frame(frame):
             links = [node for node in robot.nodes if isinstance(node, str)]
             raise InputError(
-                f"there is no link {frame!r}; it has {', '.join(links)}{hint_at(frame, links)}",
+                f"there is no link {frame!r}; expected one of the links of the robot: "
+                f"{', '.join(links)}{hint_at(frame, links)}",
                 address.robot,
             )
     if unit is None:
         raise InputError(
-            "does not state the unit of its joints; expected #rad or #deg after the topic"
+            "the log does not state the unit of the joint positions; expected #rad or #deg after "
+            "the topic"
         )
     limits = {
         name: robot.get_joint_limits(name)
@@ -835,8 +842,8 @@ def _poses_from_joints(
     if not limits:
         joints = ", ".join(columns)
         raise InputError(
-            f"has none of the joints {joints} of the log; expected the description of the recorded "
-            "robot",
+            f"the robot has none of the joints {joints} of the log; expected the description of "
+            "the recorded robot",
             address.robot,
         )
     poses = np.empty((len(values), 7))
@@ -881,8 +888,9 @@ def _require_joint_limits(
             else "; if these are degrees, append #deg to the topic"
         )
         raise InputError(
-            f"the joint {name} is at {angle:.4g}, beyond its limits {limits[0]:.4g} to "
-            f"{limits[1]:.4g} in {address.robot and address.robot.name}{hint}"
+            f"the joint {name} is at {angle:.4g}, outside its limits {limits[0]:.4g} to "
+            f"{limits[1]:.4g} in {address.robot and address.robot.name}; expected positions within "
+            f"the limits of the recorded robot{hint}"
         )
 
 

@@ -2,7 +2,7 @@
 
 Over time: `over_time` (markers, sensors) and `spectrum`. In space: `shapes` (body
 and markers at several times), `mesh_pictures`, `field_intervals` (a spatially varying constant),
-`depth_comparison_picture` (images of depth cameras) and `instability` (a buckling mode). Of
+`camera_pictures` (images of cameras) and `instability` (a buckling mode). Of
 specimens: `stress_strain`. Statistics and method: `confidence`, `search_pictures` and `jacobian`.
 `album` collects all pictures of a run and writes them; `projection` and `scene` draw bodies in
 space for the others.

@@ -15,13 +15,13 @@ from ...common.step_counting import StepUnit, complete_steps, counted_phase
 from ...runs.result_content import Result
 from ..figure_style import RESOLUTION_DPI
 from ..replay import MotionRecord, damaged_run_refused, read_run
+from .camera_pictures import camera_pictures
 from .confidence import (
     Confidence,
     budget_picture,
     confidence_ellipses,
     correlation_matrix,
 )
-from .depth_comparison_picture import depth_picture
 from .field_intervals import field_picture
 from .mesh_pictures import elements_picture, mesh_picture
 from .over_time import marker_errors, marker_tracks, sensor_picture
@@ -106,7 +106,7 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
     """Yield name and picture of everything that is known of one experiment.
 
     A name is the kind of picture before the name of the experiment, such as "tracks_swing", and of
-    a custom sensor or depth camera also that one's name; names may repeat. A specimen has only
+    a custom sensor or camera also that one's name; names may repeat. A specimen has only
     pictures of its measurements over strain, named "<measurement>_<experiment>". Infinite positions
     are drawn as NaN: as gaps.
     """
@@ -165,8 +165,7 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
             f"reading_{replay.name}_{name}",
             sensor_picture(values, names, units=units),
         )
-    for name, points in replay.visible_points.items():
-        yield f"depth_{replay.name}_{name}", depth_picture(points)
+    yield from camera_pictures(replay)
     if replay.has_shapes():
         yield f"shapes_{replay.name}", shapes_picture(replay)
         for name, figure in obstacle_pictures(replay).items():

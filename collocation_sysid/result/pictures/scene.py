@@ -38,8 +38,6 @@ _MARKER_STYLE = {
     "mec": VERMILION,
     "mew": 0.7,
 }
-# Name of points of depth cameras in a legend.
-CAMERA_ENTRY = "depth image"
 _CAMERA_POINT_STYLE = {
     "ls": "",
     "marker": ".",
@@ -47,7 +45,7 @@ _CAMERA_POINT_STYLE = {
     "mec": "none",
     "mfc": BLUE,
 }
-# Largest number of drawn points of depth cameras; more only take longer to draw.
+# Largest number of drawn points of cameras; more only take longer to draw.
 MAX_CAMERA_POINTS = 1000
 _GRASPED_STYLE = {
     "ls": "",
@@ -242,7 +240,7 @@ class BodyDrawing:
         """Update the drawing.
 
         Markers hidden by the body are drawn as rings. Grasped nodes on faces turned away are left
-        out, and so are points of depth cameras that the body hides. A drawing with an `edge_colour`
+        out, and so are points of cameras that the body hides. A drawing with an `edge_colour`
         shows the edges alone, and uses only the positions.
 
         Parameters
@@ -258,7 +256,7 @@ class BodyDrawing:
         outlines_m : (o, 3), optional
             Outlines of obstacles [m], NaN between lines; unchanged by default.
         camera_points_m : (P, 3), optional
-            Points of depth cameras [m]; unchanged by default.
+            Points of cameras [m]; unchanged by default.
         """
         camera = self.view.camera
         visible_faces = camera.visible_faces(positions_m, self.surface)
@@ -366,17 +364,19 @@ def draw_directions(
         axes.text(x, y, letter, ha="center", va="center", fontsize=SMALL_PT)
 
 
-def legend_handles(*entries: str) -> list[Line2D]:
+def legend_handles(*entries: str, camera_points: str = "") -> list[Line2D]:
     """Return legend handles of the named marks.
 
     Parameters
     ----------
-    *entries : {"grasped", "markers", "measured", "behind the body", "depth image"}
+    *entries : {"grasped", "markers", "measured", "behind the body"}
+    camera_points : str
+        Name of a last entry for points of cameras; none by default.
     """
     styles = {
         "grasped": {**_GRASPED_STYLE, "ms": 3.0},
         "behind the body": {**_MARKER_STYLE, "mfc": "none"},
-        CAMERA_ENTRY: {**_CAMERA_POINT_STYLE, "ms": 4.0},
+        camera_points: {**_CAMERA_POINT_STYLE, "ms": 4.0},
     }
     return [
         Line2D(
@@ -385,7 +385,8 @@ def legend_handles(*entries: str) -> list[Line2D]:
             label=name,
             **styles.get(name, {**_MARKER_STYLE, "mfc": VERMILION}),
         )
-        for name in entries
+        for name in (*entries, camera_points)
+        if name
     ]
 
 

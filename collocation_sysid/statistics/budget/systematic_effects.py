@@ -41,6 +41,7 @@ from ...recording.homogeneous_deformation import (
     HomogeneousDeformation,
 )
 from ...recording.nuisance import DEGREE
+from .contact_effects import obstacle_shifts_m
 from .platen_slip import slip_displacements_m
 from .shape_error import (
     CORRELATION,
@@ -50,7 +51,6 @@ from .shape_error import (
     surface_modes,
     thickness_m,
 )
-from .size_effect import obstacle_shifts_m
 
 # Differences by a scale.
 SMALL = 1e-4
@@ -437,7 +437,7 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
 
     From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths. Goals of grasped nodes scale
     about the middle of the grasps; obstacles keep their size and are moved so that they first touch
-    the body as before, see `size_effect.obstacle_shifts_m`. Contact areas grow by s², and a contact
+    the body as before, see `contact_effects.obstacle_shifts_m`. Contact areas grow by s², and a contact
     stiffness that is not stated falls by s, as it follows the edges of the mesh.
 
     Buoyancy and the mass of moved air grow by s³, and drag by s². The own mass grows by s³ unless
@@ -869,7 +869,7 @@ ASSUMPTIONS = (
         "body_scale",
         "1",
         sigma=0.01,
-        description="size of the mesh",
+        description="relative error of the size of the mesh",
         remedy="measure two lengths of the real body and scale the mesh to them",
         effect=_size,
     ),
@@ -877,8 +877,8 @@ ASSUMPTIONS = (
         "rest_shape",
         "1",
         sigma=0.58,
-        description="weight under which the mesh was deformed when it was made, along each axis, if "
-        "object.rest_shape is not stated",
+        description="share of the weight of the body under which the mesh was deformed when "
+        "it was made, along each axis, if object.rest_shape is not stated",
         remedy="state object.rest_shape: whether the mesh is free of stress, or the shape in "
         "which the body hung or stood during its scan",
         effect=_rest_shape,
@@ -888,7 +888,8 @@ ASSUMPTIONS = (
         "surface",
         "1",
         sigma=0.005,
-        description="displacement of the surface along its normal, relative to the thickness",
+        description="displacement of the surface of the body from that of the mesh along its "
+        "normal, relative to the thickness",
         remedy="measure the thickness of the real body at several places",
         effect=_surface,
         component_names=_MODES,
@@ -897,7 +898,7 @@ ASSUMPTIONS = (
         "mass",
         "1",
         sigma=0.01,
-        description="mass of the body, if it is not estimated",
+        description="relative error of the mass of the body, if the mass is not estimated",
         remedy="weigh the body",
         effect=_mass,
     ),
@@ -905,7 +906,8 @@ ASSUMPTIONS = (
         "density_gradient",
         "1",
         sigma=0.05,
-        description="density at one end of the body relative to that in its middle",
+        description="relative difference of the density at one end of the body from that in "
+        "its middle",
         remedy="weigh two halves of a specimen",
         effect=_density_gradient,
         component_names="x y z",
@@ -914,7 +916,7 @@ ASSUMPTIONS = (
         "anisotropy",
         "1",
         sigma=0.05,
-        description="stiffness along one axis relative to that across it",
+        description="relative difference of the stiffness along one axis from that across it",
         remedy="record a second motion with the body held the other way round, or press a cube "
         "along each of its axes",
         effect=_anisotropy,
@@ -925,7 +927,8 @@ ASSUMPTIONS = (
         "stiffness_drift",
         "1",
         sigma=0.02,
-        description="stiffness at the end of a recording relative to that at its beginning",
+        description="relative change of the stiffness from the beginning to the end of a "
+        "recording",
         remedy="repeat the first recording at the end",
         effect=_drift,
         of_specimens=True,
@@ -934,7 +937,7 @@ ASSUMPTIONS = (
         "time_scale",
         "1",
         sigma=1e-4,
-        description="rate of all clocks",
+        description="relative error of the rate of all clocks",
         remedy="compare all clocks with a reference clock",
         effect=_time_scale,
     ),
@@ -942,7 +945,7 @@ ASSUMPTIONS = (
         "poisson",
         "",
         sigma=0.02,
-        description="Poisson's ratio, if it is stated",
+        description="error of a stated Poisson's ratio",
         remedy="measure Poisson's ratio in a tension test, or estimate it; solid rubber is nearly "
         "incompressible: state poisson = 0.499 in [parameters], and the deviation of this value, "
         "poisson = 0.0005, in [uncertainty.assumptions]",
@@ -953,8 +956,8 @@ ASSUMPTIONS = (
         "damping_law",
         "1",
         sigma=1.0,
-        description="damping force of another objective law, as a fraction of its difference from the "
-        "stated law",
+        description="effect of another objective damping law, as a fraction of the complete "
+        "difference of its damping force from that of the stated law",
         remedy="compare the laws with compare-models --damping on faster and slower motions, "
         'or state damping_law = "none" where the law is known',
         effect=_objective_damping,
@@ -964,8 +967,8 @@ ASSUMPTIONS = (
         "rayleigh_damping",
         "1",
         sigma=None,
-        description="damping force of the Rayleigh law, as a fraction of its difference from the stated "
-        "law",
+        description="effect of Rayleigh damping, as a fraction of the complete difference of "
+        "its damping force from that of the stated law",
         remedy="compare the laws with compare-models --damping on motions that rotate "
         "the body",
         effect=_rayleigh_damping,
@@ -1021,7 +1024,7 @@ ASSUMPTIONS = (
         "buoyancy",
         "1",
         sigma=AIR_DENSITY_DEVIATION,
-        description="buoyancy relative to that of the model, because of the density of the air",
+        description="relative error of the buoyancy, because of the density of the air",
         remedy="state the density of the air",
         effect=_buoyancy,
     ),
@@ -1029,7 +1032,7 @@ ASSUMPTIONS = (
         "added_mass",
         "1",
         sigma=AIR_COEFFICIENT_DEVIATION,
-        description="added mass of the air relative to that of the model",
+        description="relative error of the added mass of the air",
         remedy="repeat the motion more slowly, or with a heavier specimen",
         effect=_added_mass,
     ),
@@ -1037,7 +1040,7 @@ ASSUMPTIONS = (
         "air_drag",
         "1",
         sigma=AIR_COEFFICIENT_DEVIATION,
-        description="drag of the air relative to that of the model",
+        description="relative error of the drag of the air",
         remedy="repeat the motion more slowly, or with a heavier specimen",
         effect=_air_drag,
     ),
@@ -1075,123 +1078,125 @@ class Assumptions(Options):
 
     Attributes
     ----------
-    body_scale
-        Size of the mesh [1].
-    rest_shape
-        Weight under which the mesh was deformed when it was made, along each axis, if
-        object.rest_shape is not stated [1].
-    surface
-        Displacement of the surface along its normal, relative to the thickness [1].
-    mass
-        Mass of the body, if it is not estimated [1].
-    density_gradient
-        Density at one end of the body relative to that in its middle [1].
-    anisotropy
-        Stiffness along one axis relative to that across it [1].
-    stiffness_drift
-        Stiffness at the end of a recording relative to that at its beginning [1].
-    time_scale
-        Rate of all clocks [1].
-    poisson
-        Poisson's ratio, if it is stated [1].
-    damping_law
-        Damping force of another objective law, as a fraction of its difference from the stated law
-        [1].
-    rayleigh_damping
-        Damping force of the Rayleigh law, as a fraction of its difference from the stated law [1].
-    grip_layer_m
+    body_scale : float or "none"
+        Relative error of the size of the mesh [1].
+    rest_shape : float or "none"
+        Share of the weight of the body under which the mesh was deformed when it was made, along
+        each axis, if object.rest_shape is not stated [1].
+    surface : float or "none"
+        Displacement of the surface of the body from that of the mesh along its normal, relative to
+        the thickness [1].
+    mass : float or "none"
+        Relative error of the mass of the body, if the mass is not estimated [1].
+    density_gradient : float or "none"
+        Relative difference of the density at one end of the body from that in its middle [1].
+    anisotropy : float or "none"
+        Relative difference of the stiffness along one axis from that across it [1].
+    stiffness_drift : float or "none"
+        Relative change of the stiffness from the beginning to the end of a recording [1].
+    time_scale : float or "none"
+        Relative error of the rate of all clocks [1].
+    poisson : float or "none"
+        Error of a stated Poisson's ratio [1].
+    damping_law : float or "none"
+        Effect of another objective damping law, as a fraction of the complete difference of its
+        damping force from that of the stated law [1].
+    rayleigh_damping : float or "none"
+        Effect of Rayleigh damping, as a fraction of the complete difference of its damping force
+        from that of the stated law [1].
+    grip_layer_m : float, "none" or table
         Compliance of grip and skin, as the thickness of a layer of the body's material [m].
-    machine_compliance_m_n
+    machine_compliance_m_n : float, "none" or table
         Compliance of the test bench [m/N].
-    platen_friction
+    platen_friction : float or "none"
         Coefficient of friction of platens between which nodes slide [1].
-    platen_slip
+    platen_slip : float or "none"
         Slip of faces that are pressed by platens and held along all axes, as a fraction of that
         without friction, if only loads are measured [1].
-    contact_stiffness
+    contact_stiffness : float or "none"
         Compliance of the contact with obstacles, as a fraction of that of the pressure law [1].
-    buoyancy
-        Buoyancy relative to that of the model, because of the density of the air [1].
-    added_mass
-        Added mass of the air relative to that of the model [1].
-    air_drag
-        Drag of the air relative to that of the model [1].
-    marker_offset_m
+    buoyancy : float or "none"
+        Relative error of the buoyancy, because of the density of the air [1].
+    added_mass : float or "none"
+        Relative error of the added mass of the air [1].
+    air_drag : float or "none"
+        Relative error of the drag of the air [1].
+    marker_offset_m : float or "none"
         Errors of the positions in reference_m without a reference_sigma_m; they rotate with the
         body [m].
-    camera_offset_m
+    camera_offset_m : float or "none"
         A constant offset of each marker in the cameras' frame [m].
-    calibration_scale
+    calibration_scale : float or "none"
         Scale error of all lengths that the cameras measure: the factor minus one [1].
-    calibration_distortion_1_m2
+    calibration_distortion_1_m2 : float or "none"
         Coefficient k of a radial distortion by the cameras: distances r from the middle of the body
         are multiplied by 1 + k r² [1/m²].
-    time_shift_s
+    time_shift_s : float or "none"
         How much later than stated the markers were measured, by the clock of the grasps [s].
-    clock_rate
+    clock_rate : float or "none"
         How much slower the clock of the markers runs than the clock of the grasps [1].
-    pose_turn_rad
+    pose_turn_rad : float or "none"
         A constant rotation of grasps and body in the cameras' frame, which rotates gravity in the
         body's frame [rad].
-    pose_shift_m
+    pose_shift_m : float or "none"
         A constant translation of grasps and body in the cameras' frame [m].
-    gravity_rad
+    gravity_rad : float or "none"
         A tilt of the direction of gravity [rad].
-    hand_eye_rad
+    hand_eye_rad : float or "none"
         A constant rotation of the body in its grasps [rad].
-    hand_eye_m
+    hand_eye_m : float or "none"
         A constant translation of the body in its grasps; rotation and translation are estimated if
         the start is an equilibrium and there are markers [m].
-    strain_zero
+    strain_zero : float or "none"
         A constant offset of the strains of a specimen [1].
-    displacement_zero_m
+    displacement_zero_m : float or "none"
         A constant offset of each prescribed displacement along each of its axes [m].
-    obstacle_offset_m
+    obstacle_offset_m : float or "none"
         A constant offset of each obstacle along its normal, or along the axis of its displacement;
         it changes the time at which the obstacle touches the body [m].
-    obstacle_tilt_rad
+    obstacle_tilt_rad : float or "none"
         A constant tilt of each obstacle that is a plane or a box, about the point of the plane or
         the middle of the box [rad].
-    obstacle_time_s
+    obstacle_time_s : float or "none"
         Delay of each obstacle's motion, to first order [s].
-    tension_factor
+    tension_factor : float or "none"
         Scale error of the tension of each tendon: the factor minus one [1].
-    tension_lost_n
+    tension_lost_n : float or "none"
         Tension of each tendon that is lost by friction [N].
-    pressure_factor
+    pressure_factor : float or "none"
         Scale error of each pressure: the factor minus one [1].
-    pressure_lost_pa
+    pressure_lost_pa : float or "none"
         Amount by which each pressure is lower than stated [Pa].
-    pressure_lag
+    pressure_lag : float or "none"
         Logarithm of the ratio of the true lag of each pressure to the stated lag_s [1].
-    joining_s
+    joining_s : float or "none"
         Delay of the time at which each point mass or force begins or ends, if this time is within
         the recording [s].
-    tare
+    tare : float or "none"
         A constant offset of each component of a force sensor, in multiples of its sigma [σ].
-    sensor_time_s
+    sensor_time_s : float or "none"
         Delay of the force sensors, limited to three standard deviations of its prior [s].
-    sensor_lag_s
+    sensor_lag_s : float or "none"
         Time constant of a first-order low-pass in the sensor, limited to values between zero and
         three standard deviations of its prior [s].
-    tool_kg
+    tool_kg : float or "none"
         Mass of the tool between a sensor and the body [kg].
-    tool_m
+    tool_m : float or "none"
         Centre of the tool relative to the point of the sensor; in the frame of the world, relative
         to the centre of the grasped nodes [m].
-    depth_turn_rad
+    depth_turn_rad : float or "none"
         Rotation of each depth camera about the middle of the body, stated along the axes of the
         camera [rad].
-    depth_shift_m
+    depth_shift_m : float or "none"
         Translation of each depth camera; if neither prior is stated, the search begins by aligning
         the first image with the body [m].
-    depth_bias_m
+    depth_bias_m : float or "none"
         Offset that is added to each depth of an image [m].
-    depth_scale
+    depth_scale : float or "none"
         Scale error of each depth of an image: the factor minus one [1].
-    depth_time_s
+    depth_time_s : float or "none"
         Delay of a depth camera, limited to three standard deviations of its prior [s].
-    depth_edge_px
+    depth_edge_px : float or "none"
         Distance by which silhouettes in the images of each depth camera end inside the outline of
         the body, in pixels [px].
     """

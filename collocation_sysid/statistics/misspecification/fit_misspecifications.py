@@ -187,7 +187,7 @@ def _grasp_layer_hypotheses(
     """Yield hypotheses, about the subject `of`, of all grasps one layer of elements deeper, and one
     less deep, where that is possible; `corrected` is the changed experiment.
     """
-    for deeper, deep in ((True, "deeper"), (False, "less deep")):
+    for deeper, deep in ((True, "more"), (False, "fewer")):
         if (layered := _with_shifted_grasps(declared, deeper)) is not None:
             yield Hypothesis(
                 "grasp-layer", of, data={"deep": deep}, corrected=layered

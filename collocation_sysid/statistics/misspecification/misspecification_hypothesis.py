@@ -142,8 +142,12 @@ def clock_hypothesis(
     handicap : float
         Divisor of the hypothesis' strength.
     """
-    when, do = ("late", "add") if lag_s > 0 else ("early", "subtract")
-    data = {"when": when, "by_ms": 1e3 * abs(lag_s), "do": do}
+    is_late = lag_s > 0
+    data = {
+        "when": "late" if is_late else "early",
+        "by_ms": 1e3 * abs(lag_s),
+        "do": "add this to" if is_late else "subtract this from",
+    }
     return Hypothesis(
         "clock", subject, data=data, corrected=corrected, handicap=handicap
     )

@@ -303,7 +303,7 @@ def _message(
         cause = (
             f"{100 * diagnosis.constant_share:.0f} % of the squared residuals is a constant "
             f"part: its position on the body is wrong by {offset:.2g} mm; "
-            f"{'widen the prior of' if estimated[0] else 'estimate'} marker_offsets"
+            f"{'widen the prior of' if estimated[0] else 'estimate'} nuisance.marker_offsets"
         )
     elif diagnosis.early_share > DOMINANT:
         end_s = EARLY_TIME * (t_s[-1] - t_s[0])
@@ -311,7 +311,7 @@ def _message(
             f"{100 * diagnosis.early_share:.0f} % of the squared residuals occurs in the "
             f"first {end_s:.2g} s: the initial state or the release time is wrong"
         )
-        cause += "" if estimated[1] else "; estimate time_shift"
+        cause += "" if estimated[1] else "; estimate nuisance.time_shift"
     elif diagnosis.oscillating_share > DOMINANT:
         cause = _oscillation_message(diagnosis, t_s, motion=motion)
     elif persistent and diagnosis.lag1 > DOMINANT:
@@ -366,7 +366,10 @@ def _oscillation_message(
             f"{message}, the frequency of the motion: stiffness, damping or mass of the model "
             "are wrong"
         )
-    return f"{message}, unlike the motion: the model lacks a vibration or a natural mode"
+    return (
+        f"{message}, which is not a frequency of the motion: the model lacks a vibration or a "
+        "natural mode"
+    )
 
 
 # Probability of reporting any sample of noise as an outlier.

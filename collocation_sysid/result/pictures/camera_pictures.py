@@ -4,6 +4,7 @@ surface.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,12 @@ from numpy.typing import NDArray
 
 from ...common.array_types import Array
 from ..figure_style import PAGE_MM, SMALL_PT, VERMILION
+from ..replay import MotionRecord
 
+# Beginning of the names of pictures; `features.depth_feature` has their caption.
+KIND = "depth"
+# Name of the points in the legend of a film.
+LEGEND_ENTRY = "depth image"
 # Millimetres in an inch, the unit of lengths in Matplotlib.
 MM_PER_INCH = 25.4
 # Largest width of a panel, as a share of the page.
@@ -31,6 +37,12 @@ COVERED_SHARE = 0.3
 SCALE_PERCENTILE = 95
 # Distance from the points up to which outlines are shown, over the extent of the points.
 OUTLINE_MARGIN = 0.5
+
+
+def camera_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
+    """Yield name and picture of the images of each camera, named "depth_<experiment>_<camera>"."""
+    for name, rows in replay.visible_points.items():
+        yield f"{KIND}_{replay.name}_{name}", depth_picture(rows)
 
 
 def depth_picture(rows: Array) -> Figure:

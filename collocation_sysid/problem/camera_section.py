@@ -37,8 +37,8 @@ class DepthCameraSection(Section):
     Attributes
     ----------
     matrix : list, optional
-        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs
-        no matrix; if it has one, an offset and a scale error of the depth are estimated, and
+        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels; a cloud needs
+        no matrix. If a cloud has one, an offset and a scale error of the depth are estimated, and
         surfaces that face away from the camera are not used.
     distortion : list
         k1, k2, p1, p2, k3 of the model of Brown and Conrady.
@@ -221,6 +221,6 @@ class DepthSection(MeasurementSection):
             else np.array(t_s, dtype=float).ravel()
         )
         if len(times) != count:
-            message = f"found {len(times)} times for {count} images or clouds; expected as many"
+            message = f"found {len(times)} times for {count} images or clouds; expected one time for each"
             raise InputError(message, where=f"{where}.t_s")
         return content, times
