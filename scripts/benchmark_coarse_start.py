@@ -1,8 +1,8 @@
-"""Compare the start on a coarser mesh with the direct start: time, sweeps and difference of results.
+"""Start on a coarser mesh, compared with the direct start: time, sweeps and difference of results.
 
-The swung cylinder of `benchmark_methods.py` with noise, four parameters without a guess. Both
-solves run one after the other in one process on one thread. Processor time is hardly lengthened by
-other work on the machine, wall time is.
+The recording is the swung cylinder of `benchmark_methods.py` with noise; four parameters have no
+guess. Both solves run one after the other in one process on one thread. Other work on the machine
+changes the processor time little, but it increases the wall time.
 
     python scripts/benchmark_coarse_start.py                        # 2,013 nodes, 40 steps
     python scripts/benchmark_coarse_start.py --size 5000 --steps 100
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from benchmark_methods import TRUTH, cylinder, swung
+from benchmark_methods import TRUTH, cylinder, swung_cylinder
 
 from collocation_sysid import Body, Problem, Unknown, simulate
 from collocation_sysid.methods.reduced_space import ReducedSpace
@@ -82,7 +82,7 @@ def swung_problem(mesh: str, steps: int) -> Problem:
     body = Body(
         cylinder(mesh), density_kg_m3=20.0, damping="rayleigh", threads=1
     )
-    experiment = swung(body, steps)
+    experiment = swung_cylinder(body, steps)
     tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
     noise_m = NOISE_M * np.random.default_rng(0).normal(size=tracks.shape)
     print(f"{len(body.nodes_m):,} nodes, {steps} samples", flush=True)
@@ -127,7 +127,7 @@ def print_ratios(coarse: Measurement, direct: Measurement) -> None:
     """Print the ratios of the coarse start to the direct one, and the difference of the results."""
     difference = np.abs(coarse.solution.q - direct.solution.q).max()
     print(
-        f"coarse over direct: {coarse.processor_s / direct.processor_s:.2f} processor time, "
+        f"coarse start over direct start: {coarse.processor_s / direct.processor_s:.2f} processor time, "
         f"{coarse.wall_s / direct.wall_s:.2f} wall time, "
         f"{coarse.solution.iterations / direct.solution.iterations:.2f} sweeps; "
         f"logarithms of the parameters differ by at most {difference:.1e}"

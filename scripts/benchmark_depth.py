@@ -1,10 +1,10 @@
-"""Time the search with one depth image of 18,900 points against that with ten markers.
+"""Time of the search with one depth image of 18,900 points, compared with that with ten markers.
 
-A bar of 875 nodes hangs from one end; of its Young's modulus there is no guess, and the pose, bias
-and scale of the camera are estimated. An earlier revision and this one solve both in turn, in
-processes of their own and on one thread, so that other work on the machine slows all. Printed are
-the least processor times of `solve`, without imports and the reading of data, their ratio for
-either revision, and the relative difference of the estimates.
+A bar of 875 nodes hangs from one end. Its Young's modulus has no guess, and the pose, bias and scale
+of the camera are estimated. An earlier revision and this one solve both in turn, in separate
+processes on one thread, so that other work on the machine slows all. The output has the smallest
+processor times of `solve`, without imports and the reading of data, their ratio for both revisions,
+and the relative difference of the estimates.
 
     python scripts/benchmark_depth.py [--baseline bbaeea20] [--rounds 3]
 """
@@ -32,15 +32,16 @@ TRUTH = {
     "gamma_r_s": 1e-3,
     "gamma_m_1_s": 0.1,
 }
+# Edges of the bar [m], and numbers of cells along them.
 SIZE_M = (0.12, 0.03, 0.02)
 CELLS = (24, 4, 6)
-# Pixels and focal length: with them some 18,900 points are on the bar.
-SHAPE = (480, 640)
+# Image shape (rows, columns) and focal length [px]; with these about 18,900 points are on the bar.
+SHAPE_PX = (480, 640)
 FOCAL_PX = 750.0
 # Noise of the image and of the markers [m].
 NOISE_M = 1e-4
-MARKERS = 10
-# About the distance of the pixels on the bar [m]: few points are left out.
+MARKER_COUNT = 10
+# Smallest distance of two points that are used [m]: about that of the pixels, so that few are omitted.
 SPACING_M = 4e-4
 KINDS = ("markers", "depth")
 
@@ -51,40 +52,42 @@ def main() -> None:
     parser.add_argument("--baseline", default="bbaeea20", metavar="REVISION")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--solve", choices=KINDS)
-    given = parser.parse_args()
-    if given.solve:
-        print(json.dumps(solved(given.solve)))
+    arguments = parser.parse_args()
+    if arguments.solve:
+        print(json.dumps(solve_once(arguments.solve)))
         return
     with tempfile.TemporaryDirectory() as folder:
-        before = checkout(given.baseline, Path(folder) / "before")
-        trees = {given.baseline: before, "now": ROOT}
+        baseline_tree = checkout(arguments.baseline, Path(folder) / "before")
+        trees = {arguments.baseline: baseline_tree, "now": ROOT}
         runs = {(name, kind): [] for name in trees for kind in KINDS}
-        for _ in range(given.rounds):
+        for _ in range(arguments.rounds):
             for (name, kind), results in runs.items():
-                results.append(in_process(trees[name], kind))
+                results.append(solve_in_own_process(trees[name], kind))
     for name in trees:
-        spent_s = {
+        best_s = {
             kind: min(each["spent_s"] for each in runs[name, kind])
             for kind in KINDS
         }
         print(
-            f"{name}: markers {spent_s['markers']:.2f} s, "
-            f"{runs[name, 'depth'][0]['points']} points {spent_s['depth']:.2f} s, "
-            f"ratio {spent_s['depth'] / spent_s['markers']:.2f}"
+            f"{name}: markers {best_s['markers']:.2f} s, "
+            f"{runs[name, 'depth'][0]['points']} points {best_s['depth']:.2f} s, "
+            f"the latter over the former {best_s['depth'] / best_s['markers']:.2f}"
         )
     for kind in KINDS:
-        first, second = (runs[name, kind][0]["young_pa"] for name in trees)
-        print(f"{kind}: E differs by {abs(second / first - 1):.1e}")
+        baseline_pa, current_pa = (
+            runs[name, kind][0]["young_pa"] for name in trees
+        )
+        print(f"{kind}: E differs by {abs(current_pa / baseline_pa - 1):.1e}")
 
 
-def in_process(tree: Path, kind: str) -> dict:
-    """Return the result of `solved` in a process with the package of a tree."""
+def solve_in_own_process(tree: Path, kind: str) -> dict:
+    """Return the result of `solve_once` in a process with the package of a tree."""
     environment = os.environ | {
         "PYTHONPATH": f"{tree}{os.pathsep}{Path(__file__).parent}",
         "COLLOCATION_SYSID_THREADS": "1",
         "OMP_NUM_THREADS": "1",
     }
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, __file__, "--solve", kind],
         env=environment,
         cwd=tree,
@@ -92,40 +95,40 @@ def in_process(tree: Path, kind: str) -> dict:
         stdout=subprocess.PIPE,
         text=True,
     )
-    return json.loads(done.stdout)
+    return json.loads(process.stdout)
 
 
-def solved(kind: str) -> dict:
+def solve_once(kind: str) -> dict:
     """Return the processor time of a solve [s], the estimate and the number of points."""
-    experiment = observed(kind)
+    experiment = make_experiment(kind)
     unknown = {**TRUTH, "young_pa": cs.Unknown()}
     problem = cs.Problem([experiment], cs.Parameters.from_mapping(unknown))
-    solve = cs.solve  # imports the modules that it needs
+    solve = cs.solve  # the access imports the modules that it needs
     began_s = time.process_time()
     solution = solve(problem)
-    spent_s = time.process_time() - began_s
+    processor_s = time.process_time() - began_s
     points = sum(len(p) for d in experiment.depths for p in d.points_m)
     young_pa = solution.parameters["young_pa"]
-    return {"spent_s": spent_s, "young_pa": young_pa, "points": points}
+    return {"spent_s": processor_s, "young_pa": young_pa, "points": points}
 
 
-def observed(kind: str) -> cs.Experiment:
+def make_experiment(kind: str) -> cs.Experiment:
     """Return the hanging bar with its markers, or with one image of a camera."""
     body = cs.Body(cs.box_mesh(SIZE_M, CELLS), density_kg_m3=1070.0)
-    held = cs.Grasp(
+    clamp = cs.Grasp(
         np.flatnonzero(body.nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed()
     )
     rng = np.random.default_rng(0)
     places_m = body.nodes_m[
-        np.linspace(0, len(body.nodes_m) - 1, MARKERS + 1).astype(int)[1:]
+        np.linspace(0, len(body.nodes_m) - 1, MARKER_COUNT + 1).astype(int)[1:]
     ]
     markers = cs.Markers(
-        np.zeros(1), np.zeros((1, MARKERS, 3)), NOISE_M, places_m=places_m
+        np.zeros(1), np.zeros((1, MARKER_COUNT, 3)), NOISE_M, places_m=places_m
     )
     experiment = cs.Experiment(
         body,
         [0.0],
-        [held],
+        [clamp],
         markers,
         kind="static",
         nuisance=cs.Nuisance.none(),
@@ -143,9 +146,9 @@ def observed(kind: str) -> cs.Experiment:
     camera = camera_at(x.mean(axis=0))
     rotations, translations = camera.pose_at([0.0])
     image_m = cs.depth_image(
-        camera, SHAPE, (corners_m - translations[0]) @ rotations[0]
+        camera, SHAPE_PX, (corners_m - translations[0]) @ rotations[0]
     )
-    image_m += NOISE_M * rng.normal(size=SHAPE)
+    image_m += NOISE_M * rng.normal(size=SHAPE_PX)
     unknown = cs.Nuisance.none(
         depth_turn_rad=0.09,
         depth_shift_m=0.02,
@@ -156,21 +159,26 @@ def observed(kind: str) -> cs.Experiment:
         "front", image_m, camera, NOISE_M, spacing_m=SPACING_M
     )
     return cs.Experiment(
-        body, [0.0], [held], kind="static", depths=[depth], nuisance=unknown
+        body, [0.0], [clamp], kind="static", depths=[depth], nuisance=unknown
     )
 
 
-def camera_at(middle_m: np.ndarray) -> cs.DepthCamera:
-    """Return a camera that looks at a place from the side and from above."""
-    ahead = np.array([0.0, 0.9, -0.44])
-    ahead /= np.linalg.norm(ahead)
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
+def camera_at(centre_m: np.ndarray) -> cs.DepthCamera:
+    """Return a camera that looks at a point (3,) [m] from the side and from above."""
+    optical_axis = np.array([0.0, 0.9, -0.44])
+    optical_axis /= np.linalg.norm(optical_axis)
+    right = np.cross(optical_axis, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3] = np.column_stack(
-        [right, np.cross(ahead, right), ahead, middle_m - 0.33 * ahead]
+        [
+            right,
+            np.cross(optical_axis, right),
+            optical_axis,
+            centre_m - 0.33 * optical_axis,
+        ]
     )
-    height, width = SHAPE
+    height, width = SHAPE_PX
     matrix = [
         [FOCAL_PX, 0, width / 2],
         [0, FOCAL_PX, height / 2],

@@ -98,6 +98,7 @@ def main() -> None:
 
 
 def noisy_problem(name: str) -> Problem:
+    """Return a problem of `TRUTH` with the noise of `NOISE_M`."""
     if name == "block":
         return twin(name, SOFT, seed=0, samples=101, integrator="midpoint")
     problem = Problem.read(PROBLEMS / name / "problem.toml")
@@ -121,6 +122,7 @@ def noisy_problem(name: str) -> Problem:
 def print_comparison(
     name: str, problem: Problem, live: LiveEstimator, frames: list[Frame]
 ) -> None:
+    """Stream a recording, solve it as a batch, and print latencies and differences of the estimates."""
     latencies_s = []
     relinearised_rows = []
     with without_garbage_of_startup():
@@ -182,6 +184,7 @@ def row_time_s(problem: Problem) -> float:
 
 
 def _frames_to_and_fro(frames: list[Frame]) -> Iterator[Frame]:
+    """Yield the frames forward and backward without end, with increasing times."""
     there_and_back = [*frames, *frames[-2:0:-1]]
     interval_s = frames[1].t_s - frames[0].t_s
     for k in count():

@@ -117,7 +117,7 @@ def make_sweep(
 
 
 def processor_time_s(run: Callable[[], object]) -> float:
-    """Processor time of a run [s]."""
+    """Call a function, and return its processor time [s]."""
     began = time.process_time()
     run()
     return time.process_time() - began

@@ -109,7 +109,7 @@ def experiment_of(
     `mesh` has the numbers of rings and layers, such as 2x8; `steps` is the number of samples.
     """
     body = Body(cylinder(mesh), density_kg_m3=20.0, damping="rayleigh")
-    experiment = swung(body, steps)
+    experiment = swung_cylinder(body, steps)
     tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
     tracks = tracks + noise_m * np.random.default_rng(seed).normal(
         size=tracks.shape
@@ -123,7 +123,7 @@ def cylinder(mesh: str) -> TetMesh:
     return cylinder_mesh(0.04, 0.16, rings, layers)
 
 
-def swung(body: Body, steps: int) -> Experiment:
+def swung_cylinder(body: Body, steps: int) -> Experiment:
     """Return the recording of a hanging, swung cylinder without tracks, with `steps` samples."""
     t_s = np.arange(steps, dtype=np.float64) * STEP_S
     poses = swing(
@@ -215,7 +215,7 @@ def problem_with_unknowns(
     body = Body(
         cylinder(mesh), density_kg_m3=20.0, prony=["prony_1"] if memory else []
     )
-    experiment = swung(body, steps)
+    experiment = swung_cylinder(body, steps)
     if case == "with a wrench":
         sensor = Wrench(experiment.t_s, np.zeros((steps, 6)), *WRENCH_SIGMAS)
         grasps = [replace(grasp, wrench=sensor) for grasp in experiment.grasps]

@@ -230,7 +230,7 @@ def run_in_this_process(
 def run_in_own_process(
     problem: str, name: str, iterations: int
 ) -> tuple[SolveTimes | None, Factorisations | None]:
-    """Run IPOPT with a setting in a process of its own.
+    """Run IPOPT with a setting in a separate process.
 
     Parameters
     ----------

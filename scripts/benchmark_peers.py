@@ -3,7 +3,7 @@
 A soft cylinder (95 nodes, 288 tetrahedra, simulated by MuJoCo's flex) hangs from a hand and is
 swung for half a second. Six markers with 0.1 mm of noise are measured; Young's modulus, Poisson's
 ratio and the damping time are unknown. Every candidate has the same recording, mesh, guess and
-bounds, one core and a process of its own. The answer is reached when all parameters stay within
+bounds, one core and a separate process. The answer is reached when all parameters stay within
 1 % of the best answer, the least-squares estimate at sixteen time steps per sample. Times are
 computing times: unlike elapsed times they do not depend on what else the machine does.
 
@@ -11,7 +11,7 @@ computing times: unlike elapsed times they do not depend on what else the machin
     python scripts/benchmark_peers.py --only reduced-space mujoco-sysid --out peers.md
 
 MuJoCo is required, because it simulates the recording: ``pip install mujoco``. Other tools are
-optional; a row of the table says which are not installed.
+optional; a row of the table names those that are not installed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Time and memory of a simulation and a sweep of bodies with 500 to 20,000 nodes.
 
 The body is the swung cylinder of `benchmark_methods.py`, with the default damping law or with
-Rayleigh's. Each line is measured in a process of its own, so that peak memory is that of the line.
+Rayleigh's. Each line is measured in a separate process, so that the peak memory is that of the line.
 On one thread, times are processor times, which other work on the machine changes little; on more
 threads they are wall times. A sweep consists of a feasibility step and the sensitivities to four
 parameters; a few time steps are enough to measure the cost of one.
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
-from benchmark_methods import PARAMETERS, TRUTH, cylinder, swung
+from benchmark_methods import PARAMETERS, TRUTH, cylinder, swung_cylinder
 
 from collocation_sysid import Body, Collocation
 from collocation_sysid.program.forward.newton_solver import NewtonOptions
@@ -97,7 +97,7 @@ def measure_size(
         element=element,
         threads=threads,
     )
-    collocation = Collocation([swung(body, steps + 1)], PARAMETERS)
+    collocation = Collocation([swung_cylinder(body, steps + 1)], PARAMETERS)
     (segment,) = collocation.transcriptions
     equations = segment.equations_at(
         np.log([TRUTH[name] for name in PARAMETERS.names]), np.zeros(0)

@@ -49,6 +49,7 @@ GRIPPER_SHIFTS_M = np.array(
     [[0.0, 0.0, -4e-4 * k] for k in range(6)]
     + [[5e-4 * k, 0.0, -2e-3] for k in range(1, 6)]
 )
+# Friction coefficient of the plate.
 FRICTION = 0.5
 # Slip from sample to sample below which friction is smooth [m].
 SLIP_M = 1e-4

@@ -30,6 +30,7 @@ from collocation_sysid.recording import (
 )
 from collocation_sysid.recording.depth_camera import depth_image
 
+# Edges [m], numbers of elements and density of the bar.
 SIZE_M = (0.12, 0.03, 0.02)
 DIVISIONS = (4, 1, 1)
 DENSITY_KG_M3 = 1070.0

@@ -92,7 +92,10 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "--from", dest="source", type=Path, help="a folder that has the files"
+        "--from",
+        dest="source",
+        type=Path,
+        help="folder that has the files; without it, they are downloaded",
     )
     source = parser.parse_args().source
     arm_mesh(ArmShape()).write(FOLDER / "arm.vtu")

@@ -29,7 +29,9 @@ GROUPS = {
     "m2_u02": (3, 2, 4, 1, 0),
     "m2_u025": (2, 1, 3, 0, 4),
 }
+# Centre of the clamped section, from the base marker [m].
 BASE_TO_CENTRE_M = np.array([-0.030, -0.013, 0.0])
+# Length of the tentacle [m], and layers of elements.
 LENGTH_M = 0.360
 LAYERS = 14
 # Positions along the axis and radii there [m].

@@ -26,6 +26,7 @@ SOURCE = (
 RECORDINGS = tuple(
     f"beam_{trial}_V2_a.c3d" for trial in ("gravity", "load52", "load101")
 )
+# Edges of the beam and the corner with the smallest coordinates [m].
 SIZE_M = (0.10, 0.03, 0.03)
 ORIGIN_M = (-0.10, 0.0, 0.0)
 MESHES = {"beam.vtu": (5, 2, 2), "beam_coarse.vtu": (3, 1, 1)}
@@ -34,7 +35,10 @@ MESHES = {"beam.vtu": (5, 2, 2), "beam_coarse.vtu": (3, 1, 1)}
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--from", dest="source", type=Path, help="a folder that has the files"
+        "--from",
+        dest="source",
+        type=Path,
+        help="folder that has the files; without it, they are downloaded",
     )
     source = parser.parse_args().source
     for name, divisions in MESHES.items():

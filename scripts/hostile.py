@@ -486,15 +486,17 @@ def _with_depth(
         place.parent.mkdir(exist_ok=True)
         write(place)
         if place.parent == folder:
-            stated = f'file = "{file}"\n'
+            data_keys = f'file = "{file}"\n'
         else:
-            stated = f'file = "{place.parent.name}"\nt_s = [0.0, 0.04, 0.08]\n'
+            data_keys = (
+                f'file = "{place.parent.name}"\nt_s = [0.0, 0.04, 0.08]\n'
+            )
             for number in (1, 2):
                 shutil.copy(place, place.with_stem(str(number)))
         camera = "camera = { matrix = [[100, 0, 16], [0, 100, 12], [0, 0, 1]] }"
         with (folder / "problem.toml").open("a") as problem:
             problem.write(
-                f"\n[[experiment.depth]]\nsigma_m = 0.001\n{stated}{camera}\n"
+                f"\n[[experiment.depth]]\nsigma_m = 0.001\n{data_keys}{camera}\n"
             )
 
     return make
@@ -1069,8 +1071,8 @@ def _two_solves(
     outcomes = [each.outcome() for each in both]
     worst = max(range(2), key=lambda k: OUTCOMES.index(outcomes[k]))
     shown = run(("report", "out"), folder, limit_s)
-    whole = shown.code == 0 and not list(folder.glob(".*.partial*"))
-    if outcomes[worst] in ("refused", "accepted") and not whole:
+    is_complete = shown.code == 0 and not list(folder.glob(".*.partial*"))
+    if outcomes[worst] in ("refused", "accepted") and not is_complete:
         return "unclear", replace(
             both[worst],
             err=f"{[p.name for p in folder.glob('.*.partial*')]} {shown.err}",
@@ -1120,8 +1122,8 @@ def _datagrams(
         ):
             break
         time.sleep(0.02)
-    _, found, rest = running.output_text(running.err).partition("port ")
-    if not found:
+    _, port_label, rest = running.output_text(running.err).partition("port ")
+    if not port_label:
         return "unclear", running.finish(0.1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         address = "127.0.0.1", int(rest.split()[0])
@@ -1196,12 +1198,12 @@ def _interrupted(
         outcome = "refused"
     if outcome == "unclear" and code == 130:
         outcome = "refused"
-    whole = (
+    is_complete = (
         not (folder / "out").exists()
         or (folder / "out" / "result.json").is_file()
     )
     if outcome in ("refused", "accepted") and not (
-        whole and not list(folder.glob(".out.*"))
+        is_complete and not list(folder.glob(".out.*"))
     ):
         outcome = "unclear"
     return outcome, ended

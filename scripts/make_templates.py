@@ -1,4 +1,4 @@
-"""Make the recordings beside the templates of `collocation-sysid new --kind`, simulated with noise.
+"""Make the simulated, noisy recordings of the templates of `collocation-sysid new --kind`.
 
 Poses and forces come from midpoint simulations and equilibria at `YOUNG_PA` or `SWUNG`.
 """

@@ -121,7 +121,7 @@ def grasped_positions(mesh: cs.TetMesh, times_s: NDArray[np.floating]) -> Array:
 def recording(mesh: cs.TetMesh, positions_m: Array) -> cs.Experiment:
     """Return the experiment of noisy markers on node positions (T, n, 3) [m].
 
-    All free nodes get the same mass: the body has the largest density at which no node is heavier
+    All free nodes have the same mass: the body has the largest density at which no node is heavier
     than NODE_MASS_KG, and point masses add what is missing.
     """
     t_s = SAMPLE_S * np.arange(SAMPLE_COUNT)

@@ -23,12 +23,14 @@ from collocation_sysid.extras.studies.study_rows import (
 )
 from collocation_sysid.problem import Problem
 
+# True parameters of the cylinder of the studies.
 TRUTH = {
     "lambda_pa": 200.0,
     "mu_pa": 300.0,
     "gamma_r_s": 0.009,
     "gamma_m_1_s": 1.0,
 }
+# Symbols of the parameters, in the order of `TRUTH`.
 PARAMETER_SYMBOLS = ("λ", "μ", "γ_r", "γ_m")
 
 # A run that does not end by its own time limit is killed this much later [s].

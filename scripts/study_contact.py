@@ -28,6 +28,7 @@ from collocation_sysid.model.contact.contact_force import contact_terms
 from collocation_sysid.recording.obstacle_solids import Solid
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
+# True constants of the block.
 YOUNG_PA = 1e4
 POISSON = 0.3
 LAW = {
@@ -36,6 +37,7 @@ LAW = {
     "gamma_r_s": 0.01,
     "gamma_m_1_s": 1.0,
 }
+# Plane-strain modulus E/(1 − ν²) [Pa], of Hertz's formulas.
 CONTACT_PA = YOUNG_PA / (1 - POISSON**2)
 # Radius of the obstacles, in half-widths of the contact (1 m): so large that strains are small.
 RADIUS_M = 50.0

@@ -246,6 +246,7 @@ def twin(
 
 
 def collocation_of(experiment: Experiment) -> Collocation:
+    """Return the program of an experiment whose guesses are the true parameters."""
     return Collocation(
         [experiment], parameters(np.array(list(TRUTH.values()))), SCHEME
     )
@@ -311,6 +312,7 @@ def has_standard_errors(uncertainty: Uncertainty) -> list[bool]:
 
 
 def header(sigma_m: float, twins: int) -> str:
+    """Return the size of the problem, and the range of coverages of exact intervals, as text."""
     experiment, _ = reference(sigma_m)
     low, high = binom.interval(0.95, twins, 0.95)
     return (

@@ -151,15 +151,14 @@ def table(design: Design) -> str:
     lines.append(
         "| standard error of | with the swing, % | with the designed motion, % | ratio |\n|---|---|---|---|"
     )
-    for name, after in design.after.compute_relative().items():
-        before = design.before.compute_relative()[name]
+    for name, after in design.after.relative.items():
+        before = design.before.relative[name]
         lines.append(
             f"| {name} | {100 * before:.3g} | {100 * after:.3g} | {before / after:.2f} |"
         )
     free = [item.name for item in design.recording.problem.parameters.free]
     before, after = (
-        max(b.compute_relative()[n] for n in free)
-        for b in (design.before, design.after)
+        max(b.relative[n] for n in free) for b in (design.before, design.after)
     )
     lines.append(
         f"| worst | {100 * before:.3g} | {100 * after:.3g} | {before / after:.2f} |"
@@ -213,7 +212,7 @@ def spread(design: Design, twins: int, seed: int) -> str:
         "| parameter | predicted standard error, % | standard deviation of estimates, % "
         "| ratio | bias, % |\n|---|---|---|---|---|"
     )
-    for name, predicted in design.after.compute_relative().items():
+    for name, predicted in design.after.relative.items():
         logarithms = np.log([each[name] for each in converged])
         deviation = logarithms.std(ddof=1)
         bias = logarithms.mean() - np.log(design.after.values[name])

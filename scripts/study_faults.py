@@ -224,15 +224,15 @@ def fit_from_truth(
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
     collocation = solution.collocation
     z = solution.z
-    found = uncertainty_at(collocation, z)
+    uncertainty = uncertainty_at(collocation, z)
     deviations = [(row, row.sigma) for row in assumed if row.sigma is not None]
     changes = changed_residuals(collocation, z, deviations)
     fit = linearise_fit(collocation, z)
     sources = VarianceSources.from_fit(
-        fit, changes, collocation.parameters, solution.q, found
+        fit, changes, collocation.parameters, solution.q, uncertainty
     )
-    lines = budget(sources, found, {}, problem.parameters)
-    return BudgetedFit(found, lines, solution.status.converged)
+    lines = budget(sources, uncertainty, {}, problem.parameters)
+    return BudgetedFit(uncertainty, lines, solution.status.converged)
 
 
 def relative_errors(uncertainty: Uncertainty) -> Array:
@@ -249,6 +249,7 @@ def relative_errors(uncertainty: Uncertainty) -> Array:
 
 
 def without_fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
+    """Return the exact recording, correctly described."""
     return experiment, experiment
 
 
@@ -378,7 +379,7 @@ def draw_assumption_errors(
     def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
         errors = {}
         for row in (row for row in ASSUMPTIONS if row.name in names):
-            for name in row.components:
+            for name in row.list_components():
                 error = (row.sigma or 0.0) * rng.standard_normal()
                 # Coefficients of the air are not negative.
                 errors[name] = max(error, -0.99) if row.name in AIR else error
@@ -431,6 +432,7 @@ FAULTS: dict[str, Callable[[Experiment, Generator], TrueAndStated]] = {
 
 
 def header(twins: int) -> str:
+    """Return the size of the problem, and the range of coverages of exact intervals, as text."""
     experiment = exact_recording()
     low, high = binom.interval(0.95, twins, 0.95)
     return (
@@ -442,6 +444,7 @@ def header(twins: int) -> str:
 
 
 def table_head() -> str:
+    """Return the two lines of the head of the table."""
     columns = [
         f"{c} {kind}, %"
         for kind in ("coverage", "combined coverage", "standard error")

@@ -29,6 +29,7 @@ UNDAMPED = {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 OGDEN_TERMS = ((6e5, 1.3), (-1e4, -2.0), (1e3, 5.0))
 # Largest stretches of the fits: where a handling robot works, and a moderate rubber test.
 LIMITS = (1.3, 2.5)
+# Tests that are fitted: one alone, or three.
 FITTED = (("uniaxial",), ("uniaxial", "equibiaxial", "planar"))
 ALL_TESTS = ("uniaxial", "equibiaxial", "planar", "biaxial")
 
@@ -120,12 +121,12 @@ def main() -> None:
         law for law in LAWS if options.laws is None or law.name in options.laws
     ]
     heads = (
-        "up to",
-        "fitted",
+        "stretch up to",
+        "fitted tests",
         "law",
-        "E MPa",
-        "fit kPa",
-        *(f"{test} kPa" for test in ALL_TESTS),
+        "E, MPa",
+        "error of the fit, kPa",
+        *(f"error of {test}, kPa" for test in ALL_TESTS),
     )
     rows = [
         row_of_tests(law, limit, tests)
@@ -138,11 +139,12 @@ def main() -> None:
         "λ₁ up to",
         "law",
         "constants with combined 95 % intervals",
-        "E MPa",
-        "fit kPa",
+        "E with combined interval, MPa",
+        "error of the fit, kPa",
+        "error of the prediction at larger λ₁, kPa",
     )
     rows = [row_of_stretches(law, limit) for limit in LIMITS for law in laws]
-    print(markdown((*heads, "larger λ₁ kPa"), rows))
+    print(markdown(heads, rows))
 
 
 def row_of_tests(

@@ -182,8 +182,15 @@ def table(fits: Sequence[SchemeFit]) -> str:
             for error, bound in zip(fit.errors, fit.at_bound, strict=True)
         ]
         name = fit.scheme if fit.converged else f"{fit.scheme} (not converged)"
-        misfit_and_time = (f"{1e3 * fit.rms_m:.2g}", f"{fit.time_s:.1f}")
-        lines.append((name, f"{1e3 * fit.step_s:g}", *cells, *misfit_and_time))
+        lines.append(
+            (
+                name,
+                f"{1e3 * fit.step_s:g}",
+                *cells,
+                f"{1e3 * fit.rms_m:.2g}",
+                f"{fit.time_s:.1f}",
+            )
+        )
     return markdown(heads, lines)
 
 

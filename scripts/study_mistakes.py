@@ -25,7 +25,7 @@ from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
 from wrong_twins import FAULTS, TRACK_FAULTS, WRENCH_FAULTS, Fault
 
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.features.depth_feature import (
+from collocation_sysid.features.camera_feature import (
     depth_image_hypotheses,
     may_be_images,
 )

@@ -321,6 +321,7 @@ def with_guesses_from(problem: Problem, solution: Solution) -> Problem:
 
 
 def rms_mm(solution: Solution) -> list[float]:
+    """Return the RMS marker distance of each experiment [mm]."""
     return [rms_of(part) for part in solution.collocation.iterates(solution.z)]
 
 
@@ -331,6 +332,7 @@ def rms_of(part: ExperimentIterate) -> float:
 
 
 def rms_line(solution: Solution) -> str:
+    """Return the RMS marker distances of all experiments as text."""
     return " / ".join(f"{rms:.3f}" for rms in rms_mm(solution))
 
 

@@ -28,6 +28,7 @@ FORWARD_LEFT_UP = np.array(
         [0.0, 0.0, 0.0, 1.0],
     ]
 )
+# Factor of depths in millimetres that are stated as metres.
 MILLIMETRES_PER_METRE = 1e3
 # Distance of a wall behind the bar from the camera [m]: less than the gate behind its far end.
 WALL_M = 0.50

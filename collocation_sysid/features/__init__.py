@@ -7,7 +7,7 @@ recording belong into the packages `program`, `model` and `recording`.
 - `feature`: `Feature`, the functions that a feature may declare.
 - `registry`: the features, in the order of the residuals.
 - `measurement_results`: predictions and errors of measurements, as in ``result.json``.
-- `marker_feature`, `wrench_feature`, `custom_sensor_feature`, `depth_feature`: measurements.
+- `marker_feature`, `wrench_feature`, `custom_sensor_feature`, `camera_feature`: measurements.
 - `wrench_causes`, `wrench_at_guess`: likely errors in the description of force sensors, after a fit
   and by the simulation at the guess.
 - `camera_misspecifications`, `camera_image_misspecifications`, `camera_clock_misspecifications`:

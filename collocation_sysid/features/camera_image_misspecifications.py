@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
@@ -22,6 +21,7 @@ from ..fem.laws.moduli import engineering_constants
 from ..model.nuisance_map import NuisanceMap
 from ..program.depth.camera_alignment import (
     AlignedPose,
+    ExactCloud,
     iterate_alignments,
     thinned,
 )
@@ -339,9 +339,9 @@ class _ImageComparison:
         """Return the best fit of a description of the image among all shapes; cached."""
         if image in self.known:
             return self.known[image]
-        tree = KDTree(image.compute_points_m())
+        cloud = ExactCloud(image.compute_points_m())
         rough = {
-            index: self._fit_shape(tree, index, iterations=ROUGH_ITERATIONS)
+            index: self._fit_shape(cloud, index, iterations=ROUGH_ITERATIONS)
             for index in range(0, len(self.surfaces), STRIDE)
         }
         best = min(rough, key=lambda index: rough[index].misfit)
@@ -350,18 +350,20 @@ class _ImageComparison:
             min(len(self.surfaces), best + STRIDE),
         )
         fits = [
-            self._fit_shape(tree, index, iterations=ITERATIONS)
+            self._fit_shape(cloud, index, iterations=ITERATIONS)
             for index in neighbours
         ]
         self.known[image] = min(fits, key=lambda each: each.misfit)
         return self.known[image]
 
-    def _fit_shape(self, tree: KDTree, index: int, iterations: int) -> _Fit:
+    def _fit_shape(
+        self, cloud: ExactCloud, index: int, iterations: int
+    ) -> _Fit:
         """Return the fit of points to one shape.
 
         Parameters
         ----------
-        tree : KDTree
+        cloud : ExactCloud
             Measured points in the camera's frame [m].
         index : int
             Index of the shape.
@@ -373,7 +375,7 @@ class _ImageComparison:
         size_m = self.camera.size_m
         (aligned,) = iterate_alignments(
             self.camera,
-            tree,
+            cloud,
             places=places_m,
             normals=normals,
             gates=np.geomspace(INITIAL_GATE * size_m, gate_m, iterations),
@@ -389,8 +391,9 @@ class _ImageComparison:
         fit = _Fit(gate_m, rotation.as_rotvec(), shift_m, np.inf)
         if not is_facing.any():
             return fit
-        nearest_m, nearest = tree.query(aligned_m[is_facing])
-        ways_m = np.asarray(tree.data)[nearest] - aligned_m[is_facing]
+        places_m = aligned_m[is_facing]
+        ways_m = cloud.points_m[cloud.nearest(places_m)] - places_m
+        nearest_m = np.linalg.norm(ways_m, axis=1)
         along_m = np.abs(np.sum(ways_m * turned[is_facing], axis=1))
         distances_m = np.where(nearest_m < gate_m, along_m, gate_m)
         fit = replace(fit, distance_m=float(np.sqrt(np.mean(distances_m**2))))

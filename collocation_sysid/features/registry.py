@@ -8,9 +8,9 @@ from typing import Any
 from ..program.simulation import Trajectory
 from ..recording.experiment import Experiment
 from ..statistics.concerns import declare_messages, declare_topics
+from .camera_feature import CAMERAS
 from .contact_feature import CONTACT
 from .custom_sensor_feature import CUSTOM_SENSORS
-from .depth_feature import DEPTH
 from .feature import Feature, Fields
 from .marker_feature import MARKERS
 from .measurement_results import InstrumentPrediction, PredictionResiduals
@@ -22,7 +22,7 @@ FEATURES: tuple[Feature, ...] = (
     WRENCH,
     CUSTOM_SENSORS,
     CONTACT,
-    DEPTH,
+    CAMERAS,
 )
 for _feature in FEATURES:
     declare_topics(_feature.topics)

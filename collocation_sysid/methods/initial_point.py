@@ -109,7 +109,7 @@ def compute_initial_point(
         if count
         else ("the given initial values")
     )
-    continuation = "IPOPT solved the complete program from there"
+    continuation = "from there the complete program was given to IPOPT"
     if is_close:
         note = (
             f"initial point: {sweeps}, which determined the parameters to "

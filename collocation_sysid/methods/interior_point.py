@@ -307,8 +307,9 @@ class InteriorPoint(Options):
         )
         if "Invalid_Option" not in solution.message:
             return solution
+        linear_solver = self.ipopt.get("linear_solver", self.linear_solver)
         missing = (
-            f"IPOPT refused one of its options: linear_solver = '{self.linear_solver}' probably "
+            f"IPOPT refused one of its options: linear_solver = '{linear_solver}' probably "
             "needs a library that is not installed; expected 'mumps' or 'spral', which come with "
             "CasADi"
         )

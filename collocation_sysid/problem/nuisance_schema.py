@@ -12,16 +12,18 @@ from ..common.schema_tables import ByForm, Section
 from ..common.validated_types import Text
 from ..recording import Nuisance
 from ..recording.nuisance import KINDS, NuisanceRow
-from .nuisance_priors import (
-    CalibrationDistortionPrior,
-    CalibrationScalePrior,
-    CameraOffsetsPrior,
-    ClockRatePrior,
+from .camera_section import (
     DepthBiasPrior,
     DepthEdgePrior,
     DepthPosePrior,
     DepthScalePrior,
     DepthTimePrior,
+)
+from .nuisance_priors import (
+    CalibrationDistortionPrior,
+    CalibrationScalePrior,
+    CameraOffsetsPrior,
+    ClockRatePrior,
     DisplacementZeroPrior,
     GravityPrior,
     HandEyePrior,

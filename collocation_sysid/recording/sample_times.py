@@ -47,8 +47,8 @@ def sample_interval_s(
     times = np.asarray(t_s, dtype=np.float64)
     if times.ndim != 1 or len(times) < 2:
         raise InputError(
-            f"{what}: found {times.size} samples; expected at least two, because the interval "
-            "between samples is needed",
+            f"{what}: the number of samples is {times.size}; expected at least two, because the "
+            "interval between samples is needed",
             source,
         )
     if fault := first_unordered_time(times):

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ..common.array_types import Array
-from ..features.depth_feature import fitted_surfaces
+from ..features.camera_feature import fitted_surfaces
 from ..model.nuisance_map import NuisanceMap
 from ..program.depth.depth_camera_model import DepthCameraModel
 from ..program.depth.depth_comparison import SurfaceComparison

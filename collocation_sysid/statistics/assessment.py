@@ -58,9 +58,7 @@ GROSS_ROLLOUT = 2.0
 PREDICTION = 3.0
 # The same for "doubtful".
 GROSS_PREDICTION = 10.0
-# Nuisance parameters in standard deviations of their priors: "check".
-LARGEST_OFFSET = 3.0
-# The same for "doubtful".
+# Nuisance parameters in standard deviations of their priors: "doubtful".
 ABSURD = 6.0
 # Time shift in standard deviations of its prior: "check".
 LATE = 1.8
@@ -483,15 +481,12 @@ def nuisance_concerns(
     Notes
     -----
     At a limit (within 0.001 standard deviations) the concern is "doubtful". Else it is "check"
-    beyond `LARGEST_OFFSET` standard deviations, or more if there are many parameters (Bonferroni),
-    and "doubtful" beyond `ABSURD`. Limits may be infinite.
+    beyond the deviation that is exceeded with the probability `RARE` by any of the n parameters
+    (Bonferroni): 3.9 standard deviations for one parameter, 4.6 for 20. Beyond `ABSURD` it is
+    "doubtful". Limits may be infinite.
     """
     items = [*zip(names, deviations, low, high, strict=True)]
-    limit = (
-        max(LARGEST_OFFSET, float(normal_isf(RARE / 2 / max(1, len(items)))))
-        if items
-        else LARGEST_OFFSET
-    )
+    limit = float(normal_isf(RARE / 2 / max(1, len(items))))
     concerns: list[Concern] = []
     for name, phi, lowest, highest in items:
         deviation = abs(float(phi))

@@ -176,7 +176,7 @@ TOPICS: dict[str, Topic] = {
         "trust",
         remedy="Look at the residuals over time: a constant part indicates a wrong position or "
         "offset, large residuals at the beginning a wrong time of release, an oscillation a "
-        "wrong stiffness or damping. The command compare-models --materials tests whether another "
+        "wrong stiffness, damping or mass. The command compare-models --materials tests whether another "
         "material law predicts better.",
         messages={
             "outlier": f"{SAMPLE}remove it, or set solver.huber",

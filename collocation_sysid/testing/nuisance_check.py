@@ -296,8 +296,9 @@ def _check_clock(
             predicted[sample, 0],
             residual.predict_positions(later, np.zeros(data.size))[sample, 0],
             statement=(
-                f"the prediction of the marker {residual.names[0]} is not its position at the time "
-                f"that the clock gives for t = {t_s:.4g} s"
+                f"the program predicts the marker {residual.names[0]} at t = {t_s:.4g} s at another "
+                f"position [m] than the motion has {float(delay):.4g} s later, the delay that "
+                "clock(values, t_s, data) returns"
             ),
             tolerance=1e-7,
         )

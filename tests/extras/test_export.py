@@ -56,6 +56,7 @@ from collocation_sysid.recording import (
     Grasp,
     Obstacle,
     Plane,
+    PointMass,
     PoseSequence,
     Solid,
     Sphere,
@@ -688,6 +689,25 @@ def test_no_number_of_a_deck_is_longer_than_calculix_reads(tmp_path):
 
 
 # What they say
+
+
+@pytest.mark.parametrize(
+    ("to", "expected"),
+    [
+        ("mujoco", "only those of the first sample are exported"),
+        ("febio", "point masses on nodes are not exported"),
+    ],
+)
+def test_a_point_mass_that_ends_has_one_sentence_by_target(
+    to, expected, tmp_path
+):
+    bar = held_bar(moving=True)
+    t_s = bar.experiment.t_s
+    mass = PointMass([5], 0.004, until_s=float(t_s[4]))
+    loaded = replace(bar, experiment=replace(bar.experiment, masses=[mass]))
+    limitations = write_export(loaded, to, tmp_path / to).limitations
+    (sentence,) = (each for each in limitations if "point masses" in each)
+    assert expected in sentence
 
 
 @pytest.mark.parametrize(

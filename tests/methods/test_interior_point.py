@@ -248,7 +248,7 @@ def test_ipopt_starts_near_the_optimum_and_the_notes_tell_how():
     solution = PRECISE(cube(), watch=seen.append)
     assert re.fullmatch(
         r"initial point: \d+ sweeps of reduced space, which determined the parameters to 1e-08 %; "
-        "IPOPT solved the complete program from there",
+        "from there the complete program was given to IPOPT",
         note_of(solution),
     )
     assert solution.iterations <= 4

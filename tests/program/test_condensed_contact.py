@@ -6,7 +6,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from benchmark_contact import TRUTH, pressed
+from benchmark_contact import TRUTH, pressed_cube
 from kit.problems import EDGE_M, IDEAL, box, vertex_markers
 
 from collocation_sysid.model.contact.contact_force import contact_terms
@@ -69,10 +69,10 @@ def test_steps_in_contact_take_hardly_more_factorisations_than_without(
 ):
     """After the equilibrium at the start and two steps at most one in three steps."""
     calls = counted_factorisations(monkeypatch)
-    simulated(pressed(3, 2, friction))
+    simulated(pressed_cube(3, 2, friction))
     at_start = len(calls)
     calls.clear()
-    simulated(pressed(3, 2 + STEPS, friction))
+    simulated(pressed_cube(3, 2 + STEPS, friction))
     assert len(calls) - at_start <= STEPS // 3
 
 
@@ -80,20 +80,20 @@ def test_steps_in_contact_take_hardly_more_factorisations_than_without(
 def test_condensed_steps_have_the_solution_of_the_complete_equations(
     friction, monkeypatch
 ):
-    experiment = pressed(3, STEPS, friction)
+    experiment = pressed_cube(3, STEPS, friction)
     x = simulated(experiment)
     assert residual_n(experiment, x).max() < 1e-9
     without_condensation(monkeypatch)
     complete = simulated(experiment)
     np.testing.assert_allclose(x, complete, atol=1e-12)
     # The plate moved the body: there is contact.
-    alone = simulated(pressed(3, STEPS, None))
+    alone = simulated(pressed_cube(3, STEPS, None))
     assert np.abs(x[:, : alone.shape[1]] - alone).max() > 1e-4
 
 
 def test_steps_that_cannot_be_condensed_are_solved_completely(monkeypatch):
     """Here the dofs that touch are too many, or never converge."""
-    experiment = pressed(3, 4, 0.3)
+    experiment = pressed_cube(3, 4, 0.3)
     x = simulated(experiment)
     for name, value in (
         ("MAX_ACTIVE_DOFS", 3),
@@ -195,4 +195,4 @@ def test_a_simulation_without_contact_does_not_condense(monkeypatch):
         raise AssertionError
 
     monkeypatch.setattr(newton_solver, "CondensedSteps", refuse)
-    simulated(pressed(2, 3, None))
+    simulated(pressed_cube(2, 3, None))

@@ -24,7 +24,7 @@ from scipy.ndimage import binary_erosion
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.features.depth_feature import (
+from collocation_sysid.features.camera_feature import (
     camera_pose_concerns,
     outline_concerns,
 )

@@ -16,11 +16,11 @@ from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
 from collocation_sysid.features.camera_clock_misspecifications import (
     camera_clock_hypotheses,
 )
+from collocation_sysid.features.camera_feature import depth_image_hypotheses
 from collocation_sysid.features.camera_image_misspecifications import (
     camera_image_hypotheses,
     equilibrium_shapes_m,
 )
-from collocation_sysid.features.depth_feature import depth_image_hypotheses
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.check import (

@@ -127,8 +127,8 @@ class TargetCapabilities:
     has_viscoelasticity, has_moving_grasps, has_moving_obstacles, has_quadratic_elements : bool
         Whether it has viscoelastic branches, moving grasps, moving obstacles, and elements with
         nodes on their edges (which are split otherwise).
-    node_forces : str
-        Sentence for forces on nodes; empty if the simulator has them.
+    node_forces, point_masses : str
+        Sentences for forces and for point masses on nodes; empty if the simulator has them.
     obstacle_shapes : tuple of str
         Kinds of `Primitive` that obstacles may have.
     has_rounded_edges, has_face_selection, has_friction : bool
@@ -147,6 +147,7 @@ class TargetCapabilities:
     has_moving_grasps: bool = False
     has_moving_obstacles: bool = False
     node_forces: str = "forces on nodes are not exported"
+    point_masses: str = ""
     has_quadratic_elements: bool = False
     obstacle_shapes: tuple[str, ...] = (
         "plane",
@@ -164,9 +165,9 @@ class TargetCapabilities:
         """Return sentences on what the simulator cannot express of a body, and what was done
         instead.
 
-        The order is: what no target expresses, obstacles, regions, motion, elements, node forces,
-        and whether the target was tested. Sentences may end with a period or not; the list is a new
-        one.
+        The order is: what no target expresses, obstacles, regions, motion, elements, forces and
+        point masses on nodes, and whether the target was tested. Sentences may end with a period or
+        not; the list is a new one.
         """
         sentences = [*_common_limitations(body)]
         sentences += self._obstacle_limitations(body)
@@ -194,9 +195,28 @@ class TargetCapabilities:
         elif body.body.element.mean_dilatation:
             worst = max(region.poisson for region in body.regions)
             sentences.append(MEAN_DILATATION.format(worst=worst))
-        if body.experiment.forces and self.node_forces:
-            sentences.append(self.node_forces)
+        sentences += self._load_limitations(body)
         return sentences if self.is_tested else [*sentences, UNTESTED]
+
+    def _load_limitations(self, body: IdentifiedBody) -> Iterator[str]:
+        """Yield sentences on forces and point masses on nodes that the simulator cannot express, or
+        that change within the recording; none without such loads.
+        """
+        e = body.experiment
+        if e.forces and self.node_forces:
+            yield self.node_forces
+        elif np.ptp(e.declared_node_forces_n(e.t_s), axis=0).any():
+            yield (
+                "forces on nodes that change within the recording: they have their values of the "
+                "first sample in the exported model"
+            )
+        if body.point_masses_kg.any() and self.point_masses:
+            yield self.point_masses
+        elif np.ptp(e.point_mass_at_nodes_kg(e.t_s), axis=0).any():
+            yield (
+                "point masses that begin or end within the recording: only those of the first "
+                "sample are exported"
+            )
 
     def _obstacle_limitations(self, body: IdentifiedBody) -> Iterator[str]:
         """Yield sentences on what the simulator cannot express of the obstacles of a body; none
@@ -229,8 +249,8 @@ class TargetCapabilities:
 def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
     """Yield a sentence for each property of a body that no target can express; none for others.
 
-    These are actuators, air, custom forces, forces or point masses on nodes that change between
-    samples, and grasps that begin or end within the recording. Moving grasps are not among them.
+    These are actuators, air, custom forces, and grasps that begin or end within the recording.
+    Moving grasps are not among them.
     """
     e = body.experiment
     times = body.experiment.t_s
@@ -240,14 +260,10 @@ def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
         yield "buoyancy, added mass and drag of the air are not exported"
     if e.body.forces:
         yield f"custom forces are not exported: {', '.join(f.name for f in e.body.forces)}"
-    if (
-        np.ptp(e.declared_node_forces_n(times), axis=0).any()
-        or np.ptp(e.point_mass_at_nodes_kg(times), axis=0).any()
-    ):
-        yield "forces and point masses stay as they are at the first sample"
     if any(not grasp.is_active(times).all() for grasp in e.grasps):
         yield (
-            "grasps that begin or end within the recording stay as they are at the first sample"
+            "grasps that begin or end within the recording: they are exported as they are at the "
+            "first sample"
         )
 
 

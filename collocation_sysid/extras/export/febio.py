@@ -37,7 +37,7 @@ CAPABILITIES = TargetCapabilities(
     mass_damping="γ_m = {gamma_m_1_s:.4g} 1/s is not exported; in a dynamic step, a body load "
     '"mass damping" represents it',
     has_viscoelasticity=True,
-    node_forces="",
+    point_masses="point masses on nodes are not exported",
     has_quadratic_elements=True,
     is_tested=False,
 )
@@ -74,8 +74,6 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         _material_xml(k, region, limits=limits)
         for k, region in enumerate(body.regions, 1)
     )
-    if body.node_loads_n.any():
-        limits.append("point masses and forces on nodes are not exported")
     xml = '<?xml version="1.0" encoding="UTF-8"?>\n' + comment_lines(
         body, limits, start="<!-- ", end=" -->"
     )

@@ -38,6 +38,7 @@ CAPABILITIES = TargetCapabilities(
     stiffness_damping="damping γ_r is not part of the USD schemas: it is exported as a custom attribute",
     mass_damping="γ_m = {gamma_m_1_s:.4g} 1/s is not part of the USD schemas: it is exported as a custom "
     "attribute",
+    point_masses="point masses on nodes are not exported",
     has_moving_grasps=True,
     has_moving_obstacles=True,
     has_rounded_edges=False,
@@ -48,7 +49,6 @@ REGIONS = (
     "regions are subsets of tetrahedra, each with its material; a simulator with one material "
     "per body, such as Newton 1.8, uses that of the largest"
 )
-POINT_MASSES = "point masses on nodes are not exported"
 TILT = (
     "gravity points {degrees:.3g}° away from −z of the stage, as estimated from the recording; a "
     "simulator that uses its magnitude only, along −z, ignores this"
@@ -72,7 +72,6 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     """
     pxr = _import_usd()
     limits = [*CAPABILITIES.limitations(body), SINGLE_PRECISION]
-    limits += [POINT_MASSES] * bool(body.point_masses_kg.any())
     limits += [REGIONS] * (len(body.regions) > 1)
     limits += [SINGLE_AXES] * bool(
         (body.is_prescribed.any(axis=1) != body.is_node_prescribed).any()

@@ -372,11 +372,12 @@ def straightening_notes(
         a = cells[e, start_of[k]]
         b = cells[e, end_of[k]]
         mid = cells[e, 4 + k]
+        count = len(np.unique(cells[bad[:, 0], 4 + bad[:, 1]]))
         raise InputError(
             f"quadratic element {e}: mid node {mid} lies {offset[e, k]:.3g} m off the middle of "
             f"the edge from node {a} to node {b}, which is {length[e, k]:.3g} m long; expected at "
-            f"most {LARGEST_SIDE_CURVATURE:.0%} of that (number of such nodes: {len(bad)}), because sides "
-            "are assumed to be straight: refine the mesh, or save it with linear tetrahedra"
+            f"most {LARGEST_SIDE_CURVATURE:.0%} of that (number of such nodes: {count}), because "
+            "sides are assumed to be straight: refine the mesh, or save it with linear tetrahedra"
         )
     is_curved = offset > ROUND_OFF * length
     if not is_curved.any():

@@ -8,5 +8,5 @@ the formats.
 - `logs`, `topics`: logs of robots (ROS bags, MCAP, LeRobot), and the tables in their topics;
   `point_topics`: one marker table from several topics; `log_frames`: static transforms between
   frames.
-- `depth_files`, `depth_messages`, `ply`: depth images and clouds of points, from files and logs.
+- `depth_files`, `camera_messages`, `ply`: depth images and clouds of points, from files and logs.
 """

@@ -20,12 +20,12 @@ from ...common.array_types import Array
 from ...common.files import reason, require_regular
 from ...errors import InputError, located
 from . import ply
-from .depth_messages import (
+from .camera_messages import (
     ENCODINGS,
+    camera_data_kind,
     camera_matrix,
     decode_cloud,
     decode_image,
-    depth_kind,
     distortion_coefficients,
     is_camera_model,
     read_png,
@@ -202,7 +202,7 @@ def _read_topic(
             list(log.messages(address.topic)), log.start_ns
         )
         camera = _camera_of_topic(log, address.topic)
-    kind = depth_kind(messages[0]) if messages else ""
+    kind = camera_data_kind(messages[0]) if messages else ""
     if not kind:
         content = "other messages" if messages else "no messages"
         raise InputError(

@@ -19,7 +19,11 @@ import numpy as np
 from ...common.array_types import Array
 from ...common.files import require_regular
 from ...errors import InputError, hint_at
-from .depth_messages import depth_kind, is_camera_model
+from .camera_messages import (
+    camera_data_kind,
+    is_camera_model,
+    use_of_camera_message,
+)
 from .logs import Log, TopicAddress, open_log, require_packages, require_topic
 
 AXES = ("x", "y", "z")
@@ -136,7 +140,7 @@ def topic_as_csv(address: TopicAddress) -> bytes:
     Raises
     ------
     InputError
-        If the topic does not exist, has no messages, holds depth data or no known data, or if
+        If the topic does not exist, has no messages, holds camera data or no known data, or if
         frames or a robot's description are needed and missing.
     """
     with open_log(address.log, address.episode) as log:
@@ -146,7 +150,7 @@ def topic_as_csv(address: TopicAddress) -> bytes:
             raise InputError(
                 f"the topic {address.topic} has no messages; expected a topic with numbers"
             )
-        if kind := depth_kind(messages[0][1]):
+        if kind := camera_data_kind(messages[0][1]):
             raise InputError(
                 f"the topic {address.topic} contains {kind}; expected a topic with numbers"
             )
@@ -190,7 +194,7 @@ def _marker_frames(log: Log) -> list[str]:
     frames = []
     for name in log.topics:
         for _, message in islice(log.messages(name), 1):
-            is_other = is_transforms(message) or depth_kind(message)
+            is_other = is_transforms(message) or camera_data_kind(message)
             frame = frame_of_message(message)
             if (
                 frame
@@ -251,11 +255,10 @@ def _describe_topic(
             STATIC_TOPIC_SUFFIX
         ) in log.topics and name.endswith(STATIC_TOPIC_SUFFIX):
             serves += f", part of the chains of {name.removesuffix(STATIC_TOPIC_SUFFIX)}"
-    elif first and (depth_type := depth_kind(first[0][1])):
-        serves = f"{depth_type}: [[experiment.depth]]"
-    elif first and is_camera_model(first[0][1]):
-        serves = "matrix of the camera, for depth images in the same namespace"
-        write = []
+    elif first and (use := use_of_camera_message(first[0][1])):
+        serves = use
+        if is_camera_model(first[0][1]):
+            write = []
     elif first:
         messages = [message for _, message in first]
         by_namespace = has_namespaces(messages)

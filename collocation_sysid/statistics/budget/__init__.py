@@ -1,7 +1,7 @@
 """Uncertainty budget: systematic effects (type B), their propagation and combined intervals.
 
 - `systematic_effects`: the effects and their standard uncertainties, with `shape_error`,
-  `contact_effects` and `platen_slip`; `discretisation_error`: errors of time step and mesh.
+  `obstacle_effects` and `platen_slip`; `discretisation_error`: errors of time step and mesh.
 - `consider_analysis`: their effect on the residuals (Schmidt); `uncertainty_budget`: on the
   estimates; `combined_intervals`: the intervals to publish.
 """

@@ -28,7 +28,6 @@ from ...fem.laws.constants import GAMMA_R, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
 from ...fem.rest_shape import RestShape
-from ...model.contact.contact_force import Contact, contact_terms
 from ...model.contact.contact_summary import surface_gaps_and_pressures
 from ...model.dynamics import Dynamics
 from ...model.force_term import States
@@ -41,7 +40,11 @@ from ...recording.homogeneous_deformation import (
     HomogeneousDeformation,
 )
 from ...recording.nuisance import DEGREE
-from .contact_effects import obstacle_shifts_m
+from .obstacle_effects import (
+    contact_changes_by_size_n,
+    obstacle_shifts_m,
+    rigid_contact_change_n,
+)
 from .platen_slip import slip_displacements_m
 from .shape_error import (
     CORRELATION,
@@ -329,27 +332,6 @@ class ExperimentAtAnswer:
         )
 
     @cached_property
-    def contacts(self) -> dict[int, Contact]:
-        """Contact forces with an energy (without complementarity), by their index in
-        `Forces.external_terms`; empty without obstacles.
-        """
-        further = enumerate(self.dynamics.forces.external_terms)
-        return {
-            k: each
-            for k, each in further
-            if isinstance(each, Contact) and not each.is_complementarity
-        }
-
-    def contact_n(self, index: int) -> Array:
-        """Return the forces (N, 3n) [N] of one of `contacts` (its index) at the evaluations; zero
-        before the first.
-        """
-        xi, nu = self.dynamics.evaluation_states(self.iterate.x)
-        forces = self.dynamics.select_evaluated_forces()
-        term = forces.external_terms[index]
-        return self.pad_rows(term.force(forces.states_of_terms(xi, nu)(term)))
-
-    @cached_property
     def proportional_s(self) -> Array:
         """Damping times γ_r (E,) of elements with Rayleigh damping γ_r K(x) v [s], zero of
         others.
@@ -437,8 +419,7 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
 
     From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths. Goals of grasped nodes scale
     about the middle of the grasps; obstacles keep their size and are moved so that they first touch
-    the body as before, see `contact_effects.obstacle_shifts_m`. Contact areas grow by s², and a contact
-    stiffness that is not stated falls by s, as it follows the edges of the mesh.
+    the body as before, see `obstacle_effects`.
 
     Buoyancy and the mass of moved air grow by s³, and drag by s². The own mass grows by s³ unless
     the mass of the body is declared, when it stays. For a mesh made under gravity, the weight
@@ -455,11 +436,8 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
         -2.0 if at.body.has_declared_mass else 1.0
     )
     mass = (0.0 if at.body.has_declared_mass else 3.0) * at.own_mass_kg
-    for number, contact in at.contacts.items():
-        has_stiffness = (
-            contact.law_of_contact.obstacle.stiffness_pa_m is not None
-        )
-        force += (2.0 if has_stiffness else 1.0) * at.contact_n(number)
+    for change_n in contact_changes_by_size_n(at.dynamics, at.iterate.x):
+        force += at.pad_rows(change_n)
     segment = at.iterate.segment
     rotations: Array = np.nan_to_num(segment.prescribed_motion.pose_rows[0])
     arms_m = (
@@ -723,19 +701,12 @@ def _platen_slip(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of rigid contact in place of the pressure law, to first order; None without
-    contact that has an energy (with complementarity contact is rigid already).
+    contact, or where it is rigid already.
     """
-    if not at.contacts:
-        return None
-    xi, nu = at.dynamics.evaluation_states(at.iterate.x)
-    forces = at.dynamics.select_evaluated_forces()
-    change_n = np.zeros_like(xi)
-    for contact in contact_terms(at.iterate.segment.experiment):
-        if not contact.is_complementarity:
-            change_n += contact.rigid_limit_n(
-                forces.states_of_terms(xi, nu)(contact)
-            )
-    return Effect(at.pad_rows(change_n))
+    change_n = rigid_contact_change_n(
+        at.iterate.segment.experiment, at.dynamics, x=at.iterate.x
+    )
+    return None if change_n is None else Effect(at.pad_rows(change_n))
 
 
 def _buoyancy(at: ExperimentAtAnswer, _: int) -> Effect | None:

@@ -26,19 +26,19 @@ class Commands:
             }
 
     def track_first_solve_s(self, times: dict[str, WaitingTimes]) -> float:
-        """Wall time of the first solve of an installation, kernels included [s]."""
+        """Return the wall time of the first solve of an installation, kernels included [s]."""
         return times["first solve"].wall_s
 
     def track_solve_s(self, times: dict[str, WaitingTimes]) -> float:
-        """Wall time of a solve with compiled kernels [s]."""
+        """Return the wall time of a solve with compiled kernels [s]."""
         return times["solve"].wall_s
 
     def track_first_text_of_solve_s(
         self, times: dict[str, WaitingTimes]
     ) -> float:
-        """Time to the first text of a solve with compiled kernels [s]."""
+        """Return the time to the first text of a solve with compiled kernels [s]."""
         return times["solve"].first_s
 
     def track_help_processor_s(self, times: dict[str, WaitingTimes]) -> float:
-        """Processor time of the help text [s]."""
+        """Return the processor time of the help text [s]."""
         return times["help"].processor_s

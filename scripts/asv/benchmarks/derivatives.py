@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmark_contact import CASES, prepared
+from benchmark_contact import FRICTION_BY_CASE, make_timed_functions
 from benchmark_jacobian import PROBLEM, measure
 
 from collocation_sysid.problem import Problem
@@ -10,41 +10,41 @@ from collocation_sysid.program.sweep import Sweep
 
 
 class Assembly:
-    """The program of Table I's size."""
+    """Nonlinear program of the size of Table I."""
 
     def setup_cache(self) -> dict:
-        """Medians of both evaluators, in one run."""
+        """Return the median times of both evaluators, measured in one run."""
         return measure(PROBLEM, "backward-euler", 7)
 
-    def track_jacobian_ms(self, measured: dict) -> float:
-        """Time of the compiled Jacobian on one thread [ms]."""
-        return measured["jacobian"]["simd_1_ms"]
+    def track_jacobian_ms(self, medians: dict) -> float:
+        """Return the time of the compiled Jacobian on one thread [ms]."""
+        return medians["jacobian"]["simd_1_ms"]
 
-    def track_ratio_to_casadi_map(self, measured: dict) -> float:
-        """Time of the Jacobian by casadi.Function.map, divided by that of the compiled kernels."""
+    def track_ratio_to_casadi_map(self, medians: dict) -> float:
+        """Return the time of the Jacobian by casadi.Function.map, divided by that of the compiled kernels."""
         return (
-            measured["jacobian"]["casadi_map_ms"]
-            / measured["jacobian"]["simd_1_ms"]
+            medians["jacobian"]["casadi_map_ms"]
+            / medians["jacobian"]["simd_1_ms"]
         )
 
 
 class Contact:
-    """A block that is pressed, with and without friction, and the same without contact."""
+    """Pressed cube with and without friction, and the same cube without contact."""
 
-    params = tuple(CASES)
+    params = tuple(FRICTION_BY_CASE)
     param_names = ("contact",)
 
     def setup(self, case: str) -> None:
         """Make the body and its motion."""
-        self.works = prepared(4, 12, CASES[case])
+        self.functions = make_timed_functions(4, 12, FRICTION_BY_CASE[case])
 
     def time_sweep(self, case: str) -> None:
         """Time a sweep: the sensitivities along the motion, with their factorisations."""
-        self.works["sweep"]()
+        self.functions["sweep"]()
 
     def time_forward_simulation(self, case: str) -> None:
-        """Newton's method, step by step."""
-        self.works["forward simulation"]()
+        """Time a forward simulation by Newton's method."""
+        self.functions["forward simulation"]()
 
 
 class Sensitivities:

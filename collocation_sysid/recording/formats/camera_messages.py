@@ -34,8 +34,8 @@ _TYPES = {
 _PACKED = np.dtype([("kind", "<i4"), ("scale", "<f4"), ("shift", "<f4")])
 
 
-def depth_kind(message: Any) -> str:
-    """Return a description of the depth data in a message, such as "depth images, 640 x 480"; empty
+def camera_data_kind(message: Any) -> str:
+    """Return a description of the camera data in a message, such as "depth images, 640 x 480"; empty
     if it contains none.
     """
     if hasattr(message, "point_step") and hasattr(message, "fields"):
@@ -49,6 +49,17 @@ def depth_kind(message: Any) -> str:
         "compressedDepth" in packed or "16UC1" in packed
     ):
         return "compressed depth images"
+    return ""
+
+
+def use_of_camera_message(message: Any) -> str:
+    """Return the possible use of a message with camera data, or with a camera model, as a
+    description and a key; empty for other messages.
+    """
+    if kind := camera_data_kind(message):
+        return f"{kind}: [[experiment.depth]]"
+    if is_camera_model(message):
+        return "matrix of the camera, for depth images in the same namespace"
     return ""
 
 
@@ -132,7 +143,7 @@ def decode_image(message: Any) -> Any:
     """Return the pixels (rows, columns) of an image message: integer counts of a depth unit, or
     floats in metres.
 
-    The message must be one for which `depth_kind` is an image.
+    The message must be one for which `camera_data_kind` is an image.
 
     Raises
     ------

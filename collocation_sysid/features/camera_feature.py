@@ -497,7 +497,7 @@ def _distance_text(error: DepthError) -> str:
     return f"{beyond}, the others {1e3 * error.rms_within_gate_m:.3g} mm RMS"
 
 
-DEPTH = Feature(
+CAMERAS = Feature(
     "depth",
     messages={
         **MESSAGES,

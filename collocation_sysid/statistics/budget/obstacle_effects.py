@@ -1,10 +1,10 @@
-"""Displacements of obstacles if the body is larger than its mesh, such that first contact is
-preserved.
+"""Changes of the forces of obstacles by systematic effects: the size of the body, a rigid contact.
 
-An indentation counts from first contact, and the prior of an obstacle's offset refers
-to the surface of the body. A larger body would penetrate obstacles that do not move, by its
-relative size times its distance from the grasps: for an indentation of 1 mm into a block of 15 mm,
-15 % of the indentation for a size error of 1 %.
+If the body is larger than its mesh, its contact forces grow, and obstacles are displaced such that
+first contact is preserved: an indentation counts from first contact, and the prior of an obstacle's
+offset refers to the surface of the body. A larger body would penetrate obstacles that do not move,
+by its relative size times its distance from the grasps: for an indentation of 1 mm into a block of
+15 mm, 15 % of the indentation for a size error of 1 %.
 """
 
 from __future__ import annotations
@@ -15,8 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...common.array_types import Array
-from ...model.contact.contact_force import Contact
+from ...model.contact.contact_force import Contact, contact_terms
+from ...model.dynamics import Dynamics
+from ...model.forces import Forces
 from ...program.experiment_iterate import ExperimentIterate
+from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle
 
 # Rows whose gaps are evaluated together.
@@ -89,6 +92,68 @@ class FirstContact:
             place_m,
             normal=normal / max(float(np.linalg.norm(normal)), 1e-9),
         )
+
+
+def contact_changes_by_size_n(dynamics: Dynamics, x: Array) -> Iterator[Array]:
+    """Yield for each contact force with an energy its change per relative size of the body at the
+    evaluations, (evaluations, 3n) [N]; nothing without obstacles.
+
+    Contact areas grow with the square of the size; a contact stiffness that is not stated falls
+    with the size, as it follows the edges of the mesh.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Equations of motion at the parameters.
+    x : (N, 3n) array
+        Positions [m].
+    """
+    forces = dynamics.select_evaluated_forces()
+    states_of = forces.states_of_terms(*dynamics.evaluation_states(x))
+    for contact in _contacts_with_energy(forces):
+        obstacle = contact.law_of_contact.obstacle
+        power = 1.0 if obstacle.stiffness_pa_m is None else 2.0
+        yield power * contact.force(states_of(contact))
+
+
+def rigid_contact_change_n(
+    experiment: Experiment, dynamics: Dynamics, x: Array
+) -> Array | None:
+    """Return the change of the contact forces at the evaluations, (evaluations, 3n) [N], if contact
+    were rigid instead of obeying the pressure law, to first order; None without contact that has an
+    energy (with complementarity contact is rigid already).
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment, whose pressures are not averaged over time steps here.
+    dynamics : Dynamics
+        Equations of motion at the parameters.
+    x : (N, 3n) array
+        Positions [m].
+    """
+    forces = dynamics.select_evaluated_forces()
+    if not _contacts_with_energy(forces):
+        return None
+    xi, nu = dynamics.evaluation_states(x)
+    change_n = np.zeros_like(xi)
+    for contact in contact_terms(experiment):
+        if not contact.is_complementarity:
+            change_n += contact.rigid_limit_n(
+                forces.states_of_terms(xi, nu)(contact)
+            )
+    return change_n
+
+
+def _contacts_with_energy(forces: Forces) -> list[Contact]:
+    """Return the contact forces with an energy, without those of complementarity; empty without
+    obstacles.
+    """
+    return [
+        term
+        for term in forces.external_terms
+        if isinstance(term, Contact) and not term.is_complementarity
+    ]
 
 
 def obstacle_shifts_m(
