@@ -399,7 +399,9 @@ def _checked(
     except InputError as error:
         raise error.located(problem.path) from error
     answer = replace(
-        answer, uncertainty=uncertainty, notes=tuple(n.message for n in noises)
+        answer,
+        uncertainty=uncertainty,
+        notes=tuple(n.describe() for n in noises),
     )
     error = step_error(
         problem, solution, fit=fit, rollouts=rollouts, estimates=answer.optimum
@@ -413,7 +415,9 @@ def _changes(answer: Run, say: Log) -> ResidualChanges:
     """
     say("computing the effects of assumptions")
     solution = answer.solution
-    deviations = probed_deviations(answer.problem.uncertainty.considered)
+    deviations = probed_deviations(
+        answer.problem.uncertainty.collect_considered()
+    )
     # One sweep for the assumptions, and one for the nuisance parameters that are not estimated.
     with counted_phase(StepUnit.TIME_STEP, 2 * _row_count(solution)):
         return changes_of_assumptions(
@@ -449,12 +453,12 @@ def _sources(
         Changes of the residuals by all effects.
     """
     solution = answer.solution
-    deviations = answer.problem.uncertainty.assumptions.deviations
+    deviations = answer.problem.uncertainty.assumptions.collect_deviations()
     parameters = solution.collocation.parameters
     budgeted = changes.without(
         name for name, deviation in deviations.items() if deviation is None
     )
-    means = answer.problem.uncertainty.assumptions.means
+    means = answer.problem.uncertainty.assumptions.collect_means()
     return VarianceSources.from_fit(
         fit,
         budgeted,
@@ -488,7 +492,7 @@ def _probes(
     """
     solution = answer.solution
     options = answer.problem.uncertainty
-    deviations = probed_deviations(options.considered)
+    deviations = probed_deviations(options.collect_considered())
     collocation = solution.collocation
     z = solution.z
     solved_fit = SolvedFit(

@@ -159,7 +159,7 @@ def nuisances() -> str:
             for row in rows
         )
         priors = ", ".join(
-            f"{row.prior} = {row.sigma:.4g}" for row in rows if row.sigma
+            f"{row.prior_key()} = {row.sigma:.4g}" for row in rows if row.sigma
         )
         usual = ", ".join(row.usual for row in rows if row.unit != "σ")
         default = f"`{{ {priors} }}` {usual}".strip() if priors else '"none"'

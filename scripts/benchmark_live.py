@@ -136,7 +136,7 @@ def print_comparison(
     row_s = row_time_s(problem)
     median, upper = 1e3 * np.percentile(latencies_s, [50, 99])
     print(
-        f"{name}: {len(frames)} frames of {live.model.substeps} rows, "
+        f"{name}: {len(frames)} frames of {live.model.collocation.substeps} rows, "
         f"{np.mean(relinearised_rows):.1f} rows linearised again per frame"
     )
     print(
@@ -235,7 +235,7 @@ def compare_long_recording(samples: int, options: LiveOptions) -> None:
         seed=0,
         samples=samples,
         integrator="midpoint",
-        substeps=short_estimator.model.substeps,
+        substeps=short_estimator.model.collocation.substeps,
     )
     live = LiveEstimator(problem, options, time.thread_time)
     frames = list(frames_of_recording(problem.experiments[0], live.model))
@@ -254,7 +254,7 @@ def compare_long_recording(samples: int, options: LiveOptions) -> None:
         f"{100 * np.mean(latencies_s < FRAME_S):.2f} % within {1e3 * FRAME_S:g} ms"
     )
     began_s = time.process_time()
-    batch_problem = replace(problem, substeps=live.model.substeps)
+    batch_problem = replace(problem, substeps=live.model.collocation.substeps)
     solution = solve(batch_problem, ReducedSpace())
     print(
         f"    batch: {len(solution.history)} sweeps, {time.process_time() - began_s:.0f} s, "

@@ -118,7 +118,7 @@ def measure_size(
     stopwatch = Stopwatch(clock)
     solver = Sweep(segment, stopwatch=stopwatch, factorisation=choice)
     # The symbolic factorisation is computed once for all sweeps; accessing this computes it.
-    chunk_bytes = solver.chunk_bytes
+    chunk_bytes = solver.estimate_chunk_bytes()
     began = clock()
     solver.forward(x, equations)
     sweep_cost = PartCost(clock() - began, stopwatch)
@@ -126,7 +126,7 @@ def measure_size(
         f"{len(body.nodes_m):6d} nodes {element:5s} {steps:4d} steps {threads} threads "
         f"{factorisation_name(solver):10s} simulation {simulation_cost.as_text(steps)}  "
         f"sweep {sweep_cost.as_text(steps)}  "
-        f"chunks of {solver.chunk_rows} steps, {chunk_bytes / 1e6:.0f} MB; "
+        f"chunks of {solver.choose_chunk_rows()} steps, {chunk_bytes / 1e6:.0f} MB; "
         f"peak memory {peak_mb():.0f} MB, before {before_mb:.0f} MB"
     )
 

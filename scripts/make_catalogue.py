@@ -223,7 +223,7 @@ def constants_of(
     """Return parameters and derived moduli; without the dampings of equilibria, which have none."""
     named = {
         n: e
-        for n, e in result.values.items()
+        for n, e in result.collect_estimates().items()
         if not (is_static and is_damping(n))
     }
     return tuple(

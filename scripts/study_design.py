@@ -233,17 +233,17 @@ def twin(design: Design, rng: np.random.Generator) -> dict[str, float] | None:
             [recording],
             problem.parameters,
             problem.scheme,
-            problem.first_substeps,
+            problem.choose_first_substeps(),
         )
 
     (segment,) = collocation_of(experiment).transcriptions
-    phi = segment.guess_phi + rng.normal(size=segment.nuisance.size)
+    phi = segment.compute_guess_phi() + rng.normal(size=segment.nuisance.size)
     values = problem.parameters.guesses
     motion = simulate(
         segment.corrected_experiment(phi),
         values,
         problem.scheme,
-        substeps=problem.first_substeps,
+        substeps=problem.choose_first_substeps(),
     )
     tracks = segment.markers.predict_samples(motion.positions_m, phi)
     noise = experiment.markers.sigma_m[:, None] * rng.normal(size=tracks.shape)

@@ -379,7 +379,7 @@ def draw_assumption_errors(
     def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
         errors = {}
         for row in (row for row in ASSUMPTIONS if row.name in names):
-            for name in row.components:
+            for name in row.list_components():
                 error = (row.sigma or 0.0) * rng.standard_normal()
                 # Coefficients of the air are not negative.
                 errors[name] = max(error, -0.99) if row.name in AIR else error

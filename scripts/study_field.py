@@ -287,7 +287,7 @@ def table_row(twin: FieldTwin, seeds: range) -> str:
                 width,
                 ratio,
                 step_mm,
-                field.identified_modes,
+                field.count_identified_modes(),
                 processor_time_s,
                 inclusion_coverage,
             )
@@ -295,7 +295,7 @@ def table_row(twin: FieldTwin, seeds: range) -> str:
         if answer.contrast95 is not None:
             lower, upper = answer.contrast95
             notes |= {f"contrast {lower:.3g} to {upper:.3g}"}
-        notes |= {concern.code for concern in field.concerns}
+        notes |= {concern.code for concern in field.list_concerns()}
         notes |= (
             {f"length {field.modes.length_m:g}"}
             if isinstance(twin.length_m, tuple)
@@ -338,7 +338,8 @@ def cost() -> None:
         problem, _ = problem_of(twin, 1)
         if not modes:
             fixed = {
-                name: 0.0 for name in problem.bodies[0].field_coefficient_names
+                name: 0.0
+                for name in problem.bodies[0].list_field_coefficient_names()
             }
             problem = cs.Problem(
                 problem.experiments,

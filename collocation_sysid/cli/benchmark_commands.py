@@ -101,7 +101,7 @@ def _list_bodies(options: BenchmarkCommand) -> None:
                 "is_measured": entry.is_measured,
                 "recordings": body.recordings,
                 "is_held_out": body.are_held_out,
-                "is_available": body.is_available,
+                "is_available": body.find_data_folder() is not None,
                 "script": body.script,
                 "licence": entry.licence,
             }

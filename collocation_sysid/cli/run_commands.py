@@ -172,7 +172,7 @@ def _export_body(
             "warnings": body.warnings,
             "not_expressed": exported.limitations,
             "verified": [
-                {**asdict(each), "relative": each.relative_difference}
+                {**asdict(each), "relative": each.compute_relative_difference()}
                 for each in compared
             ],
         }

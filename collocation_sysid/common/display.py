@@ -74,10 +74,9 @@ class Line:
     style: str = ""
     name: str = ""
 
-    @property
-    def spans(self) -> tuple[Span, ...]:
-        """The sentence as pieces, each with a style of its own; a
-        text is one piece without style.
+    def to_spans(self) -> tuple[Span, ...]:
+        """Return the sentence as pieces, each with a style of its own; a text is one piece without
+        style.
         """
         return (Span(self.text),) if isinstance(self.text, str) else self.text
 
@@ -294,7 +293,9 @@ def _on_terminal(part: Shown) -> RenderableType:
         case str():
             return _text(part)
         case Line():
-            pieces = ((span.text, _colour(span.style)) for span in part.spans)
+            pieces = (
+                (span.text, _colour(span.style)) for span in part.to_spans()
+            )
             return UnbrokenWords(
                 Text.assemble(*pieces, style=_colour(part.style))
             )
@@ -440,7 +441,7 @@ def as_html(part: Shown) -> str:
             return f"<p>{escape(part)}</p>\n"
         case Line():
             name = f' id="{escape(part.name)}"' if part.name else ""
-            return f"<p{name}{_class(part.style)}>{''.join(map(_span, part.spans))}</p>\n"
+            return f"<p{name}{_class(part.style)}>{''.join(map(_span, part.to_spans()))}</p>\n"
         case Items():
             lines = (f"<li>{escape(text)}</li>\n" for text in part.texts)
             return f"<ul>\n{''.join(lines)}</ul>\n"
@@ -537,7 +538,7 @@ def _markdown(part: Shown) -> str:
         case str():
             return escape_markdown(part)
         case Line():
-            return "".join(map(_markdown_span, part.spans))
+            return "".join(map(_markdown_span, part.to_spans()))
         case Items():
             return "\n".join(
                 f"- {escape_markdown(text)}" for text in part.texts

@@ -61,11 +61,6 @@ class ProcessLimits:
     time_s: float
     memory_mb: float
 
-    @property
-    def waiting_s(self) -> float:
-        """Wall-clock time after which the process is killed, on all systems [s]."""
-        return WAITING_FACTOR * self.time_s
-
     @classmethod
     def for_file(cls, path: str | Path) -> ProcessLimits:
         """Return limits for reading a file, in proportion to its size: some tens of times what
@@ -151,7 +146,9 @@ def run_isolated(
                 capture_output=True,
                 text=True,
                 errors="replace",
-                timeout=None if limits is None else limits.waiting_s,
+                timeout=None
+                if limits is None
+                else (WAITING_FACTOR * limits.time_s),
             )
         except subprocess.TimeoutExpired as late:
             raise Failed(

@@ -120,7 +120,7 @@ def predict(
 def reason_against_copy(experiment: Experiment, _: Experiment) -> str:
     """Return that points cannot be compared if nothing else is measured; else ""."""
     is_compared = (
-        experiment.markers.sample_count
+        experiment.markers.count_samples()
         or experiment.sensors_by_grasp
         or experiment.readings
     )
@@ -167,7 +167,7 @@ def step_differences(
         return []
     known_s = part.segment.experiment.t_s
     rows_s = part.segment.dynamics.t_s
-    fitted = part.x[part.segment.markers.sample_rows]
+    fitted = part.x[part.segment.markers.observable.rows]
     way_m = share * (trajectory.positions_m.reshape(len(fitted), -1) - fitted)
     way_rows_m = np.array(
         [np.interp(rows_s, known_s, each) for each in way_m.T]

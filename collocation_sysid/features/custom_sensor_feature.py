@@ -110,7 +110,7 @@ def step_differences(
     """Yield the changes (S, G, 3) of the residuals of each sensor; zero where not predicted."""
     if not (segment := part.segment).custom_sensors:
         return
-    fitted_x = part.x[segment.markers.sample_rows]
+    fitted_x = part.x[segment.markers.observable.rows]
     fitted = _predict_sensors(
         segment,
         fitted_x,

@@ -66,7 +66,7 @@ def copied_times_s(
     experiment: Experiment, other: Experiment
 ) -> Iterable[tuple[Array, Array]]:
     """Return the times of both recordings if the experiment has a marker sample."""
-    if experiment.markers.sample_count:
+    if experiment.markers.count_samples():
         return ((experiment.t_s, other.t_s),)
     return ()
 
@@ -152,7 +152,7 @@ def prediction_residuals(
 ) -> PredictionResiduals | None:
     """Return the differences of the markers [m]; None without a sample of any."""
     markers = experiment.markers
-    if not markers.sample_count:
+    if not markers.count_samples():
         return None
     return PredictionResiduals(
         experiment.t_s,

@@ -146,7 +146,7 @@ def wrench_causes(solution: Solution) -> list[Hypothesis]:
     with_markers = [
         s
         for s in solution.collocation.transcriptions
-        if s.experiment.markers.sample_count
+        if s.experiment.markers.count_samples()
     ]
     estimated = {part.segment.experiment.name: part for part in solution.parts}
     parts = _from_markers(
@@ -189,7 +189,7 @@ def wrench_mistakes(collocation: Collocation) -> WrenchComparison:
         s
         for s in collocation.transcriptions
         if s.sensors
-        and s.experiment.markers.sample_count
+        and s.experiment.markers.count_samples()
         and not len(s.nuisance.indices_of_rows(*TOOL))
     ]
     shorter = [first_samples(s.experiment, CHECKED_SAMPLES) for s in with_both]
@@ -217,7 +217,7 @@ def _misses(part: ExperimentIterate) -> bool:
     pairs = zip(part.segment.sensors, part.observables[1:], strict=False)
     return any(
         float(np.sum(sensor.residuals(observation, part.phi) ** 2))
-        > MISFIT**2 * sensor.is_compared_by_component.sum()
+        > MISFIT**2 * sensor.is_compared.reshape(-1, 6).sum()
         for sensor, observation in pairs
     )
 
@@ -230,7 +230,7 @@ def _markers_misfit(part: ExperimentIterate) -> float:
     return float(
         np.sqrt(
             np.sum(residuals**2)
-            / max(1, 3 * part.segment.experiment.markers.sample_count)
+            / max(1, 3 * part.segment.experiment.markers.count_samples())
         )
     )
 
@@ -330,7 +330,7 @@ class _OneSensor:
         self.forced = forced
         blind = without_grasp_sensors(segment.experiment)
         self.scale_known = (
-            not segment.body.mass_derivatives or blind.has_known_force
+            not segment.body.mass_derivatives or blind.has_known_force()
         )
         self._known: dict[tuple[bytes, Frame, bytes], Array] = {}
         self.declared = DescribedWrench(
@@ -392,7 +392,7 @@ class _OneSensor:
         noise, without what its tare explains; NaN in the same places.
         """
         wrench = trial.wrench
-        sigmas = trial.wrench.sigmas
+        sigmas = trial.wrench.stack_sigmas()
         predicted = (
             np.where(wrench.is_measured, self._predicted(wrench), np.nan)
             / sigmas
@@ -456,7 +456,8 @@ class _OneSensor:
         wrench = self.declared.wrench
         forces = self._predicted(wrench)[:, FORCES]
         by_shift = (
-            np.cross(forces[:, None], np.eye(3)[None]) / wrench.sigmas[3]
+            np.cross(forces[:, None], np.eye(3)[None])
+            / wrench.stack_sigmas()[3]
         )  # (S, shift, 3)
         by_shift = np.where(
             np.isfinite(measured[:, None, TORQUES]), by_shift, np.nan

@@ -106,7 +106,7 @@ def misfits(
     """Yield the differences of each sensor over its σ."""
     pairs = zip(predicted.wrenches, experiment.wrenches, strict=True)
     for values, sensor in pairs:
-        ratio = (values - sensor.values) / sensor.sigmas
+        ratio = (values - sensor.values) / sensor.stack_sigmas()
         yield misfit("the wrench", "sigma_n", ratio=ratio)
 
 
@@ -126,7 +126,7 @@ def step_differences(
     rows = zip(sensors, fitted, predicted.wrenches, strict=True)
     for sensor, of_fit, of_simulation in rows:
         way = share * np.nan_to_num(
-            (of_simulation - of_fit) / sensor.wrench.sigmas
+            (of_simulation - of_fit) / sensor.wrench.stack_sigmas()
         )
         yield way.reshape(-1, 2, 3)
 
@@ -147,7 +147,7 @@ def simulated_hypotheses(
     unpredicted = {each.experiment for each in deviations}
     hypotheses: list[Hypothesis] = []
     has_both = any(
-        each.wrenches and each.markers.sample_count
+        each.wrenches and each.markers.count_samples()
         for each in check.problem.experiments
     )
     fit_s = check.fit_s(CHECKED_SAMPLES) if has_both else 0.0
@@ -301,7 +301,7 @@ def fit_fields(part: ExperimentIterate, solution: Solution) -> dict[str, Any]:
     name = part.segment.experiment.name
     force_n, torque_nm = solution.wrench_rms.get(name, (None, None))
     squares = [
-        (sensor.wrench.symmetry * sensor.wrench.sigmas) ** 2
+        (sensor.wrench.symmetry * sensor.wrench.stack_sigmas()) ** 2
         * np.where(sensor.wrench.measured_components, 1.0, np.nan)
         for sensor in part.segment.sensors
     ]

@@ -304,7 +304,7 @@ class Body(Discretisation):
         other = copy(self)
         other.geometry = self._geometry_at(positions_m)
         other.rest_shape = "stress_free"
-        for name in self._cached_names - {"pattern", "part_of_cells"}:
+        for name in self._list_cached_names() - {"pattern", "part_of_cells"}:
             vars(other).pop(name, None)
         other._evaluators = {}
         other._framed = {}
@@ -346,10 +346,9 @@ class Body(Discretisation):
             face_sets=mesh.face_sets,
         )
 
-    @property
-    def density_indices(self) -> list[int]:
-        """Indices in θ of the free densities, in the order of the parts; empty if all are
-        stated.
+    def list_density_indices(self) -> list[int]:
+        """Return the indices in θ of the free densities, in the order of the parts; empty if all
+        are stated.
         """
         pairs = zip(self.parts, self._gamma_m_indices, strict=True)
         return [place + 1 for part, place in pairs if part.has_free_density]
@@ -357,13 +356,14 @@ class Body(Discretisation):
     def __getstate__(self) -> dict[str, Any]:
         # Kernels belong to this process, and cached properties are computed again.
         state = {
-            n: v for n, v in vars(self).items() if n not in self._cached_names
+            n: v
+            for n, v in vars(self).items()
+            if n not in self._list_cached_names()
         }
         return state | {"_evaluators": {}, "_framed": {}}
 
-    @property
-    def _cached_names(self) -> set[str]:
-        """Names of the cached properties that have been computed."""
+    def _list_cached_names(self) -> set[str]:
+        """Return the names of the cached properties that have been computed."""
         return {
             n
             for n in vars(self)
@@ -410,10 +410,9 @@ class Body(Discretisation):
         )
         return self if free == self.parts else self.with_parts(free)
 
-    @property
-    def field_lengths_m(self) -> dict[str, float]:
-        """Correlation lengths [m] of the fields, by the names of their constants; empty without
-        fields.
+    def collect_field_lengths_m(self) -> dict[str, float]:
+        """Return the correlation lengths [m] of the fields, by the names of their constants; empty
+        without fields.
         """
         return {
             part.field_name: part.field.length_m
@@ -423,7 +422,7 @@ class Body(Discretisation):
 
     def with_field_lengths(self, lengths_m: Mapping[str, float]) -> Body:
         """Return a copy of this body with other correlation lengths [m] of its fields, by the names of
-        the fields' constants (keys of `field_lengths_m`).
+        the fields' constants (keys of `collect_field_lengths_m`).
 
         Other names are ignored; a field without a length is a KeyError.
         """
@@ -438,9 +437,10 @@ class Body(Discretisation):
             )
         )
 
-    @property
-    def phase_samples(self) -> tuple[PhaseSamples, ...]:
-        """Posterior samples of the phases of two-phase fields; empty before a solution is known."""
+    def list_phase_samples(self) -> tuple[PhaseSamples, ...]:
+        """Return the posterior samples of the phases of two-phase fields; empty before a solution
+        is known.
+        """
         fields = (part.field for part in self.parts)
         return tuple(
             field.samples
@@ -467,7 +467,7 @@ class Body(Discretisation):
         obstacle frames; θ and everything that depends on it follow the new parts.
         """
         other = copy(self)
-        for name in self._cached_names - {
+        for name in self._list_cached_names() - {
             "pattern",
             "shape_gradients",
             "part_of_cells",
@@ -510,7 +510,10 @@ class Body(Discretisation):
             return self
         if key not in self._framed:
             other = copy(self)
-            for name in self._cached_names - {"part_of_cells", "frame_nodes_m"}:
+            for name in self._list_cached_names() - {
+                "part_of_cells",
+                "frame_nodes_m",
+            }:
                 vars(other).pop(name, None)
             ConstantsModel.__init__(
                 other, self.parts, forces=self.forces, frictions=frictions
@@ -634,7 +637,7 @@ class Body(Discretisation):
         masses = np.array(self._part_masses(theta))[:, ::3]
         # Nodes of obstacle frames have no mass.
         total = np.where(
-            self.dof_volume_m3[::3] > 0, masses.sum(axis=0), np.inf
+            self.sum_dof_volumes_m3()[::3] > 0, masses.sum(axis=0), np.inf
         )
         node = int(total.argmin())
         if total[node] > 0:
@@ -680,7 +683,7 @@ class Body(Discretisation):
         """Custom forces on their nodes or faces, in the order of `forces`; a force without `nodes`
         acts on all nodes. Constants of each are the entries of θ after those of the parts.
         """
-        volume = self.dof_volume_m3[::3]
+        volume = self.sum_dof_volumes_m3()[::3]
         first = self.starts[-1]
         placed = []
         for force in self.forces:
@@ -710,11 +713,10 @@ class Body(Discretisation):
     @cached_property
     def unit_air_drag(self) -> LocatedForce:
         """Drag on the surface in a fluid of density 1 kg/m³, see `air`."""
-        return placed_unit_drag(self.nodes, self.dof_volume_m3[::3])
+        return placed_unit_drag(self.nodes, self.sum_dof_volumes_m3()[::3])
 
-    @property
-    def dof_volume_m3(self) -> Array:
-        """Lumped volume (3n,) of every degree of freedom [m³]."""
+    def sum_dof_volumes_m3(self) -> Array:
+        """Return the lumped volume (3n,) of every degree of freedom [m³]."""
         return np.sum(self._lumped_m3, axis=0)
 
     @cached_property
@@ -1120,7 +1122,10 @@ class Body(Discretisation):
     def _gamma_m_indices(self) -> list[int]:
         """Index in θ of each part's γ_m; the density follows where it is free."""
         starts = zip(self.parts, self.starts, strict=False)
-        return [start + part.gamma_m_index for part, start in starts]
+        return [
+            start + (part.law_constant_count + 2 * len(part.prony))
+            for part, start in starts
+        ]
 
     @cached_property
     def tied_shares(self) -> dict[int, Array]:

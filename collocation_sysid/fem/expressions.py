@@ -68,10 +68,9 @@ class PointLaw:
     scaled_indices: tuple[int, ...] = ()
     rest: RestPointLayout | None = None
 
-    @property
-    def constant_count(self) -> int:
-        """Number of entries of θ at a point: constants of material and damping law, the stiffening
-        by memory, and changes of the inputs of the stress-free shape.
+    def count_constants(self) -> int:
+        """Return the number of entries of θ at a point: constants of material and damping law, the
+        stiffening by memory, and changes of the inputs of the stress-free shape.
         """
         count = (
             len(self.material.constants)
@@ -79,11 +78,6 @@ class PointLaw:
             + self.has_memory
         )
         return count + (self.rest.input_count if self.rest else 0)
-
-    @property
-    def internal_variable_count(self) -> int:
-        """Number of internal variables of a point."""
-        return 6 if self.has_memory else 0
 
     def psi(self, F: ca.SX, theta: ca.SX) -> ca.SX:
         """Return the energy density [J/m³] at the deformation gradient F (3, 3), from the constants
@@ -167,20 +161,20 @@ def quadrature_point(
         Number of internal variables; by default that of the law.
     """
     count = (
-        law.internal_variable_count
+        (6 if law.has_memory else 0)
         if internal_variable_count is None
         else internal_variable_count
     )
     point = QuadraturePoint.from_element(
         element,
-        law.constant_count,
+        law.count_constants(),
         *fields,
         internal_variable_count=count,
         scaled=law.scaled_indices,
         rest=law.rest,
     )
     rule = law.material.chain_rule(
-        point.material_gradient, _material_constants(point, law)
+        point.compute_material_gradient(), _material_constants(point, law)
     )
     return replace(point, rule=rule)
 
@@ -207,7 +201,10 @@ def kernel_from_outputs(
             )
             for term in terms
         ]
-        pieces[key] = terms[0].contraction, sum(summands[1:], summands[0])
+        pieces[key] = (
+            terms[0].choose_contraction(),
+            sum(summands[1:], summands[0]),
+        )
     last = point.make_phase(name, pieces)
     return ElementKernel(
         last.pieces, tuple(point.fields), contractions=last.contractions
@@ -216,7 +213,7 @@ def kernel_from_outputs(
 
 def _energy(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return the elastic energy V ψ of a point."""
-    return point.volume * _energy_density(point, law)
+    return point.compute_volume() * _energy_density(point, law)
 
 
 def _energy_density(point: QuadraturePoint, law: PointLaw) -> ca.SX:
@@ -225,13 +222,13 @@ def _energy_density(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """
     constants = _material_constants(point, law)
     return law.material.psi_in(
-        point.rule, point.material_gradient, values=constants
+        point.rule, point.compute_material_gradient(), values=constants
     )
 
 
 def _material_constants(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return the constants of the material at a point, multiplied by the field."""
-    return point.local_constants[: len(law.material.constants)]
+    return point.scale_constants()[: len(law.material.constants)]
 
 
 def _potential(point: QuadraturePoint, law: PointLaw) -> ca.SX:
@@ -253,8 +250,8 @@ def _damping_potential(
     A law that treats all symbols alike also gets the symbols of energies and their rates. Any
     other gets the energy as an expression without them.
     """
-    strain = point.strain_symbols
-    rate = point.strain_rate_symbols
+    strain = point.stack_strain_symbols()
+    rate = ca.vertcat(point.gradients["v"], *point.stretches[1:2])
     if law.damping.accepts_symbols:
         symbols, rates = point.rule.rates(strain, rate)
         strain = ca.vertcat(strain, symbols)
@@ -262,15 +259,15 @@ def _damping_potential(
     elif law.damping.potential:
         (energy,) = point.rule.eliminate([energy])
     return law.damping_potential(
-        energy, strain, rate=rate, theta=point.local_constants
+        energy, strain, rate=rate, theta=point.scale_constants()
     )
 
 
 def memory_energy(point: QuadraturePoint) -> ca.SX:
     """Return ½ V H : FᵀF, the energy of the overstress, whose derivative by F is V F H."""
-    F = point.material_gradient
+    F = point.compute_material_gradient()
     return (
-        point.volume
+        point.compute_volume()
         * ca.trace(symmetric_matrix(point.point_data[:6]) @ F.T @ F)
         / 2
     )
@@ -306,7 +303,7 @@ def second_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     `point.rule`.
     """
     return six_entries(
-        ca.inv_minor(point.material_gradient)
+        ca.inv_minor(point.compute_material_gradient())
         @ ca.reshape(first_piola(point, law), 3, 3)
     )
 
@@ -319,16 +316,16 @@ def _damping(
     potential.
     """
     stress_and_slope = law.damping_stress(
-        ca.vec(point.material_gradient),
-        point.material_gradient_rate,
-        theta=point.local_constants,
+        ca.vec(point.compute_material_gradient()),
+        point.compute_material_gradient_rate(),
+        theta=point.scale_constants(),
     )
     return (
         None
         if stress_and_slope is None
         else (
-            point.volume * stress_and_slope[0],
-            point.volume * stress_and_slope[1],
+            point.compute_volume() * stress_and_slope[0],
+            point.compute_volume() * stress_and_slope[1],
         )
     )
 
@@ -357,7 +354,7 @@ def force_kernel(element: Element, law: PointLaw) -> ElementKernel:
         stress = -damping[0]
         force += (
             Derivative(
-                ca.dot(stress, point.material_gradient_rate) / 2,
+                ca.dot(stress, point.compute_material_gradient_rate()) / 2,
                 ("v",),
                 known=stress,
             ),
@@ -384,9 +381,9 @@ def linearisation_kernel(element: Element, law: PointLaw) -> ElementKernel:
         stress = -damping[0]
         slope = -damping[1]
         # Half the dissipated power is quadratic in the rate; its derivative by it is the stress.
-        half_power = ca.dot(stress, point.material_gradient_rate) / 2
+        half_power = ca.dot(stress, point.compute_material_gradient_rate()) / 2
         by_rate = ca.jacobian(stress, point.gradients["v"])
-        by_theta = ca.jacobian(stress, point.differentiated_constants)
+        by_theta = ca.jacobian(stress, point.stack_differentiated_constants())
         outputs["force"] += (Derivative(half_power, ("v",), known=stress),)
         outputs["by_position"] += (
             Derivative(half_power, ("v", "x"), part="symmetric", known=slope),
@@ -416,13 +413,15 @@ def curvature_kernel(element: Element, law: PointLaw) -> ElementKernel:
         "x",
         "v",
         "w",
-        internal_variable_count=2 * law.internal_variable_count,
+        internal_variable_count=2 * (6 if law.has_memory else 0),
     )
     power = -point.weighted_derivative(_potential(point, law))
     if law.has_memory:
-        power += ca.dot(point.internal_variables[6:], second_piola(point, law))
+        power += ca.dot(
+            point.select_internal_variables()[6:], second_piola(point, law)
+        )
     if damping := _damping(point, law):
-        power -= ca.dot(damping[0], point.weighted_material_gradient)
+        power -= ca.dot(damping[0], point.weigh_material_gradient())
     mixed = Derivative(
         power, ("x", "v"), part="symmetric" if damping else "whole"
     )

@@ -48,9 +48,8 @@ class Phase:
     pieces: ca.Function
     contractions: dict[str, Contraction]
 
-    @property
-    def nodes(self) -> int:
-        """Number of nodes per element."""
+    def count_nodes(self) -> int:
+        """Return the number of nodes per element."""
         return self.pieces.nnz_in(0) // 3
 
     @cached_property
@@ -63,7 +62,9 @@ class Phase:
         inputs = [
             ca.SX.sym(name, sx.size1_in(k)) for k, name in enumerate(names)
         ]
-        gradients = node_gradients(inputs[names.index("geometry")], self.nodes)
+        gradients = node_gradients(
+            inputs[names.index("geometry")], self.count_nodes()
+        )
         outputs = [
             _contracted(piece, how, gradients=gradients)
             for piece, how in zip(
@@ -131,10 +132,9 @@ class ElementKernel:
     coupled: dict[str, Contraction] = field(default_factory=dict)
     coupling: ca.Function | None = None
 
-    @property
-    def point_data_count(self) -> int:
-        """Number of internal variables and other data of a point; 0 if the kernel has no such
-        input.
+    def count_point_data(self) -> int:
+        """Return the number of internal variables and other data of a point; 0 if the kernel has no
+        such input.
         """
         names = self.pieces.name_in()
         return (
@@ -175,7 +175,7 @@ class ElementKernel:
             inputs[place] = ca.MX.sym(
                 names[place], self.pieces.size1_in(place), points
             )
-        size = 3 * self.phases[0].nodes
+        size = 3 * self.phases[0].count_nodes()
         sums = ca.MX(0, 1)
         vectors = ca.MX(size, 0)
         outputs: list[ca.MX] = []
@@ -301,9 +301,8 @@ class Derivative:
     part: Literal["whole", "symmetric", "skew"] = "whole"
     known: ca.SX | None = None
 
-    @property
-    def contraction(self) -> Contraction:
-        """Contraction of its piece: as many node indices as variables that are fields."""
+    def choose_contraction(self) -> Contraction:
+        """Return the contraction of its piece: as many node indices as variables that are fields."""
         contractions: tuple[Contraction, ...] = ("none", "nodes", "pairs")
         return contractions[len(self.by) - self.by.count("theta")]
 
@@ -311,7 +310,7 @@ class Derivative:
         """Return the part (symmetric, skew or whole) that `part` states of the piece (9, 9) of a
         second derivative by two fields; the pieces of other derivatives are returned unchanged.
         """
-        if self.contraction != "pairs":
+        if self.choose_contraction() != "pairs":
             return piece
         if self.part == "whole":
             return from_lower_triangle(piece)
@@ -410,32 +409,33 @@ class QuadraturePoint:
                 "carried",
                 internal_variable_count
                 + bool(scaled)
-                + (rest.count if rest else 0),
+                + (rest.count_values() if rest else 0),
             ),
             scaled_indices=scaled,
             rest=rest,
         )
 
-    @property
-    def local_constants(self) -> ca.SX:
-        """Constants θ at this point; those that a field scales are multiplied by its value."""
+    def scale_constants(self) -> ca.SX:
+        """Return the constants θ at this point; those that a field scales are multiplied by its
+        value.
+        """
         constants = ca.SX(self.theta)
         for place in self.scaled_indices:
             constants[place] *= ca.exp(self.point_data[-1])
         return constants
 
-    @property
-    def differentiated_constants(self) -> ca.SX:
-        """Variables of derivatives by "theta": θ, and the logarithm of the field."""
+    def stack_differentiated_constants(self) -> ca.SX:
+        """Return the variables of derivatives by "theta": θ, and the logarithm of the field."""
         return (
             ca.vertcat(self.theta, self.point_data[-1])
             if self.scaled_indices
             else self.theta
         )
 
-    @property
-    def internal_variables(self) -> ca.SX:
-        """Internal variables, i.e. the data of the point without the logarithm of the field."""
+    def select_internal_variables(self) -> ca.SX:
+        """Return the internal variables, i.e. the data of the point without the logarithm of the
+        field.
+        """
         return self.point_data[:-1] if self.scaled_indices else self.point_data
 
     @property
@@ -443,41 +443,39 @@ class QuadraturePoint:
         """Volume assigned to the point in the mesh [m³]."""
         return self.geometry[3 * self.nodes]
 
-    @property
-    def volume(self) -> ca.SX:
-        """Volume assigned to the point in the stress-free shape [m³]."""
+    def compute_volume(self) -> ca.SX:
+        """Return the volume assigned to the point in the stress-free shape [m³]."""
         if self.rest is None:
             return self.mesh_volume
         return self.mesh_volume * ca.det(
-            ca.reshape(self._rest_values[:9], 3, 3)
+            ca.reshape(self._expand_rest_values()[:9], 3, 3)
         )
 
-    @property
-    def _rest_values(self) -> ca.SX:
-        """Values of the stress-free shape at this point, see `RestPointLayout`."""
+    def _expand_rest_values(self) -> ca.SX:
+        """Return the values of the stress-free shape at this point, see `RestPointLayout`."""
         assert self.rest is not None
-        data = self.point_data[self.point_data.numel() - self.rest.count :]
+        data = self.point_data[
+            self.point_data.numel() - self.rest.count_values() :
+        ]
         changes = self.theta[self.theta.numel() - self.rest.input_count :]
         return self.rest.expand(data, changes)
 
-    @property
-    def material_gradient(self) -> ca.SX:
-        """Deformation gradient at which the material is evaluated (3, 3).
+    def compute_material_gradient(self) -> ca.SX:
+        """Return the deformation gradient at which the material is evaluated (3, 3).
 
         It includes the averaged dilatation and the stress-free shape.
         """
         F = ca.reshape(self.gradients["x"], 3, 3)
         stretch = self.stretches[0] if self.stretches else None
         if self.rest is not None:
-            values = self._rest_values
+            values = self._expand_rest_values()
             F = F @ ca.inv_minor(ca.reshape(values[:9], 3, 3))
             if stretch is not None:
                 stretch = stretch + values[9] / 3
         return F if stretch is None else ca.exp(stretch) * F
 
-    @property
-    def strain_symbols(self) -> ca.SX:
-        """Symbols of an energy that depend on x: F and m."""
+    def stack_strain_symbols(self) -> ca.SX:
+        """Return the symbols of an energy that depend on x: F and m."""
         return ca.vertcat(self.gradients["x"], *self.stretches[:1])
 
     def gradient(self, scalar: ca.SX, by: ca.SX) -> ca.SX:
@@ -500,26 +498,21 @@ class QuadraturePoint:
             expression, by, direction=direction
         )
 
-    @property
-    def strain_rate_symbols(self) -> ca.SX:
-        """Symbols of the derivative of `strain_symbols` along v."""
-        return ca.vertcat(self.gradients["v"], *self.stretches[1:2])
-
-    @property
-    def material_gradient_rate(self) -> ca.SX:
-        """Derivative of `material_gradient` along v, stacked (9,)."""
+    def compute_material_gradient_rate(self) -> ca.SX:
+        """Return the derivative of `compute_material_gradient` along v, stacked (9,)."""
         return ca.jtimes(
-            ca.vec(self.material_gradient),
-            self.strain_symbols,
-            self.strain_rate_symbols,
+            ca.vec(self.compute_material_gradient()),
+            self.stack_strain_symbols(),
+            ca.vertcat(self.gradients["v"], *self.stretches[1:2]),
         )
 
-    @property
-    def weighted_material_gradient(self) -> ca.SX:
-        """Derivative of `material_gradient` along w, stacked (9,)."""
+    def weigh_material_gradient(self) -> ca.SX:
+        """Return the derivative of `compute_material_gradient` along w, stacked (9,)."""
         weights = ca.vertcat(self.gradients["w"], *self.stretches[2:3])
         return ca.jtimes(
-            ca.vec(self.material_gradient), self.strain_symbols, weights
+            ca.vec(self.compute_material_gradient()),
+            self.stack_strain_symbols(),
+            weights,
         )
 
     def weighted_derivative(self, scalar: ca.SX) -> ca.SX:
@@ -539,7 +532,7 @@ class QuadraturePoint:
         second variable.
         """
         inputs = [
-            self.differentiated_constants
+            self.stack_differentiated_constants()
             if name == "theta"
             else self.gradients[name]
             for name in by

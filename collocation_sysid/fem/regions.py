@@ -128,7 +128,9 @@ class BodyPart:
         Prony branches, γ_m (always), the density if it is a parameter, and those of the field.
         """
         memory = [
-            constant for branch in self.prony for constant in branch.constants
+            constant
+            for branch in self.prony
+            for constant in branch.named_constants()
         ]
         density = (DENSITY,) if self.has_free_density else ()
         return (
@@ -149,13 +151,6 @@ class BodyPart:
     def law_constant_count(self) -> int:
         """Number of constants of the material and the damping law."""
         return len(self.material.constants) + len(self.damping.constants)
-
-    @property
-    def gamma_m_index(self) -> int:
-        """Index of γ_m among the constants of the part (not in θ); a free density has the next
-        index.
-        """
-        return self.law_constant_count + 2 * len(self.prony)
 
     @property
     def point_constant_count(self) -> int:
@@ -465,7 +460,7 @@ class ConstantsModel:
         }
         for force in forces:
             for constant in force.constants:
-                if constant.name in self.parameter_names:
+                if constant.name in self.list_parameter_names():
                     raise InputError(
                         f"force {force.name!r} has the constant {constant.name!r}, but another "
                         "constant of the body has the same name; expected another name for the "
@@ -473,7 +468,7 @@ class ConstantsModel:
                     )
                 self.constants[constant.name] = constant
         for constant in frictions:
-            if constant.name in self.parameter_names:
+            if constant.name in self.list_parameter_names():
                 raise InputError(
                     f"the coefficient of friction {constant.name!r} has the name of another constant of "
                     "the body; expected another name of the obstacle, which the name of its friction "
@@ -527,16 +522,17 @@ class ConstantsModel:
             for source in self.constant_sources(known)
             for name in source.names.values()
         }
-        used.update(self.field_coefficient_names, self.contrast_deviations)
+        used.update(
+            self.list_field_coefficient_names(), self.find_contrast_deviations()
+        )
         further = (force.constants for force in self.forces)
         return used.union(
             *({c.name for c in some} for some in (*further, self.frictions))
         )
 
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """All names that a parameter may have, without repetitions: constants of each part, moduli
-        in their place, both with and without the name of the region, and `mass_kg`.
+    def list_parameter_names(self) -> tuple[str, ...]:
+        """Return all names that a parameter may have, without repetitions: constants of each part,
+        moduli in their place, both with and without the name of the region, and `mass_kg`.
         """
         names = []
         for part in self.parts:
@@ -644,17 +640,19 @@ class ConstantsModel:
         """
         return [theta[a:b] for a, b in pairwise(self.starts)]
 
-    @property
-    def field_coefficient_names(self) -> tuple[str, ...]:
-        """Names of all constants of fields that are coefficients of shapes, in the order of θ."""
+    def list_field_coefficient_names(self) -> tuple[str, ...]:
+        """Return the names of all constants of fields that are coefficients of shapes, in the order
+        of θ.
+        """
         return tuple(
-            name for names in self.field_vectors.values() for name in names
+            name
+            for names in self.group_field_coefficients().values()
+            for name in names
         )
 
-    @property
-    def field_vectors(self) -> dict[str, tuple[str, ...]]:
-        """Names of the coefficients of each smooth field in the order of θ, by the name of their
-        vector: "field", or "core.field" for the field of the region "core".
+    def group_field_coefficients(self) -> dict[str, tuple[str, ...]]:
+        """Return the names of the coefficients of each smooth field in the order of θ, by the name
+        of their vector: "field", or "core.field" for the field of the region "core".
         """
         return {
             part.full_name(FIELD_COEFFICIENT.name): tuple(
@@ -665,9 +663,10 @@ class ConstantsModel:
             if part.field and part.field.field.prior != TWO_PHASE
         }
 
-    @property
-    def contrast_deviations(self) -> dict[str, float]:
-        """Prior deviations of the logarithms of the contrasts of two-phase fields, by name."""
+    def find_contrast_deviations(self) -> dict[str, float]:
+        """Return the prior deviations of the logarithms of the contrasts of two-phase fields, by
+        name.
+        """
         return {
             part.full_name(CONTRAST.name): part.field.field.deviation
             for part in self.parts
@@ -703,8 +702,8 @@ class ConstantsModel:
             For a name that the model does not have, or an elastic constant that is missing.
         """
         for name in constants:
-            if name not in self.parameter_names:
-                hint = hint_at(name, self.parameter_names)
+            if name not in self.list_parameter_names():
+                hint = hint_at(name, self.list_parameter_names())
                 raise InputError(
                     f"found the constant {name!r}; expected one of {', '.join(self.constants)}{hint}"
                 )

@@ -26,37 +26,34 @@ class RestPointLayout:
     input_count: int
     averages_dilatation: bool
 
-    @property
-    def value_count(self) -> int:
-        """Number D of values of a point."""
-        return 10 if self.averages_dilatation else 9
-
-    @property
-    def input_pairs(self) -> list[tuple[int, int]]:
-        """Pairs of inputs (i, j), i ≤ j, in the order of the second derivatives."""
+    def list_input_pairs(self) -> list[tuple[int, int]]:
+        """Return the pairs of inputs (i, j), i ≤ j, in the order of the second derivatives."""
         return [(i, j) for j in range(self.input_count) for i in range(j + 1)]
 
-    @property
-    def count(self) -> int:
-        """Number D (1 + k + k (k + 1)/2) of data of a point: values, first and second
+    def count_values(self) -> int:
+        """Return the number D (1 + k + k (k + 1)/2) of data of a point: values, first and second
         derivatives.
         """
-        return self.value_count * (1 + self.input_count + len(self.input_pairs))
+        return (10 if self.averages_dilatation else 9) * (
+            1 + self.input_count + len(self.list_input_pairs())
+        )
 
     def expand(self, data: ca.SX, changes: ca.SX) -> ca.SX:
         """Return the D values of the stress-free shape after changes (k,) of the inputs, to second
         order.
 
         `data` contains column after column the D values, their k first derivatives, and their
-        second derivatives in the order of `input_pairs`.
+        second derivatives in the order of `list_input_pairs`.
         """
         columns = ca.reshape(
-            data, self.value_count, 1 + self.input_count + len(self.input_pairs)
+            data,
+            10 if self.averages_dilatation else 9,
+            1 + self.input_count + len(self.list_input_pairs()),
         )
         values = columns[:, 0]
         for i in range(self.input_count):
             values += columns[:, 1 + i] * changes[i]
-        for number, (i, j) in enumerate(self.input_pairs):
+        for number, (i, j) in enumerate(self.list_input_pairs()):
             factor = 0.5 if i == j else 1.0
             values += (
                 factor

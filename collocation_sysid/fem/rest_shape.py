@@ -401,7 +401,8 @@ class InverseEquilibrium:
             np.arange(size), (3 * grasped_nodes[:, None] + np.arange(3)).ravel()
         )
         self.places: Index = np.array(
-            [*body.elastic_indices, *body.density_indices], dtype=np.int64
+            [*body.elastic_indices, *body.list_density_indices()],
+            dtype=np.int64,
         )
         self.layout = RestPointLayout(
             len(self.places), body.element.mean_dilatation
@@ -455,7 +456,7 @@ class InverseEquilibrium:
             columns.append((ends[0] - ends[1]) / (2 * step))
         pairs = [
             (columns[j][i] + columns[i][j]) / 2
-            for i, j in self.layout.input_pairs
+            for i, j in self.layout.list_input_pairs()
         ]
         return np.array(pairs).reshape(-1, *self.points_m.shape)
 
@@ -488,7 +489,7 @@ class InverseEquilibrium:
                 fields += [*self.second_derivatives(theta)]
             else:
                 fields += [np.zeros_like(self.points_m)] * len(
-                    self.layout.input_pairs
+                    self.layout.list_input_pairs()
                 )
             while len(self._data) >= 2:
                 self._data.pop(next(iter(self._data)), None)
@@ -500,7 +501,7 @@ class InverseEquilibrium:
         `point_data`, for the part of this index.
         """
         count, points = self._parts[part][1].shape[:2]
-        size = self.layout.count
+        size = self.layout.count_values()
         return np.arange(count * points * size).reshape(count, points, size)
 
     def weight_sensitivity(self, theta: ArrayLike) -> Array:
@@ -525,7 +526,7 @@ class InverseEquilibrium:
         stress-free positions X (n, 3) [m] are given and do not depend on θ: all derivatives are
         zero. New arrays, with the columns of `point_data_columns`.
         """
-        others = self.layout.input_count + len(self.layout.input_pairs)
+        others = self.layout.input_count + len(self.layout.list_input_pairs())
         return self._fields_at_points(
             [positions_m, *[np.zeros_like(positions_m)] * others]
         )
@@ -538,7 +539,7 @@ class InverseEquilibrium:
         ----------
         fields : sequence of (n, 3)
             X [m], then its derivatives by the inputs, and the second ones in the order of
-            `layout.input_pairs`.
+            `layout.list_input_pairs()`.
         """
         layout = self.layout
         data = []
@@ -589,7 +590,7 @@ class InverseEquilibrium:
                 )
                 + traces[..., k + number]
             )
-            for number, (i, j) in enumerate(layout.input_pairs)
+            for number, (i, j) in enumerate(layout.list_input_pairs())
         ]
         determinants = np.concatenate(
             [ratios[..., None], first, np.stack(second, axis=-1)], axis=-1
@@ -610,7 +611,7 @@ class InverseEquilibrium:
         logarithm = np.empty_like(values)
         logarithm[..., 0] = np.log(values[..., 0])
         logarithm[..., 1 : k + 1] = values[..., 1 : k + 1] / values[..., :1]
-        for number, (i, j) in enumerate(self.layout.input_pairs):
+        for number, (i, j) in enumerate(self.layout.list_input_pairs()):
             column = k + 1 + number
             product = logarithm[..., 1 + i] * logarithm[..., 1 + j]
             logarithm[..., column] = (

@@ -370,9 +370,8 @@ class FieldModes:
         """Constants of the coefficients a."""
         return tuple(field_coefficient(k) for k in range(self.field.modes))
 
-    @property
-    def resolution(self) -> FieldResolution:
-        """Resolution of the field, for reports."""
+    def describe_resolution(self) -> FieldResolution:
+        """Return the resolution of the field, for reports."""
         detail_m = float(np.pi / np.sqrt(self.laplacian.values[-1]))
         return FieldResolution(
             modes=self.field.modes,

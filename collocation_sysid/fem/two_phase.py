@@ -139,17 +139,15 @@ class TwoPhaseModes(FieldModes):
         assert isinstance(modes, cls)
         return replace(modes, phase=np.zeros(len(cells)))
 
-    @property
     def has_phases(self) -> bool:
-        """Whether any element is in an inclusion; false until phases are known, and also if the
-        solution has none.
+        """Return whether any element is in an inclusion; false until phases are known, and also if
+        the solution has none.
         """
         return bool(self.phase.any())
 
-    @property
-    def smooth_field(self) -> FieldModes:
-        """Smooth field of the same cells and correlation length, with the default amplitude, with
-        which the search for the phases starts.
+    def to_smooth_field(self) -> FieldModes:
+        """Return the smooth field of the same cells and correlation length, with the default
+        amplitude, with which the search for the phases starts.
         """
         field = replace(self.field, prior=SMOOTH, amplitude=None)
         return FieldModes(
@@ -163,7 +161,7 @@ class TwoPhaseModes(FieldModes):
     @property
     def variance_share(self) -> float:
         """Share of the prior variance that the shapes of the smooth field represent."""
-        return self.smooth_field.variance_share
+        return self.to_smooth_field().variance_share
 
     @property
     def shapes(self) -> Array:

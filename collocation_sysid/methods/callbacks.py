@@ -180,14 +180,12 @@ class NlpFunctions:
         self._functions: list[TimedFunction] = []
         self.nlp = self.function("nlp", "f", "g")
 
-    @property
-    def seconds(self) -> float:
-        """Time of all evaluations [s]."""
+    def sum_seconds(self) -> float:
+        """Return the time of all evaluations [s]."""
         return sum(function.seconds for function in self._functions)
 
-    @property
-    def calls(self) -> int:
-        """Number of evaluations of all functions."""
+    def count_calls(self) -> int:
+        """Return the number of evaluations of all functions."""
         return sum(function.calls for function in self._functions)
 
     def function(self, name: str, *outputs: str) -> TimedFunction:
@@ -452,7 +450,7 @@ class IterationMonitor(ca.Callback):
         except BaseException as error:
             self.errors.append(error)
         self.seconds += time.perf_counter() - began
-        return [1 if self.stop or self.recorder.is_late or self.errors else 0]
+        return [1 if self.stop or self.recorder.is_late() or self.errors else 0]
 
     def _record(self, arguments) -> None:
         """Add an entry to the recorder's history, count it in `lines`, and store the iterate in

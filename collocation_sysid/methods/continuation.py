@@ -140,7 +140,7 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
         Number of samples; it is increased to three and to the first sample with a marker, and as in
         `shortened_experiment`, but not beyond the recording.
     """
-    first_visible = experiment.markers.first_visible_sample
+    first_visible = experiment.markers.find_first_visible_sample()
     count = max(count, first_visible + 1, FEWEST_SHARED_SAMPLES)
     return shortened_experiment(experiment, min(len(experiment.t_s), count))
 
@@ -204,7 +204,7 @@ class _ContinuationState:
         before = max(
             [self.iterations, *(line.number for line in recorder.history[-1:])]
         )
-        elapsed_s = recorder.elapsed_s
+        elapsed_s = recorder.measure_elapsed_s()
 
         def record(line: Iteration) -> None:
             """Record an iteration with its number, time and share in the whole solve."""

@@ -71,11 +71,6 @@ class Iterate:
         """Largest coordinate of the feasibility step [m]."""
         return max(report.feasibility_m for report in self.reports)
 
-    @cached_property
-    def position_change_m(self) -> float:
-        """Largest change of a coordinate since the previous iterate [m]."""
-        return max(report.position_change_m for report in self.reports)
-
     @property
     def is_finite(self) -> bool:
         """Whether the loss and the feasibility step are finite."""

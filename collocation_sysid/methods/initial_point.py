@@ -156,10 +156,10 @@ def _search(
             replace(
                 line,
                 number=first_number + line.number,
-                time_s=recorder.elapsed_s,
+                time_s=recorder.measure_elapsed_s(),
             )
         )
-        if recorder.elapsed_s > max_time_s:
+        if recorder.measure_elapsed_s() > max_time_s:
             raise SearchEnded(Status.TIME_LIMIT)
 
     return method(collocation, record, start)

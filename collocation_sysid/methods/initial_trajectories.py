@@ -35,7 +35,9 @@ def associated_at_guess(collocation: Collocation) -> Collocation:
     the grasp. The given problem is not modified; it is returned itself if all positions are known.
     Every parameter must have a guess.
     """
-    if not any(segment.rows_to_place for segment in collocation.transcriptions):
+    if not any(
+        segment.count_rows_to_place() for segment in collocation.transcriptions
+    ):
         return collocation
     p = collocation.guess_p
     positions = []
@@ -146,7 +148,9 @@ def simulate_trajectories(
         )
         if failure is not None:
             failure = explain_failure(
-                part.segment.experiment, part.equations.theta, error=failure
+                part.segment.experiment,
+                part.equations.dynamics.theta,
+                error=failure,
             )
         return x, failure
 
@@ -182,7 +186,7 @@ def complete_variables(
         x = part.x
         if len(x) < part.segment.grid_times:
             rigid_positions = rigid_trajectory(
-                part.segment, part.equations.theta
+                part.segment, part.equations.dynamics.theta
             )
             x = np.concatenate([x, rigid_positions[len(x) :]])
         trajectories.append(x)
@@ -221,5 +225,5 @@ def rigid_trajectory(transcription: Transcription, theta: Array) -> Array:
         np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
     )
     return transcription.with_prescribed_positions(
-        positions.reshape(len(t_s), -1), transcription.guess_phi
+        positions.reshape(len(t_s), -1), transcription.compute_guess_phi()
     )

@@ -290,7 +290,9 @@ class InteriorPoint(Options):
         def settings(functions: NlpFunctions) -> dict[str, Any]:
             """Return the options of IPOPT with the time that remains."""
             options = self._settings(functions, is_warm=is_warm)
-            remaining_s = max(SHORTEST_S, self.max_time_s - recorder.elapsed_s)
+            remaining_s = max(
+                SHORTEST_S, self.max_time_s - recorder.measure_elapsed_s()
+            )
             return {"ipopt.max_wall_time": remaining_s} | options
 
         solution = nlpsol.solve(
@@ -450,7 +452,7 @@ class _DampedHessian:
 
         p is stored, and the damping, at most 1, adapted to the length of the step of q.
         """
-        steps = np.abs(p - self._last_p) / self.collocation.reach_p
+        steps = np.abs(p - self._last_p) / self.collocation.compute_reach_p()
         self._last_p = p
         of_q = steps[: self.collocation.nq].max(initial=0.0)
         is_short = (

@@ -40,9 +40,9 @@ def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
         Iterate after the step, which was evaluated as a trial from `previous`.
     """
     step = after.p - previous.p
-    change = after.fit.score - previous.fit.score
+    change = after.fit.compute_score() - previous.fit.compute_score()
     curvature_step = (
-        after.fit.score - after.previous_slopes_residual
+        after.fit.compute_score() - after.previous_slopes_residual
     )  # B · step
     change_dot_step = float(change @ step)
     if change_dot_step <= 0:
@@ -160,7 +160,7 @@ def exact_curvature(
     reduced = (
         directions.T @ (hessian @ directions) / (2 * collocation.loss_scale)
     )
-    return (reduced + reduced.T) / 2 - iterate.fit.information
+    return (reduced + reduced.T) / 2 - iterate.fit.compute_information()
 
 
 def _tangent_direction(
@@ -172,7 +172,8 @@ def _tangent_direction(
     """
     unit = np.eye(len(iterate.p))[k]
     position_changes = [
-        each.by_p @ unit[segment.parameter_indices[segment.dynamic_parameters]]
+        each.by_p
+        @ unit[segment.list_parameter_indices()[segment.dynamic_parameters]]
         for each, segment in zip(
             iterate.trajectories, collocation.transcriptions, strict=True
         )

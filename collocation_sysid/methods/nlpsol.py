@@ -97,7 +97,7 @@ def solve(
     previous_evaluations_s = watch.evaluations
     previous_linear_algebra_s = watch.linear_algebra
     unaccounted_s = (
-        recorder.elapsed_s
+        recorder.measure_elapsed_s()
         - watch.build
         - previous_evaluations_s
         - previous_linear_algebra_s
@@ -124,16 +124,16 @@ def solve(
     multipliers = result.multipliers
     if errors and not isinstance(errors[0], _SolverAbandoned):
         raise errors[0]
-    watch.evaluations = previous_evaluations_s + functions.seconds
+    watch.evaluations = previous_evaluations_s + functions.sum_seconds()
     # What is neither set-up nor callback.
     accounted_s = (
         watch.build + watch.evaluations + monitor.seconds + unaccounted_s
     )
     watch.linear_algebra = max(
-        previous_linear_algebra_s, recorder.elapsed_s - accounted_s
+        previous_linear_algebra_s, recorder.measure_elapsed_s() - accounted_s
     )
     status = statuses.get(result.return_status, Status.NUMERICAL_FAILURE)
-    if monitor.stop or (recorder.is_late and not status.converged):
+    if monitor.stop or (recorder.is_late() and not status.converged):
         status = Status.INTERRUPTED if monitor.stop else Status.TIME_LIMIT
     if not (status.converged and np.isfinite(z).all()):
         z, multipliers = monitor.best or (
@@ -157,7 +157,7 @@ def solve(
         z=problem_variables,
         multipliers=problem_multipliers,
         iterations=iterations,
-        evaluations=functions.calls,
+        evaluations=functions.count_calls(),
     )
 
 

@@ -215,15 +215,17 @@ class ReducedSearch:
         self.indefinite_steps = 0
         self.refines_solutions = not all(
             Factoriser.cached(
-                segment.pattern, segment.free_dofs, choice=options.factorisation
+                segment.experiment.sparsity,
+                segment.free_dofs,
+                choice=options.factorisation,
             ).skyline
             for segment in collocation.transcriptions
         )
-        self.lower, self.upper = collocation.parameter_bounds
+        self.lower, self.upper = collocation.compute_parameter_bounds()
         self.reassociations = 0
         self.most_measurements = 0
         self.is_associated = True
-        self.reach = collocation.reach_p
+        self.reach = collocation.compute_reach_p()
         self.p: Array = collocation.guess_p
         self.trajectories: list[Any] | None = None
         self.workers = workers
@@ -550,7 +552,9 @@ class ReducedSearch:
         predicted = point.loss - point.predicted_loss(step)
         actual = point.loss - trial.loss
         if trial.feasibility_m > max(
-            CONTRACTION * trial.position_change_m, SMALL_STRAIN * self.edge_m
+            CONTRACTION
+            * max(report.position_change_m for report in trial.reports),
+            SMALL_STRAIN * self.edge_m,
         ):
             return False
         noise = 1e-12 * point.loss + 1e-20
@@ -631,7 +635,7 @@ class ReducedSearch:
             is_first or not self.is_associated
         ) and self.trajectories is not None:
             counts = [
-                segment.rows_to_place
+                segment.count_rows_to_place()
                 for segment in self.collocation.transcriptions
             ]
             if any(counts):
@@ -653,7 +657,7 @@ class ReducedSearch:
         """
         self.collocation = self.recorder.collocation = collocation
         horizon.set_collocation(collocation)
-        self.lower, self.upper = collocation.parameter_bounds
+        self.lower, self.upper = collocation.compute_parameter_bounds()
         self.p = p
 
     def _reassociate(self, horizon: Horizon, point: Iterate) -> Iterate:
@@ -673,7 +677,7 @@ class ReducedSearch:
         else:
             stored = None
             counts = [
-                segment.rows_to_follow
+                segment.count_rows_to_follow()
                 for segment in self.collocation.transcriptions
             ]
             rows = horizon.first_rows(point.trajectories, counts)
@@ -692,7 +696,7 @@ class ReducedSearch:
         """Return whether a trial is still acceptable with correspondences found at its estimates.
 
         A point may then belong to another part of the surface, or to none. The number of
-        measurements, with those left out because of a crease (`Collocation.associated_count`), must
+        measurements, with those left out because of a crease (`Collocation.count_associated()`), must
         be at least `LEAST_VISIBLE_SHARE` of the largest so far, and the loss per measurement at most
         `EQUAL_MISFIT_RATIO` times that of the point. True without correspondences; false if the
         association may not be updated any more.
@@ -716,7 +720,7 @@ class ReducedSearch:
         if self.reassociations >= REREADINGS:
             return False
         self.most_measurements = max(
-            self.most_measurements, before.associated_count
+            self.most_measurements, before.count_associated()
         )
         after = self._reassociate(horizon, trial)
         if self.collocation is not before:
@@ -724,9 +728,9 @@ class ReducedSearch:
         self.reassociated_trial = _ReassociatedTrial(
             trial, self.collocation, reassociated=after
         )
-        associated = self.collocation.associated_count
-        each = after.loss / max(1, self.collocation.measurement_count)
-        before_each = point.loss / max(1, before.measurement_count)
+        associated = self.collocation.count_associated()
+        each = after.loss / max(1, self.collocation.count_measurements())
+        before_each = point.loss / max(1, before.count_measurements())
         self._set_collocation(horizon, before, p=point.p)
         return (
             associated >= LEAST_VISIBLE_SHARE * self.most_measurements
@@ -787,7 +791,7 @@ class ReducedSearch:
         values = self.collocation.parameters.scalar_values(
             p[: self.collocation.nq]
         )
-        time_s = self.recorder.elapsed_s
+        time_s = self.recorder.measure_elapsed_s()
         share = sum(each.rows for each in summaries) / sum(
             s.grid_times for s in self.collocation.transcriptions
         )

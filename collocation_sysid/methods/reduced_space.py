@@ -194,7 +194,8 @@ def memory_mb(collocation: Collocation) -> float:
     columns = 2 * (2 + collocation.nq) + 6
     values = columns * collocation.variable_count
     chunks = sorted(
-        Sweep(segment).chunk_bytes for segment in collocation.transcriptions
+        Sweep(segment).estimate_chunk_bytes()
+        for segment in collocation.transcriptions
     )
     concurrent = concurrent_count(len(chunks), collocation.threads)
     return (8 * values + sum(chunks[-concurrent:])) / 1e6
@@ -228,7 +229,9 @@ def _notes(
         )
     if status in (Status.CONVERGED, Status.STALLED):
         squares = sum(part.loss for part in collocation.iterates(z))
-        misfit = float(np.sqrt(squares / max(1, collocation.measurement_count)))
+        misfit = float(
+            np.sqrt(squares / max(1, collocation.count_measurements()))
+        )
         if misfit > MISFIT:
             size = f" ({1e3 * collocation.rms_marker_distance_m(z):.3g} mm rms)"
             measurements, noise_key = main_measurement(

@@ -102,15 +102,13 @@ class Recorder:
         self.notes: list[str] = []
         self.stopwatch = Stopwatch()
 
-    @property
-    def elapsed_s(self) -> float:
-        """Wall-clock time since the recorder was made [s]."""
+    def measure_elapsed_s(self) -> float:
+        """Return the wall-clock time since the recorder was made [s]."""
         return time.perf_counter() - self.start_s
 
-    @property
     def is_late(self) -> bool:
-        """Whether the elapsed time exceeds `max_time_s`."""
-        return self.elapsed_s > self.max_time_s
+        """Return whether the elapsed time exceeds `max_time_s`."""
+        return self.measure_elapsed_s() > self.max_time_s
 
     def initial_variables(self, start: Array | None) -> Array:
         """Return the initial variables (variables,).
@@ -157,7 +155,7 @@ class Recorder:
             parameters=collocation.parameters.scalar_values(
                 z[: collocation.nq]
             ),
-            time_s=self.elapsed_s,
+            time_s=self.measure_elapsed_s(),
         )
         self.add(line)
 

@@ -146,7 +146,7 @@ def start_problem(
         If a modulus has no guess and the body cannot be simulated at any stiffness, or with
         `is_complete` to the end at none from the best one on.
     """
-    unguessed = collocation.parameters.names_without_guess
+    unguessed = collocation.parameters.list_names_without_guess()
     if any(is_modulus(name) for name in unguessed):
         result = scan_stiffness(collocation, is_complete=is_complete)
         return collocation.with_parameters(result.parameters), result
@@ -475,7 +475,9 @@ def _compared_samples(transcription: Transcription) -> int:
     and at least one sample of each measurement; at most all.
     """
     t_s = transcription.experiment.t_s
-    first_samples = [transcription.experiment.markers.first_visible_sample]
+    first_samples = [
+        transcription.experiment.markers.find_first_visible_sample()
+    ]
     for reading in transcription.residuals[1:]:
         first_samples.append(
             int(np.searchsorted(t_s, reading.first_needed_s))

@@ -392,7 +392,9 @@ def simulate_rows(
     )
     if failure is not None:
         failure = explain_failure(
-            transcription.experiment, part.equations.theta, error=failure
+            transcription.experiment,
+            part.equations.dynamics.theta,
+            error=failure,
         )
     return SimulationResult(
         x, failure, times_s=solver.stopwatch.read_and_reset()
@@ -405,7 +407,7 @@ def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
     """
     part = _iterate(transcription, p, x=x)
     return FitSummary.from_iterate(
-        part, x, violation_n=float(np.abs(part.residual_n).max())
+        part, x, violation_n=float(np.abs(part.compute_residual_n()).max())
     )
 
 

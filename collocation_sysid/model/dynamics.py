@@ -65,7 +65,7 @@ class StencilTables:
         stencil of statics.
         """
         p, q, w, s = (
-            np.zeros((rows, scheme.largest_lag + 1)) for _ in range(4)
+            np.zeros((rows, scheme.compute_largest_lag() + 1)) for _ in range(4)
         )
         r = np.zeros(rows)
         for row in range(first_row, rows):
@@ -176,7 +176,7 @@ class Dynamics:
         lags = tables.p @ np.arange(tables.p.shape[1])
         evaluated_s = t_s - lags * experiment.timestep_s / substeps
         averaged_s = 0.0
-        if not experiment.is_static and table.is_midpoint:
+        if not experiment.is_static and table.is_midpoint():
             averaged_s = experiment.timestep_s / substeps
         forces = Forces.from_experiment(
             experiment, evaluated_s, step_s=averaged_s
@@ -289,9 +289,9 @@ class Dynamics:
         nu = self.combine(self.tables.q, x) / self.step_s
         return xi[self.first_row :], nu[self.first_row :]
 
-    @property
-    def state_weights(self) -> Array:
-        """Weights (N, reach + 1) of x_{t−i} in ξ_t, where a given start counts as an evaluation.
+    def compute_state_weights(self) -> Array:
+        """Return the weights (N, reach + 1) of x_{t−i} in ξ_t, where a given start counts as an
+        evaluation.
 
         Rows before `first_row` have weight 1 at lag 0: internal variables begin with the start
         state.
@@ -300,9 +300,8 @@ class Dynamics:
         weights[: self.first_row, 0] = 1.0
         return weights
 
-    @property
-    def interval_to_next_s(self) -> Array:
-        """Time [s] from each evaluation to the next (N,).
+    def compute_intervals_to_next_s(self) -> Array:
+        """Return the time [s] from each evaluation to the next (N,).
 
         The last entry is one step; in a static experiment 1 s.
         """
@@ -333,7 +332,8 @@ class Dynamics:
             result. Internal variables that are not given are computed from x.
         """
         if not (
-            self.body.has_memory or self.forces.terms_with_internal_variables
+            self.body.has_memory
+            or self.forces.find_terms_with_internal_variables()
         ):
             return ()
         first_rows = slice(len(x))
@@ -341,7 +341,7 @@ class Dynamics:
         return histories_of_trajectory(
             at_times(self.forces, first_rows),
             states,
-            until_next_s=self.interval_to_next_s[first_rows],
+            until_next_s=self.compute_intervals_to_next_s()[first_rows],
             loaded_s=self.loaded_since_s,
             previous_states=previous_states or {},
         )
@@ -380,7 +380,7 @@ class Dynamics:
         xi, nu : (N, 3n)
             Positions [m] and velocities [m/s]; before `first_row`, ν is the start velocity.
         """
-        xi = self.combine(self.state_weights[: len(x)], x)
+        xi = self.combine(self.compute_state_weights()[: len(x)], x)
         nu = self.combine(self.tables.q[: len(x)], x) / self.step_s
         nu[: self.first_row] = self.start_velocity_m_s
         return xi, nu
@@ -432,9 +432,8 @@ class Dynamics:
         """
         return self.assemble_residual(x, self.force(x, histories))
 
-    @property
-    def evaluated_forces(self) -> Forces:
-        """Forces of the rows from `first_row` on."""
+    def select_evaluated_forces(self) -> Forces:
+        """Return the forces of the rows from `first_row` on."""
         return at_times(self.forces, slice(self.first_row, self.row_count))
 
     def force(self, x: Array, histories: Sequence[AnyHistory] = ()) -> Array:

@@ -47,20 +47,10 @@ class EquationsAtParameters:
     dynamics: Dynamics
     prescribed: PrescribedDisplacements
 
-    @property
-    def theta(self) -> Array:
-        """Constants θ of the body (k,)."""
-        return self.dynamics.theta
-
     @cached_property
     def theta_p(self) -> Array:
         """Derivatives ∂θ/∂p of the constants (k, m); zero for the nuisance parameters among p."""
-        return np.array(self.input_derivatives[0, : len(self.theta)])
-
-    @property
-    def theta_q(self) -> Array:
-        """Derivatives ∂θ/∂q of the constants (k, nq); nuisance parameters do not change θ."""
-        return self.theta_p[:, : self.nq]
+        return np.array(self.input_derivatives[0, : len(self.dynamics.theta)])
 
     def force_derivatives(
         self, rows: int | slice, input_slopes: Array
@@ -145,7 +135,9 @@ class EquationsAtParameters:
         step_s = self.dynamics.step_s
         by_xi = force_curvature.position_theta @ self.input_derivatives
         by_nu = force_curvature.velocity_theta @ self.input_derivatives / step_s
-        by_x = dynamics.combine_transposed(dynamics.state_weights, by_xi)
+        by_x = dynamics.combine_transposed(
+            dynamics.compute_state_weights(), by_xi
+        )
         by_x += dynamics.combine_transposed(dynamics.tables.q, by_nu)
         by_u = force_curvature.theta
         inertia = np.zeros_like(force_curvature.theta)

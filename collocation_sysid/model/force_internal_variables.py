@@ -127,9 +127,8 @@ class ForceHistory:
         """
         return forces.with_term(self.number, self.term_at(rows))
 
-    @property
-    def final_state(self) -> ForcePreviousState:
-        """State after the last evaluation."""
+    def extract_final_state(self) -> ForcePreviousState:
+        """Return the state after the last evaluation."""
         last = slice(len(self.xi) - 1, None)
         return ForcePreviousState(
             self.number, self.term_at(last), after=self.internal_variables(last)
@@ -151,9 +150,8 @@ class ForceHistory:
         rests = self.forces.is_static and not term.uses_increments
         return parts._replace(v=np.zeros_like(parts.v)) if rests else parts
 
-    @property
-    def input_columns(self) -> Index:
-        """Columns (c,) of the force's constants among all inputs."""
+    def find_input_columns(self) -> Index:
+        """Return the columns (c,) of the force's constants among all inputs."""
         return self.forces.pointwise_term(self.number)[1]
 
     # Second derivatives of weights · F + μ · h ----------------------------------------------------
@@ -232,7 +230,7 @@ class ForceHistory:
         for k in reversed(range(len(self.xi))):
             by_xi[k], by_nu[k] = pulling.state_gradient()
             by_parameters += (
-                pulling.input_gradient() @ by_p[k][self.input_columns]
+                pulling.input_gradient() @ by_p[k][self.find_input_columns()]
             )
             pulling.step_back(force_weights[k])
         return HistoryGradient(by_xi, by_nu, by_parameters=by_parameters)
@@ -417,7 +415,7 @@ class ForceForwardColumns(_DerivativeIterator):
             called only if the variables depend on them.
         """
         _, by = self.derivatives()
-        of_inputs = self.by_p(self.next)[self.history.input_columns]
+        of_inputs = self.by_p(self.next)[self.history.find_input_columns()]
         columns = np.einsum("abi,bic->aic", by.b, self.columns)
         columns += np.einsum("abi,bc->aic", by.c, of_inputs)
         for part, state_change in ((by.y, of_state), (by.v, of_rate)):

@@ -91,7 +91,8 @@ class Forces:
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         potentials = tuple(
             Potential(
-                actuator.measure, actuator.energy_amplitude_at(times)[:, None]
+                actuator.require_measure(),
+                actuator.energy_amplitude_at(times)[:, None],
             )
             for actuator in experiment.actuators
         )
@@ -106,7 +107,7 @@ class Forces:
         forces = cls(
             Weight.from_experiment(experiment, times),
             further,
-            joint_pattern=experiment.coupled_graph,
+            joint_pattern=experiment.build_coupled_graph(),
             theta=unknown,
             is_static=still,
         )
@@ -288,7 +289,7 @@ class Forces:
         )
         if self.is_static:
             at.by_velocity[:] = 0.0
-        if self._has_external_derivatives:
+        if self._has_external_derivatives():
             spread = self.joint_pattern.expand
             at = Linearisation(
                 at.force,
@@ -307,21 +308,16 @@ class Forces:
             term.add_derivatives(at, places, states=states_for(term))
         return at
 
-    @property
     def _has_external_derivatives(self) -> bool:
-        """Whether there are external terms, inputs besides θ, or couplings besides the mesh graph,
-        so that derivatives have more entries or columns than those of the body's internal forces.
+        """Return whether there are external terms, inputs besides θ, or couplings besides the mesh
+        graph, so that derivatives have more entries or columns than those of the body's internal
+        forces.
         """
         more = (
             self._input_offsets[-1] > self._input_offsets[0]
             or self.pattern is not self.body.pattern
         )
         return bool(self.external_terms) or more
-
-    @property
-    def linearisation_width(self) -> int:
-        """Length of one time's row of `out` in `linearise`."""
-        return self.body.linearisation_width
 
     def weighted_hessian(
         self, xi: Array, nu: Array, weights: Array, out: Array | None = None
@@ -358,7 +354,7 @@ class Forces:
                 at.position_velocity_skew,
             ):
                 by_velocity[:] = 0.0
-        if self._has_external_derivatives:
+        if self._has_external_derivatives():
             spread = self.joint_pattern.expand
             with_columns = self._with_input_columns
             at = SecondDerivatives(
@@ -401,11 +397,6 @@ class Forces:
         return any(
             term.is_nonlinear_in_velocity for term in self.external_terms
         )
-
-    @property
-    def curvature_width(self) -> int:
-        """Length of one time's row of `out` in `weighted_hessian`."""
-        return self.body.curvature_width
 
     def states_of_terms(
         self, xi: Array, nu: Array
@@ -461,9 +452,8 @@ class Forces:
         assert isinstance(term, Pointwise)
         return term, term.constant_columns(places)
 
-    @property
-    def air_drag(self) -> CustomForce | None:
-        """Drag of the air around the body; None in a vacuum or in a static experiment."""
+    def find_air_drag(self) -> CustomForce | None:
+        """Return the drag of the air around the body; None in a vacuum or in a static experiment."""
         terms = (
             term
             for term in self.external_terms
@@ -471,18 +461,16 @@ class Forces:
         )
         return next(terms, None)
 
-    @property
-    def terms_with_internal_variables(self) -> list[int]:
-        """Indices in `external_terms` of the terms with internal variables."""
+    def find_terms_with_internal_variables(self) -> list[int]:
+        """Return the indices in `external_terms` of the terms with internal variables."""
         return [
             k
             for k, term in enumerate(self.external_terms)
             if term.internal_variable_count
         ]
 
-    @property
-    def complementarity_terms(self) -> list[int]:
-        """Indices in `external_terms` of the forces of a complementarity condition."""
+    def find_complementarity_terms(self) -> list[int]:
+        """Return the indices in `external_terms` of the forces of a complementarity condition."""
         further = enumerate(self.external_terms)
         return [
             k

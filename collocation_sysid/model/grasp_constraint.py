@@ -99,17 +99,25 @@ class GraspConstraint:
         obstacle and the zeros of displacements are not included.
         """
         places, by_own = self.nuisance.grasp_motion.evaluate_with_jacobian(
-            self._phi_of_grasps(phi), self._points
+            self._phi_of_grasps(phi), self._find_points()
         )
-        places[:, ~self._is_body_node] = self._points[:, ~self._is_body_node]
+        places[:, ~self._is_body_node] = self._find_points()[
+            :, ~self._is_body_node
+        ]
         by_own[..., ~self._is_body_node] = 0
         slopes = np.zeros(
             (3, len(self.nuisance.motion_indices), places.shape[1])
         )
-        slopes[:, self._columns] = by_own
-        places = places.T[self._node_of_dof]
-        slopes = np.moveaxis(slopes, 2, 0)[self._node_of_dof]
-        for columns, obstacle, row, axis, place in self._obstacle_parameters:
+        slopes[:, self._find_columns()] = by_own
+        places = places.T[self._nodes[1]]
+        slopes = np.moveaxis(slopes, 2, 0)[self._nodes[1]]
+        for (
+            columns,
+            obstacle,
+            row,
+            axis,
+            place,
+        ) in self._iterate_obstacle_parameters():
             if row != OBSTACLE_TIME:
                 column = np.flatnonzero(self.nuisance.motion_indices == place)[
                     0
@@ -137,23 +145,26 @@ class GraspConstraint:
         point_weights = np.einsum(
             "tgj,tg->gj", np.nan_to_num(self.pose_rows[0]), weights
         )
-        node_weights = np.zeros_like(self._points.T)
-        np.add.at(node_weights, self._node_of_dof, point_weights)
+        node_weights = np.zeros_like(self._find_points().T)
+        np.add.at(node_weights, self._nodes[1], point_weights)
         node_weights[~self._is_body_node] = 0.0
         hessian = np.zeros((len(self.nuisance.motion_indices),) * 2)
         second = self.nuisance.grasp_motion.weighted_hessian(
-            self._phi_of_grasps(phi), self._points, weights=node_weights.T
+            self._phi_of_grasps(phi),
+            self._find_points(),
+            weights=node_weights.T,
         )
-        hessian[np.ix_(self._columns, self._columns)] = second.sum(axis=2)
+        hessian[np.ix_(self._find_columns(), self._find_columns())] = (
+            second.sum(axis=2)
+        )
         return hessian
 
     def _phi_of_grasps(self, phi: Array) -> Array:
         """Return the nuisance parameters of the hand–eye transform H, from all φ."""
         return phi[self.nuisance.grasp_indices]
 
-    @property
-    def _points(self) -> Array:
-        """Undeformed positions X (3, nodes) of the grasped nodes [m]."""
+    def _find_points(self) -> Array:
+        """Return the undeformed positions X (3, nodes) of the grasped nodes [m]."""
         return self.experiment.body.nodes_m[self._nodes[0]].T
 
     @cached_property
@@ -189,7 +200,13 @@ class GraspConstraint:
                     self.nuisance.scales[place] * own_m[None, :, None]
                 )
         half_interval_s = 0.5e-3 * self.experiment.timestep_s
-        for columns, obstacle, row, _, place in self._obstacle_parameters:
+        for (
+            columns,
+            obstacle,
+            row,
+            _,
+            place,
+        ) in self._iterate_obstacle_parameters():
             if row == OBSTACLE_TIME:
                 places_m = self.experiment.body.nodes_m[obstacle.nodes]
                 after, before = (
@@ -205,12 +222,11 @@ class GraspConstraint:
                 )
         return derivatives
 
-    @property
-    def _obstacle_parameters(
+    def _iterate_obstacle_parameters(
         self,
     ) -> Iterator[tuple[Index, Obstacle, NuisanceRow, int, int]]:
-        """For each nuisance parameter of an obstacle, yield the positions of the obstacle's dofs in
-        `dofs`, the obstacle, the row, the axis and the index in φ.
+        """Return the for each nuisance parameter of an obstacle, yield the positions of the
+        obstacle's dofs in `dofs`, the obstacle, the row, the axis and the index in φ.
         """
         for number, obstacle in enumerate(
             self.experiment.obstacles, len(self.experiment.body_grasps)
@@ -232,14 +248,10 @@ class GraspConstraint:
         nodes, places = np.unique(self.dofs // 3, return_inverse=True)
         return nodes, places
 
-    @property
-    def _node_of_dof(self) -> Index:
-        """Index of each grasped dof's node among the grasped nodes (g,)."""
-        return self._nodes[1]
-
-    @property
-    def _columns(self) -> Index:
-        """Positions of the parameters of H among the nuisance parameters that affect the motion."""
+    def _find_columns(self) -> Index:
+        """Return the positions of the parameters of H among the nuisance parameters that affect the
+        motion.
+        """
         return np.flatnonzero(
             np.isin(self.nuisance.motion_indices, self.nuisance.grasp_indices)
         )

@@ -59,7 +59,7 @@ def histories_of_trajectory(
                 previous_variables=previous_states.get(0),
             )
         )
-    for number in forces.terms_with_internal_variables:
+    for number in forces.find_terms_with_internal_variables():
         before = previous_states.get(len(collected))
         collected.append(
             ForceHistory.from_states(
@@ -108,7 +108,7 @@ def start_states(
     """
     states: list[PreviousState] = [
         ForcePreviousState.from_state(forces, number, x=x, v=v)
-        for number in forces.terms_with_internal_variables
+        for number in forces.find_terms_with_internal_variables()
     ]
     if forces.body.has_memory:
         states.insert(

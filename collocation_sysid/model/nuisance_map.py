@@ -133,9 +133,8 @@ class NuisanceEntry:
     label: str
     sigma: float
 
-    @property
-    def unit(self) -> str:
-        """Unit of the parameter, taken from its label."""
+    def unit_in_label(self) -> str:
+        """Return the unit of the parameter, taken from its label."""
         return self.label.rpartition("[")[2].rstrip("]")
 
 
@@ -247,7 +246,7 @@ class NuisanceMap:
                 grasped_nodes if len(grasped_nodes) else slice(None)
             ].mean(axis=0),
             declared_calibration=np.array(
-                [a.calibration for a in experiment.actuators]
+                [a.make_calibration() for a in experiment.actuators]
             ).reshape(-1, 3),
             timed_loads=tuple(timed for _, timed in _timed_loads(experiment)),
             recorded_s=(float(experiment.t_s[0]), float(experiment.t_s[-1])),
@@ -744,7 +743,9 @@ def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
     Consecutive kinds of one sort of component are ordered by component, then by kind and axis; the
     unknowns of custom sensors come last. Exact quantities are left out.
     """
-    for _, rows in groupby(experiment.nuisance.kinds, key=lambda row: row.of):
+    for _, rows in groupby(
+        experiment.nuisance.list_kinds(), key=lambda row: row.of
+    ):
         applicable = [row for row in rows if row.applies(experiment)]
         for number, component_name in (
             _components(experiment, applicable[0].of) if applicable else ()
@@ -786,7 +787,9 @@ def _components(
     if of == "place":
         return [
             (m, names[m])
-            for m in np.flatnonzero(experiment.place_sigma_m > 0).tolist()
+            for m in np.flatnonzero(
+                experiment.compute_place_sigma_m() > 0
+            ).tolist()
         ]
     if of == "grasp":
         return [(k, str(k + 1)) for k in range(len(experiment.body_grasps))]
@@ -826,7 +829,7 @@ def _component_axes(
     sigma = experiment.nuisance.sigma(row)
     names = row.axes.split() or [""]
     if row == PLACE:
-        sigma = float(experiment.place_sigma_m[number])
+        sigma = float(experiment.compute_place_sigma_m()[number])
         names = ["first", "second"] if experiment.markers.on_surface else names
     if not sigma:
         return []

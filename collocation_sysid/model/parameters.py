@@ -176,13 +176,14 @@ class Parameter:
     def _check_fixed(self) -> None:
         """Raise an `InputError` if the fixed value is missing, not finite, or not admissible for
         the constant: at or above its `below`, or less than its least value. That is `at_least` if
-        the scale of this parameter is linear, else `lower_limit`, which is itself admissible.
+        the scale of this parameter or that of the constant is linear, else zero; the least value is
+        itself admissible.
         """
         constant = constant_named(self.name)
         least = (
             constant.at_least
             if self.scale == "linear"
-            else constant.lower_limit
+            else (0.0 if constant.scale == "log" else constant.at_least)
         )
         value = np.nan if self.guess is None else self.guess
         if not (np.isfinite(value) and value >= least):
@@ -499,12 +500,12 @@ class Parameters:
         vectors = {
             vector: names
             for body in bodies
-            for vector, names in body.field_vectors.items()
+            for vector, names in body.group_field_coefficients().items()
         }
         priors = {
             name: (1.0, deviation)
             for body in bodies
-            for name, deviation in body.contrast_deviations.items()
+            for name, deviation in body.find_contrast_deviations().items()
         }
         stated = {item.name: item for item in self.components}
         coefficients = {name for names in vectors.values() for name in names}
@@ -650,9 +651,8 @@ class Parameters:
             k for k, item in enumerate(self.free) if item.name in scalars
         )
 
-    @property
-    def linear_names(self) -> frozenset[str]:
-        """Names of the components with linear scale."""
+    def list_linear_names(self) -> frozenset[str]:
+        """Return the names of the components with linear scale."""
         return frozenset(
             item.name for item in self.components if item.scale == "linear"
         )
@@ -666,12 +666,11 @@ class Parameters:
         """
         item = next((each for each in self.free if each.name == name), None)
         if item is None:
-            return name in self.linear_names, (-np.inf, np.inf)
+            return name in self.list_linear_names(), (-np.inf, np.inf)
         return item.scale == "linear", (item.lower, item.upper)
 
-    @property
-    def names_without_guess(self) -> tuple[str, ...]:
-        """Names of the estimated parameters without a guess."""
+    def list_names_without_guess(self) -> tuple[str, ...]:
+        """Return the names of the estimated parameters without a guess."""
         return tuple(item.name for item in self.free if item.guess is None)
 
     @property
@@ -688,10 +687,9 @@ class Parameters:
             [item.to_coordinate(_guess(item)) for item in self.free]
         )
 
-    @property
-    def bounds_q(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of q, (nq,) each, in the order of `free`; infinite where there is
-        none.
+    def compute_bounds_q(self) -> tuple[Array, Array]:
+        """Return the lower and upper bounds of q, (nq,) each, in the order of `free`; infinite
+        where there is none.
         """
         return (
             np.array([item.to_coordinate(item.lower) for item in self.free]),
@@ -815,7 +813,9 @@ class Parameters:
             no region uses, or a fixed stiffness or density of zero.
         """
         bodies = list(bodies)
-        known = [name for body in bodies for name in body.parameter_names]
+        known = [
+            name for body in bodies for name in body.list_parameter_names()
+        ]
         for name in self.names:
             if name not in known:
                 parameter, _, key = name.rpartition(".")

@@ -66,9 +66,10 @@ class Recursion:
     constant_count: int
     data_size: int
 
-    @property
-    def input_offsets(self) -> list[int]:
-        """End indices of h_{k−1}, s_k, s_{k−1} and c in the input vector of `step_function`."""
+    def compute_input_offsets(self) -> list[int]:
+        """Return the end indices of h_{k−1}, s_k, s_{k−1} and c in the input vector of
+        `step_function`.
+        """
         sizes = [
             self.state_size,
             self.signal_size,
@@ -84,12 +85,14 @@ class Recursion:
         def expression(u: ca.SX, data: ca.SX) -> ca.SX:
             """Return h_k from the stacked inputs."""
             before, now, last, constants = ca.vertsplit(
-                u, [0, *self.input_offsets]
+                u, [0, *self.compute_input_offsets()]
             )
             return self.expression(before, now, last, constants, data)
 
         return GeneratedFunction(
-            expression, self.input_offsets[-1], data_size=self.data_size
+            expression,
+            self.compute_input_offsets()[-1],
+            data_size=self.data_size,
         )
 
     def linear_coefficients(self, constants: ca.SX, data: ca.SX) -> ca.SX:
@@ -106,8 +109,10 @@ class Recursion:
         (n (n + 2 i),) SX
             The Jacobian (n, n + 2 i), stacked column by column.
         """
-        u = ca.SX.sym("u", self.input_offsets[2])
-        before, now, last = ca.vertsplit(u, [0, *self.input_offsets[:3]])
+        u = ca.SX.sym("u", self.compute_input_offsets()[2])
+        before, now, last = ca.vertsplit(
+            u, [0, *self.compute_input_offsets()[:3]]
+        )
         return ca.vec(
             ca.jacobian(self.expression(before, now, last, constants, data), u)
         )
@@ -187,7 +192,9 @@ class RecursionTrajectory:
         by_u = step.evaluate_with_jacobian(
             self._stacked_inputs(all_times), self.data
         )[1]
-        return np.split(by_u, self.recursion.input_offsets[:-1], axis=1)
+        return np.split(
+            by_u, self.recursion.compute_input_offsets()[:-1], axis=1
+        )
 
     def jacobian_vector_product(
         self, signal_changes: Array, constant_changes: Array

@@ -78,10 +78,9 @@ class Scheme:
             return STATIC
         return self.start[row - 1] if row <= len(self.start) else self.regular
 
-    @property
     def is_midpoint(self) -> bool:
-        """Whether `regular` and all stencils of `start` evaluate forces half way between the last
-        two states, with the velocity from their difference.
+        """Return whether `regular` and all stencils of `start` evaluate forces half way between the
+        last two states, with the velocity from their difference.
 
         The last two states are then ξ ∓ Δt ν/2, and a force may be averaged over the step.
         """
@@ -90,9 +89,8 @@ class Scheme:
             (each.p, each.q) == ((0.5, 0.5), (1.0, -1.0)) for each in stencils
         )
 
-    @property
-    def largest_lag(self) -> int:
-        """Largest lag l with ∂c_t/∂x_{t−l} ≠ 0, in time steps."""
+    def compute_largest_lag(self) -> int:
+        """Return the largest lag l with ∂c_t/∂x_{t−l} ≠ 0, in time steps."""
         lags = []
         for stencil in (self.regular, *self.start):
             points = max(len(stencil.p), len(stencil.q))

@@ -34,7 +34,7 @@ import numpy as np
 
 from ..common.array_types import Array, Index
 from ..fem.body import Body, SecondDerivatives
-from ..fem.laws.memory import MemoryInput, MemoryLayout, fading_coefficients
+from ..fem.laws.memory import MemoryInput, fading_coefficients
 from .forces import Forces
 from .generated_functions import GeneratedFunction
 from .recursion import HistoryGradient, Recursion
@@ -255,23 +255,18 @@ class MemoryHistory:
             previous_variables=previous_variables,
         )
 
-    @property
-    def memory(self) -> MemoryLayout:
-        """Layout of points and branches in the arrays."""
-        return self.body.memory
-
     def past_at(self, rows: slice) -> MemoryInput:
         """Return the memory's contribution to the forces at the evaluations `rows`, in new arrays.
 
         The overstress is H = Σ m_{k−1}, the stiffening of each part Σ c_k of its branches, with
         first and second derivatives by θ.
         """
-        past = self.memory.relaxed(len(self.xi[rows]))
+        past = self.body.memory.relaxed(len(self.xi[rows]))
         fades = self.fading
-        past.overstress[:] = self.memory.sum_over_branches(
+        past.overstress[:] = self.body.memory.sum_over_branches(
             self.previous_variables[rows]
         )
-        for branch, c in zip(self.memory.branches, fades.c, strict=True):
+        for branch, c in zip(self.body.memory.branches, fades.c, strict=True):
             past.stiffening[:, branch.part] += c[rows]
         second = STIFFENING.weighted_hessian(fades.u, fades.data)
         past.stiffening_derivatives[:, fades.places] = np.moveaxis(
@@ -327,28 +322,27 @@ class MemoryHistory:
         """Return an iterator of the weights μ backward in time, see `MemoryAdjoint`."""
         return MemoryAdjoint(self)
 
-    @property
-    def final_state(self) -> MemoryState:
-        """State of the memory after the last evaluation."""
-        c = self.memory.repeat_over_points(self.fading.c)[-1]
-        overstress = self.previous_variables[-1] + c * self.memory.to_branches(
-            self.stress[-1]
-        )
+    def extract_final_state(self) -> MemoryState:
+        """Return the state of the memory after the last evaluation."""
+        c = self.body.memory.repeat_over_points(self.fading.c)[-1]
+        overstress = self.previous_variables[
+            -1
+        ] + c * self.body.memory.to_branches(self.stress[-1])
         return MemoryState(
             self.body, self.theta, stress=self.stress[-1], overstress=overstress
         )
 
-    @property
-    def recursion_residuals(self) -> Array:
-        """Residuals m_k − d_k m_{k−1} − a_k S_k for k = 0 … N − 2 (N − 1, all branches) [Pa]; zero if
-        `previous_variables` satisfy the recursion, as those do that are computed from the states.
+    def compute_recursion_residuals(self) -> Array:
+        """Return the residuals m_k − d_k m_{k−1} − a_k S_k for k = 0 … N − 2 (N − 1, all branches)
+        [Pa]; zero if `previous_variables` satisfy the recursion, as those do that are computed from
+        the states.
         """
         d, a = (
-            self.memory.repeat_over_points(each[:, :-1])
+            self.body.memory.repeat_over_points(each[:, :-1])
             for each in (self.fading.d, self.fading.a)
         )
         m = self.previous_variables
-        borne = self.memory.to_branches(self.stress[:-1])
+        borne = self.body.memory.to_branches(self.stress[:-1])
         return m[1:] - d * m[:-1] - a * borne
 
     # Derivatives of Σ μ_k (d_k m_{k−1} + a_k S_k), μ (N, all branches) --------------------------
@@ -357,8 +351,8 @@ class MemoryHistory:
         """Return σ_k (N, width) such that Σ μ_k a_k S_k = Σ σ_k S_k, for weights μ (N, all
         branches).
         """
-        return self.memory.sum_over_branches(
-            self.memory.repeat_over_points(self.fading.a) * mu
+        return self.body.memory.sum_over_branches(
+            self.body.memory.repeat_over_points(self.fading.a) * mu
         )
 
     def _overstress_inputs(self, mu: Array) -> Array:
@@ -366,9 +360,9 @@ class MemoryHistory:
 
         The recursion is linear in m and S, so the inputs are Σ μ_k m_{k−1} and Σ μ_k S_k.
         """
-        borne = self.memory.to_branches(self.stress)
+        borne = self.body.memory.to_branches(self.stress)
         before, now = (
-            self.memory.sum_over_points(mu * each)
+            self.body.memory.sum_over_points(mu * each)
             for each in (self.previous_variables, borne)
         )
         return np.stack([before, now, 0 * now, *self.fading.u])
@@ -405,8 +399,8 @@ class MemoryHistory:
         theta_q = theta_p[:, used]
         by_parameters = np.zeros(theta_p.shape[1])
         stresses = self.body.stresses
-        d = self.memory.repeat_over_points(self.fading.d)
-        pushes = self.memory.to_branches(
+        d = self.body.memory.repeat_over_points(self.fading.d)
+        pushes = self.body.memory.to_branches(
             stresses.memory_force_vjp(self.xi, force_weights, theta=self.theta)
         )
         mu = np.zeros_like(pushes)
@@ -415,7 +409,7 @@ class MemoryHistory:
         _, by = OVERSTRESS.step_function.evaluate_with_jacobian(
             self._overstress_inputs(mu), self.fading.data
         )
-        by_fading = by[0, OVERSTRESS.input_offsets[2] :]
+        by_fading = by[0, OVERSTRESS.compute_input_offsets()[2] :]
         by_q = np.einsum("jbn,jbq->q", by_fading, theta_q[self.fading.places])
         sigma = self.stress_weights(mu)
         for rows, slopes in self.stress_derivatives(theta_q):
@@ -441,12 +435,12 @@ class MemoryHistory:
         mu : (N, all branches)
             Weights μ.
         """
-        memory = self.memory
+        memory = self.body.memory
         places = self.fading.places
         inputs = self._overstress_inputs(mu)
         data = self.fading.data
         elastic = self.body.elastic_indices
-        fading_inputs = slice(OVERSTRESS.input_offsets[2], None)
+        fading_inputs = slice(OVERSTRESS.compute_input_offsets()[2], None)
         slopes = OVERSTRESS.step_function.evaluate_with_jacobian(inputs, data)[
             1
         ]
@@ -515,7 +509,7 @@ class MemoryState:
             theta=theta,
             until_next_s=np.ones(1),
             loaded_s=loaded_s,
-        ).final_state
+        ).extract_final_state()
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
         """Return `forces`, given at one time, in the state of this memory: with its overstress Q,
@@ -620,7 +614,7 @@ class MemoryForwardColumns:
     ) -> None:
         self.history = history
         self.next = done
-        self.memory = history.memory
+        self.memory = history.body.memory
         self.stresses = history.body.stresses
         self.theta = history.theta
         shape = theta_q.shape[1], history.previous_variables.shape[1]
@@ -738,8 +732,8 @@ class MemoryAdjoint:
         """Return the derivatives of μ · m by ξ and ν of the evaluation, (3n,) each; by ν zero."""
         history = self.history
         k = self.next
-        weights = history.memory.sum_over_branches(
-            history.memory.repeat_over_points(history.fading.a[:, k])
+        weights = history.body.memory.sum_over_branches(
+            history.body.memory.repeat_over_points(history.fading.a[:, k])
             * self.columns
         )
         state = history.xi[k]
@@ -764,6 +758,6 @@ class MemoryAdjoint:
         push = history.body.stresses.memory_force_vjp(
             state, weight, theta=history.theta
         )[0]
-        d = history.memory.repeat_over_points(history.fading.d[:, k])
-        self.columns = d * self.columns + history.memory.to_branches(push)
+        d = history.body.memory.repeat_over_points(history.fading.d[:, k])
+        self.columns = d * self.columns + history.body.memory.to_branches(push)
         self.next -= 1

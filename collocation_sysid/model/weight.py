@@ -137,7 +137,7 @@ class Weight(ForceTerm):
         applied = experiment.declared_node_forces_n(t_s)
         body = experiment.body
         tied = np.repeat(experiment.point_mass_at_nodes_kg(t_s), 3, axis=1)
-        air_kg = experiment.air_density_kg_m3 * body.dof_volume_m3
+        air_kg = experiment.air_density_kg_m3 * body.sum_dof_volumes_m3()
         mass = DofMasses(
             _own_kg(body),
             _as_constant_view(tied),
@@ -299,7 +299,8 @@ class Weight(ForceTerm):
                     self.mass.weight_kg[:, axis::3]
                 )
         for k, (kg, newtons) in enumerate(
-            self._joining, first_column + 3 * self.has_gravity_input
+            zip(self.joining_kg, self.joining_n, strict=True),
+            first_column + 3 * self.has_gravity_input,
         ):
             linearisation.by_theta[:, :, k] += (
                 kg * self._load_acceleration(states) + newtons
@@ -340,7 +341,8 @@ class Weight(ForceTerm):
                 curvature.theta_theta[:, place, gravity_columns] += mixed
                 curvature.theta_theta[:, gravity_columns, place] += mixed
         for k, (kg, newtons) in enumerate(
-            self._joining, first_column + 3 * self.has_gravity_input
+            zip(self.joining_kg, self.joining_n, strict=True),
+            first_column + 3 * self.has_gravity_input,
         ):
             share_derivative = kg * self._load_acceleration(states) + newtons
             curvature.theta[:, k] += np.einsum(
@@ -353,11 +355,6 @@ class Weight(ForceTerm):
                 mixed = (weights * kg * states.nu) @ share
                 curvature.theta_theta[:, gamma, k] -= mixed
                 curvature.theta_theta[:, k, gamma] -= mixed
-
-    @property
-    def _joining(self) -> zip[tuple[Array, Array]]:
-        """Pairs of mass (3n,) and force (T, 3n) of each joining load."""
-        return zip(self.joining_kg, self.joining_n, strict=True)
 
     def _load_acceleration(self, states: States) -> Array:
         """Return the acceleration g − γ_m ν (T, 3n) by which a tied mass loads the body [m/s²]."""

@@ -279,8 +279,8 @@ def bench_tables(
             )
     measured = iter(loads)
     for declared, grasp in moved:
-        if (sensed := declared.sensor) is not None and grasp.has_sensor:
-            at_s = grasp.load_times_s
+        if (sensed := declared.sensor) is not None and grasp.has_sensor():
+            at_s = grasp.list_load_times_s()
             table = tables.setdefault(
                 table_name(section, sensed), BenchTable(at_s, time)
             )

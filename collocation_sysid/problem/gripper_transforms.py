@@ -35,10 +35,10 @@ def gripper_transforms(
         return [None] * len(indices)
     sections = ProblemFile.model_validate(
         tomllib.loads(problem.origin.text)
-    ).recordings
+    ).list_recordings()
     (section,) = (each for each in sections if each.name == experiment)
     transforms: list[Array | None] = []
     for k in indices:
         stated = section.moved_sections[k].gripper_to_body
-        transforms.append(None if stated is None else stated.matrix)
+        transforms.append(None if stated is None else stated.to_matrix())
     return transforms

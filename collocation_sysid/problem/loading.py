@@ -97,7 +97,7 @@ def problem_arguments(
     mesh_warnings: list[str] = []
     with _locate_in_table(path, "object"):
         cells = SpecimenCells(file.object, code)
-        if file.recordings:
+        if file.list_recordings():
             body, size = _load_object(
                 file, folder, code=code, simulation=simulation, say=say
             )
@@ -105,7 +105,7 @@ def problem_arguments(
                 oddity.message for oddity in size_and_density_hypotheses(body)
             ]
         else:
-            body = cells.body_for(file.specimens[0].test)
+            body = cells.body_for(file.list_specimens()[0].test)
             unknowns = cells.with_undamped(unknowns)
     with _locate_in_table(path, "parameters"):
         body_with_friction = body.with_frames(0, frictions=_frictions(file))
@@ -241,7 +241,7 @@ class SpecimenCells:
         InputError
             If the material is a Python file that may not be run or is invalid.
         """
-        has_inner_node = DEFORMATIONS[test].needs_inner_node
+        has_inner_node = not DEFORMATIONS[test].free
         if has_inner_node not in self._bodies:
             law = self._section.material
             is_code = isinstance(law, CodeSection)
@@ -329,9 +329,9 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     exist; Python files and poses of cameras are not among them.
     """
     names = [file.object.mesh, file.object.surface]
-    names += [section.file for section in file.specimens]
-    for section in file.recordings:
-        names += section.measurement_files
+    names += [section.file for section in file.list_specimens()]
+    for section in file.list_recordings():
+        names += section.list_measurement_files()
         for _, word, kind in LOADS:
             keys = [
                 key.name for _, key in keys_of(kind) if key.constant is not None
@@ -547,7 +547,7 @@ def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
     """
     declared = (
         each.friction
-        for section in file.recordings
+        for section in file.list_recordings()
         for each in section.obstacle
     )
     named = (

@@ -220,7 +220,7 @@ def nuisance_from_section(
         if prior == "none":
             deviations |= {row.name: None for row in rows}
         elif prior is not None:
-            known = {row.name: getattr(prior, row.prior) for row in rows}
+            known = {row.name: getattr(prior, row.prior_key()) for row in rows}
             # A scope alone leaves the deviations as they are.
             deviations |= known if any(known.values()) else {}
             if prior.scope != "recording":

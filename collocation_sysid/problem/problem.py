@@ -219,15 +219,14 @@ class Problem:
         """Bodies of the experiments, each object once, in the order of the experiments."""
         return tuple({id(e.body): e.body for e in self.experiments}.values())
 
-    @property
-    def lengths_m(self) -> dict[str, float]:
-        """Correlation lengths of spatially varying constants [m], by name of the constant with its
-        region; empty without fields.
+    def collect_lengths_m(self) -> dict[str, float]:
+        """Return the correlation lengths of spatially varying constants [m], by name of the
+        constant with its region; empty without fields.
         """
         return {
             name: each
             for body in self.bodies
-            for name, each in body.field_lengths_m.items()
+            for name, each in body.collect_field_lengths_m().items()
         }
 
     def with_lengths(self, lengths_m: Mapping[str, float]) -> Problem:
@@ -241,7 +240,7 @@ class Problem:
             Correlation length [m] of every such constant, by the names of the property `lengths_m`;
             a missing one is a KeyError, and other names are ignored.
         """
-        if dict(lengths_m) == self.lengths_m:
+        if dict(lengths_m) == self.collect_lengths_m():
             return self
         bodies = {
             id(body): body.with_field_lengths(lengths_m) for body in self.bodies
@@ -253,9 +252,10 @@ class Problem:
             ],
         )
 
-    @property
-    def two_phase_fields(self) -> dict[str, TwoPhaseModes]:
-        """Two-phase fields of the bodies, by name of the constant; empty if there are none."""
+    def find_two_phase_fields(self) -> dict[str, TwoPhaseModes]:
+        """Return the two-phase fields of the bodies, by name of the constant; empty if there are
+        none.
+        """
         return {
             part.field_name: part.field
             for body in self.bodies
@@ -275,12 +275,18 @@ class Problem:
         removed_names = {
             n
             for b in self.bodies
-            for n in (*b.field_coefficient_names, *b.contrast_deviations)
+            for n in (
+                *b.list_field_coefficient_names(),
+                *b.find_contrast_deviations(),
+            )
         }
         removed_names -= {
             n
             for b in bodies.values()
-            for n in (*b.field_coefficient_names, *b.contrast_deviations)
+            for n in (
+                *b.list_field_coefficient_names(),
+                *b.find_contrast_deviations(),
+            )
         }
         return replace(
             self,
@@ -290,20 +296,19 @@ class Problem:
             parameters=self.parameters.without(removed_names),
         )
 
-    @property
-    def first_substeps(self) -> int:
-        """Grid steps between samples in the first solve, and where nothing is solved: 1
+    def choose_first_substeps(self) -> int:
+        """Return the grid steps between samples in the first solve, and where nothing is solved: 1
         for "auto".
         """
         return 1 if self.substeps == "auto" else self.substeps
 
     def collocation(self) -> Collocation:
-        """Return a new nonlinear program of the problem, with `first_substeps`."""
+        """Return a new nonlinear program of the problem, with `choose_first_substeps`."""
         return Collocation(
             self.experiments,
             self.parameters,
             scheme=self.scheme,
-            substeps=self.first_substeps,
+            substeps=self.choose_first_substeps(),
             has_grasp_constraints=self.explicit_grasps,
             huber=self.huber,
         )
@@ -354,7 +359,7 @@ class Problem:
                 f"found {self.substeps!r}; expected a whole number or 'auto'",
                 where="transcription.substeps",
             )
-        if self.first_substeps != 1 and all(
+        if self.choose_first_substeps() != 1 and all(
             each.is_static for each in self.experiments
         ):
             raise InputError(

@@ -58,12 +58,11 @@ class UncertaintyOptions(ErrorModel):
     )
     surface_correlation: Positive = CORRELATION
 
-    @property
-    def considered(self) -> dict[str, float | None]:
-        """Standard deviations of systematic effects by name (None for exact ones), and the
-        surface's correlation length under `CORRELATION_KEY`.
+    def collect_considered(self) -> dict[str, float | None]:
+        """Return the standard deviations of systematic effects by name (None for exact ones), and
+        the surface's correlation length under `CORRELATION_KEY`.
         """
-        return self.assumptions.deviations | {
+        return self.assumptions.collect_deviations() | {
             CORRELATION_KEY: self.surface_correlation
         }
 

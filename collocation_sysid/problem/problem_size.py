@@ -81,11 +81,6 @@ class Size:
     markers: int = 0
     unplaced_markers: int = 0
 
-    @property
-    def timesteps(self) -> int:
-        """Number of time steps: samples times steps per sample."""
-        return self.samples * self.substeps
-
     def memory_mb(self) -> float:
         """Return a lower bound of the memory that the problem needs [MB, 10⁶ bytes]: positions,
         sensitivities and derivatives of residuals if something is estimated, the factor of a
@@ -94,7 +89,7 @@ class Size:
         copies = SIMULATION_COPIES
         if self.unknowns:
             copies = SEARCH_COPIES + SENSITIVITY_COPIES * self.unknowns
-        values = copies * 3 * self.nodes * self.timesteps
+        values = copies * 3 * self.nodes * (self.samples * self.substeps)
         if self.unknowns:
             # Derivatives of all residuals of markers by all parameters are one array.
             parameters = self.unknowns + 3 * self.unplaced_markers
@@ -109,7 +104,11 @@ class Size:
         nothing is estimated, on one thread.
         """
         step_s = max(LEAST_STEP_S, STEP_S * (self.nodes / NODES) ** STEP_POWER)
-        return (SWEEPS if self.unknowns else 1) * self.timesteps * step_s
+        return (
+            (SWEEPS if self.unknowns else 1)
+            * (self.samples * self.substeps)
+            * step_s
+        )
 
 
 def require_feasible(size: Size, say: Say | None = None) -> None:

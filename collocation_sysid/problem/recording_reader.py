@@ -283,7 +283,7 @@ class RecordingReader:
             file = self._table_file(
                 grasp.displacement, self._grasp_key(k, "displacement")
             )
-            layout = grasp.displacement.layout
+            layout = grasp.displacement.dump_layout()
             layout |= {
                 "length_m": strain_length_m(grasp.displacement, self.body)
             }
@@ -392,7 +392,7 @@ class RecordingReader:
         section's `symmetry`; `key` is that of the section, for messages.
         """
         file = self._table_file(section, f"{key}.file")
-        layout = section.layout
+        layout = section.dump_layout()
         return read_wrench(
             file,
             **layout,

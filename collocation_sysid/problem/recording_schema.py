@@ -59,9 +59,8 @@ class TransformSection(Section):
         1.0,
     )
 
-    @property
-    def matrix(self) -> Array:
-        """(4, 4) matrix of the motion."""
+    def to_matrix(self) -> Array:
+        """Return (4, 4) matrix of the motion."""
         matrix = np.eye(4)
         rotation = Rotation.from_quat(self.quaternion_xyzw)
         matrix[:3, :3] = rotation.as_matrix()
@@ -91,10 +90,9 @@ class TableSection(Section):
     axis: Literal["x", "y", "z"] = "z"
     sign: Literal[1, -1] = 1
 
-    @property
-    def layout(self) -> dict[str, Any]:
-        """Arguments with which the columns are read, by name: `columns`, `axis`, `sign`, and
-        `scale`, `length_m` or `area_m2` where the section has them.
+    def dump_layout(self) -> dict[str, Any]:
+        """Return the arguments with which the columns are read, by name: `columns`, `axis`, `sign`,
+        and `scale`, `length_m` or `area_m2` where the section has them.
         """
         return self.model_dump(
             include={"columns", "axis", "sign", "scale", "length_m", "area_m2"}
@@ -619,9 +617,10 @@ class ExperimentSection(NamedSection):
         """
         return table and (table.file or self.file)
 
-    @property
-    def measurement_files(self) -> list[str | None]:
-        """Files of markers, sensors, grasps and obstacles; None for those that are not named."""
+    def list_measurement_files(self) -> list[str | None]:
+        """Return the files of markers, sensors, grasps and obstacles; None for those that are not
+        named.
+        """
         names = [
             self.markers.file,
             *(each.file for each in self.reading),

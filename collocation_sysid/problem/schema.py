@@ -556,7 +556,7 @@ class ProblemFile(Section):
         """
         if self.object.has_shape:
             return self
-        if self.recordings:
+        if self.list_recordings():
             raise InputError(
                 f"found no {' or '.join(SHAPES)}; expected exactly one of {', '.join(SHAPES)}",
                 where="object",
@@ -570,18 +570,16 @@ class ProblemFile(Section):
                 )
         return self
 
-    @property
-    def recordings(self) -> list[ExperimentSection]:
-        """Experiments with the object's mesh, in the order of the file."""
+    def list_recordings(self) -> list[ExperimentSection]:
+        """Return the experiments with the object's mesh, in the order of the file."""
         return [
             each
             for each in self.experiment
             if isinstance(each, ExperimentSection)
         ]
 
-    @property
-    def specimens(self) -> list[SpecimenSection]:
-        """Material tests without a mesh, in the order of the file."""
+    def list_specimens(self) -> list[SpecimenSection]:
+        """Return the material tests without a mesh, in the order of the file."""
         return [
             each
             for each in self.experiment

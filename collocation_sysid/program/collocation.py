@@ -241,21 +241,20 @@ class Collocation:
         """Number of constraints g."""
         return self.transcriptions[-1].next_offsets.row
 
-    @property
-    def measurement_count(self) -> int:
-        """Number of scalar measurements that are compared, of all fitted experiments."""
+    def count_measurements(self) -> int:
+        """Return the number of scalar measurements that are compared, of all fitted experiments."""
         return sum(
             int(reading.is_compared.sum())
             for segment in self.transcriptions
             for reading in segment.residuals
         )
 
-    @property
-    def associated_count(self) -> int:
-        """Number of scalar measurements that belong to the body at the present estimates: those
-        that are compared, and the points of cameras that are left out because of a crease.
+    def count_associated(self) -> int:
+        """Return the number of scalar measurements that belong to the body at the present
+        estimates: those that are compared, and the points of cameras that are left out because of a
+        crease.
         """
-        return self.measurement_count + sum(
+        return self.count_measurements() + sum(
             reading.uncompared_count
             for segment in self.transcriptions
             for reading in segment.residuals
@@ -266,7 +265,7 @@ class Collocation:
         """Factor of the loss in the objective: one over the number of measurements, or 1 without
         any.
         """
-        return 1.0 / max(1, self.measurement_count)
+        return 1.0 / max(1, self.count_measurements())
 
     def pack(self, p: Array, positions: Sequence[Array]) -> Array:
         """Return the variables z.
@@ -314,7 +313,9 @@ class Collocation:
     @cached_property
     def parameter_indices(self) -> list[Index]:
         """Indices (nq + k,) of (q, φ) of each experiment in p."""
-        return [segment.parameter_indices for segment in self.transcriptions]
+        return [
+            segment.list_parameter_indices() for segment in self.transcriptions
+        ]
 
     @property
     def threads(self) -> int:
@@ -344,10 +345,9 @@ class Collocation:
             for segment, x in zip(self.transcriptions, positions, strict=True)
         ]
 
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Name of each entry of p: the parameters' names, then the labels of the nuisance
-        parameters; of a shared one, the label in the last experiment that has it.
+    def list_parameter_names(self) -> tuple[str, ...]:
+        """Return the name of each entry of p: the parameters' names, then the labels of the
+        nuisance parameters; of a shared one, the label in the last experiment that has it.
         """
         names = [item.name for item in self.parameters.free] + [""] * self.nphi
         for segment in self.transcriptions:
@@ -372,12 +372,11 @@ class Collocation:
             np.concatenate([slopes, np.ones(self.nphi)]),
         )
 
-    @property
-    def parameter_bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of p, (nq + nphi,) each; infinite for most φ. For a shared φ, the
-        narrowest of all experiments.
+    def compute_parameter_bounds(self) -> tuple[Array, Array]:
+        """Return the lower and upper bounds of p, (nq + nphi,) each; infinite for most φ. For a
+        shared φ, the narrowest of all experiments.
         """
-        lower, upper = self.parameters.bounds_q
+        lower, upper = self.parameters.compute_bounds_q()
         low, high = (np.full(self.nphi, bound) for bound in (-np.inf, np.inf))
         for segment in self.transcriptions:
             indices = segment.nuisance_indices.indices - self.nq
@@ -449,7 +448,9 @@ class Collocation:
             The program with the new associations, and p in it; self and p if no experiment has
             unknown places or cameras.
         """
-        if not any(segment.rows_to_place for segment in self.transcriptions):
+        if not any(
+            segment.count_rows_to_place() for segment in self.transcriptions
+        ):
             return self, p
         updates = [
             part.segment.place_unknown_markers(
@@ -474,7 +475,7 @@ class Collocation:
             for s, c in zip(self.transcriptions, charts, strict=True)
         ]
         return self._with_associations(
-            charts, self.guess_p, phis=[s.guess_phi for s in segments]
+            charts, self.guess_p, phis=[s.compute_guess_phi() for s in segments]
         )[0]
 
     def _with_associations(
@@ -504,7 +505,8 @@ class Collocation:
     def guess_p(self) -> Array:
         """Guess of p: that of q, and φ at the centres of the associations."""
         return self._combine_parameters(
-            self.parameters.guess_q, [s.guess_phi for s in self.transcriptions]
+            self.parameters.guess_q,
+            [s.compute_guess_phi() for s in self.transcriptions],
         )
 
     def _combine_parameters(self, q: Array, phis: Sequence[Array]) -> Array:
@@ -518,10 +520,9 @@ class Collocation:
             p[segment.nuisance_indices.indices] = phi
         return p
 
-    @property
-    def reach_p(self) -> Array:
-        """Scale (nq + nphi,) of p: the change of each entry that a trust region of radius one
-        allows, which is one for q.
+    def compute_reach_p(self) -> Array:
+        """Return the scale (nq + nphi,) of p: the change of each entry that a trust region of
+        radius one allows, which is one for q.
         """
         return self._combine_parameters(
             np.ones(self.nq),
@@ -532,7 +533,7 @@ class Collocation:
         """Return lower and upper bounds of z, (variables,) each; equal where a value is prescribed,
         ∓∞ where there is none.
         """
-        lower, upper = self.parameter_bounds
+        lower, upper = self.compute_parameter_bounds()
         lows, highs = zip(
             *(segment.bounds() for segment in self.transcriptions), strict=True
         )
@@ -561,7 +562,7 @@ class Collocation:
         for part in parts:
             of_x, of_p = part.gradient()
             by_x.append(of_x.ravel() * part.segment.length_m)
-            by_p[part.segment.parameter_indices] += of_p
+            by_p[part.segment.list_parameter_indices()] += of_p
         return self.loss_scale * np.concatenate(
             [
                 by_p[: self.nq],
@@ -597,8 +598,12 @@ class Collocation:
         indices = [np.tile(np.arange(own), self.nq)]
         of_phi = []
         for segment in self.transcriptions:
-            indptr.append(indptr[-1][-1] + segment.jacobian.indptr[1:])
-            indices.append(segment.offsets.row + segment.jacobian.indices)
+            indptr.append(
+                indptr[-1][-1] + segment.motion_rows.structure.indptr[1:]
+            )
+            indices.append(
+                segment.offsets.row + segment.motion_rows.structure.indices
+            )
             moving = (
                 segment.nuisance_indices.indices[
                     segment.nuisance.motion_indices
@@ -644,7 +649,7 @@ class Collocation:
         parts = self.iterates(z)
         height = self.transcriptions[-1].next_offsets.row
         count = self.nq * height + sum(
-            s.jacobian.nnz for s in self.transcriptions
+            s.motion_rows.structure.nnz for s in self.transcriptions
         )
         values, own = self._jacobian.allocate(out, count)
         columns = own[: self.nq * height].reshape(self.nq, height)
@@ -653,14 +658,14 @@ class Collocation:
         used = columns.size
         for part in parts:
             segment = part.segment
-            here = own[used : used + segment.jacobian.nnz]
+            here = own[used : used + segment.motion_rows.structure.nnz]
             constraints, by_p = segment.constraints_and_jacobian(
                 part.x, part.equations, forces=part.forces, values=here
             )
             rows[segment.rows] = constraints
             columns[:, segment.rows] = by_p[:, : self.nq].T
             further.append(by_p[:, self.nq :].T.ravel())
-            used += segment.jacobian.nnz
+            used += segment.motion_rows.structure.nnz
         added = self._additional_jacobian(parts, z)
         self._jacobian.assemble(
             values, own, groups=further + [entries for _, entries in added]
@@ -684,7 +689,7 @@ class Collocation:
         """Whether history variables are eliminated, so that ∂g/∂z has more entries than
         `jacobian`.
         """
-        return any(segment.has_histories for segment in self.transcriptions)
+        return any(segment.has_histories() for segment in self.transcriptions)
 
     def jacobian_vjp(self, z: Array, multipliers: Array) -> Array:
         """Return the vector–Jacobian product (∂g/∂z)ᵀ multipliers (variables,) at z, for
@@ -749,7 +754,7 @@ class Collocation:
         of_x = []
         used = self.nq * (self.nq + 1) // 2
         for segment in self.transcriptions:
-            of_x.append(used + segment.hessian_diagonal_positions)
+            of_x.append(used + segment.find_hessian_diagonal())
             used += segment.hessian.nnz
         return of_q, self._hessian.positions_of(np.concatenate(of_x))
 
@@ -959,7 +964,7 @@ class Collocation:
         """Return the residuals of the equations of motion (N, free dofs) of each fitted experiment
         [N], zero while a grasp prescribes the dof.
         """
-        return [part.residual_n for part in self.iterates(z)]
+        return [part.compute_residual_n() for part in self.iterates(z)]
 
     def largest_force_n(self, z: Array) -> float:
         """Return the largest magnitude of a force on a dof [N] at z, as a scale for violations.
@@ -971,7 +976,7 @@ class Collocation:
         for part in self.iterates(z):
             dynamics = part.equations.dynamics
             total = dynamics.force(part.x, part.histories)
-            external = dynamics.evaluated_forces.weight.external_n
+            external = dynamics.select_evaluated_forces().weight.external_n
             for force in (total - external, external):
                 # What a grasp bears counts too: where nothing else acts, all other forces vanish.
                 largest = max(largest, float(np.abs(force).max()))
@@ -984,7 +989,7 @@ class Collocation:
         violations = []
         for part in self.iterates(z):
             segment = part.segment
-            residual = part.residual_n
+            residual = part.compute_residual_n()
             worst = np.argsort(-np.abs(residual), axis=None)[:count]
             for t, place in zip(
                 *np.unravel_index(worst, residual.shape), strict=True

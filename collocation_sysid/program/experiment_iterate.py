@@ -224,10 +224,9 @@ class ExperimentIterate:
             self.x, rows, histories=self.histories
         )
 
-    @property
-    def residual_n(self) -> Array:
-        """Residuals of the equations of motion (N, free dofs) [N],
-        see `Transcription.residual_n`.
+    def compute_residual_n(self) -> Array:
+        """Return the residuals of the equations of motion (N, free dofs) [N], see
+        `Transcription.residual_n`.
         """
         return self.segment.residual_n(
             self.x, self.equations, histories=self.histories

@@ -111,14 +111,12 @@ class SquareRootInformation:
         """Residuals r (k,) at p = 0, as the triangle represents them, k ≤ P + 1."""
         return self.triangle[:, -1]
 
-    @property
-    def information(self) -> Array:
-        """Information matrix (P, P), SᵀS."""
+    def compute_information(self) -> Array:
+        """Return the information matrix (P, P), SᵀS."""
         return self.jacobian.T @ self.jacobian
 
-    @property
-    def score(self) -> Array:
-        """Score (P,), Sᵀ r with r at p = 0: half the gradient of the sum of squares there."""
+    def compute_score(self) -> Array:
+        """Return the score (P,), Sᵀ r with r at p = 0: half the gradient of the sum of squares there."""
         return self.jacobian.T @ self.residual
 
     def loss(self, p: Array) -> float:

@@ -52,17 +52,14 @@ class LocalLoss:
                 None, none, position_count=self.position_count
             )
             codes.append(self._codes(*reading.hessian_structure(slopes)))
-        columns, rows = np.divmod(unique_codes(codes), self._height)
+        columns, rows = np.divmod(
+            unique_codes(codes), self.position_count + self.nuisance_count
+        )
         return rows, columns
-
-    @property
-    def _height(self) -> int:
-        """Number of rows and columns."""
-        return self.position_count + self.nuisance_count
 
     def _codes(self, rows: Index, columns: Index) -> Index:
         """Return one number for each entry, ascending in the order of `structure`."""
-        return columns * self._height + rows
+        return columns * (self.position_count + self.nuisance_count) + rows
 
     def hessian(
         self, x: Array, phi: Array, has_observation_curvature: bool = True
@@ -84,15 +81,14 @@ class LocalLoss:
         """
         return (
             self._constant
-            if self._is_quadratic
+            if self._is_quadratic()
             else self._evaluate_at(
                 x, phi, has_observation_curvature=has_observation_curvature
             )
         )
 
-    @property
     def _is_quadratic(self) -> bool:
-        """Whether the values do not depend on x and φ."""
+        """Return whether the values do not depend on x and φ."""
         return all(
             reading.is_quadratic and points.is_linear
             for reading, points in self.residuals

@@ -52,16 +52,13 @@ class MotionJacobian:
     length_m: float
     force_n: float
 
-    @property
-    def pattern(self) -> SymmetricPattern:
-        """Sparsity pattern of the blocks."""
-        return self.dynamics.pattern
-
     @cached_property
     def structure(self) -> BlockBand:
         """Sparsity structure of ∂c/∂x by columns."""
         return BlockBand(
-            self.pattern.size, self._row_starts, blocks=self._blocks()
+            self.dynamics.pattern.size,
+            self._compute_row_starts(),
+            blocks=self._blocks(),
         )
 
     @cached_property
@@ -69,15 +66,14 @@ class MotionJacobian:
         """Plan that adds the skew parts of ∂F/∂x and ∂F/∂v to the values of `structure`."""
         has_skew_damping = self.dynamics.forces.has_skew_damping
         return skew_block_band(
-            self.pattern.size,
-            self._row_starts,
+            self.dynamics.pattern.size,
+            self._compute_row_starts(),
             blocks=self._blocks(),
             by_velocity=has_skew_damping,
         )
 
-    @property
-    def _row_starts(self) -> Index:
-        """Index of the first row of each grid time, (N,); −1 where there are no rows."""
+    def _compute_row_starts(self) -> Index:
+        """Return the index of the first row of each grid time, (N,); −1 where there are no rows."""
         first_row = self.dynamics.first_row
         starts = (np.arange(self.dynamics.row_count) - first_row) * len(
             self.constrained_dofs
@@ -93,9 +89,9 @@ class MotionJacobian:
         has the diagonal of prescribed dofs that are constrained; these rows have constants only,
         which are written afterwards.
         """
-        rows, columns, source = self.pattern.full
-        place = np.full(self.pattern.size, -1)
-        moving = np.zeros(self.pattern.size, dtype=bool)
+        rows, columns, source = self.dynamics.pattern.full
+        place = np.full(self.dynamics.pattern.size, -1)
+        moving = np.zeros(self.dynamics.pattern.size, dtype=bool)
         place[self.constrained_dofs] = np.arange(len(self.constrained_dofs))
         moving[self.free_dofs] = True
         has_motion = moving[rows]
@@ -191,8 +187,8 @@ class MotionJacobian:
         return ReleasedGrasps.from_dynamics(
             self.dynamics,
             self.structure,
-            row_starts=self._row_starts,
-            pattern=self.pattern,
+            row_starts=self._compute_row_starts(),
+            pattern=self.dynamics.pattern,
             row_dofs=self.constrained_dofs,
             scale=scale,
         )
@@ -227,8 +223,10 @@ class MotionJacobian:
             if has_variable_mass
             else self._constant_inertia
         )
-        skew = full_skew_values(self.pattern, forces.by_position_skew)
-        of_rates = full_skew_values(self.pattern, forces.by_velocity_skew)
+        skew = full_skew_values(self.dynamics.pattern, forces.by_position_skew)
+        of_rates = full_skew_values(
+            self.dynamics.pattern, forces.by_velocity_skew
+        )
         if skew.size:
             self._skew.fill(
                 values,

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from ..common.array_types import Array, Index
 from ..common.time_dependence import at_times
 from ..fem.body import Body, Linearisation, SecondDerivatives
-from ..fem.pattern import SymmetricPattern
 from ..model.dynamics import Dynamics, StencilRow
 from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.grasp_constraint import GraspConstraint, PrescribedDisplacements
@@ -139,11 +138,6 @@ class MotionTranscription:
         """Body whose motion is measured; several experiments may share one."""
         return self.experiment.body
 
-    @property
-    def pattern(self) -> SymmetricPattern:
-        """Sparsity pattern of the time-step matrices (3n, 3n)."""
-        return self.experiment.sparsity
-
     @cached_property
     def constants(self) -> ThetaMap:
         """Map from the shared parameters q to the constants θ of the body."""
@@ -210,7 +204,7 @@ class MotionTranscription:
     @property
     def dof_count(self) -> int:
         """Number of dofs of the body, 3n: three displacements for each of n nodes."""
-        return self.pattern.size
+        return self.experiment.sparsity.size
 
     @cached_property
     def free_dofs(self) -> Index:
@@ -285,9 +279,8 @@ class MotionTranscription:
         """Slice of its constraints in g."""
         return slice(self.offsets.row, self.offsets.row + self.constraint_count)
 
-    @property
-    def parameter_indices(self) -> Index:
-        """Indices (nq + k,) of its (q, φ) in p."""
+    def list_parameter_indices(self) -> Index:
+        """Return the indices (nq + k,) of its (q, φ) in p."""
         return np.concatenate(
             [np.arange(self.nq), self.nuisance_indices.indices]
         )
@@ -330,7 +323,7 @@ class MotionTranscription:
         theta = self.constants.theta(self.parameters.guess_q)
         at_rest = self.body.nodes_m
         dynamics = self.dynamics.with_theta(theta)
-        pattern = self.pattern
+        pattern = self.experiment.sparsity
         at_last = at_times(dynamics.forces, slice(dynamics.row_count - 1, None))
         forces = at_last.linearise(at_rest, np.zeros_like(at_rest))
         last = StencilRow.from_dynamics(dynamics, dynamics.row_count - 1)
@@ -397,11 +390,10 @@ class MotionTranscription:
         )
         return np.concatenate([np.arange(self.nq), phi])
 
-    @property
     def has_histories(self) -> bool:
-        """Whether its body (viscoelastic memory) or a force on it has history variables."""
+        """Return whether its body (viscoelastic memory) or a force on it has history variables."""
         return self.body.has_memory or bool(
-            self.dynamics.forces.terms_with_internal_variables
+            self.dynamics.forces.find_terms_with_internal_variables()
         )
 
     def equations_at(self, q: Array, phi: Array) -> EquationsAtParameters:
@@ -560,13 +552,6 @@ class MotionTranscription:
             force_n=self.force_n,
         )
 
-    @property
-    def jacobian(self) -> BlockBand:
-        """Sparsity structure of ∂c/∂x by columns; row indices count from the first constraint of
-        this experiment.
-        """
-        return self.motion_rows.structure
-
     def constraints_and_jacobian(
         self,
         x: Array,
@@ -694,7 +679,9 @@ class MotionTranscription:
             by_xi, by_nu, own = history.vector_jacobian_product(
                 weights, equations.input_derivatives
             )
-            by_x += dynamics.combine_transposed(dynamics.state_weights, by_xi)
+            by_x += dynamics.combine_transposed(
+                dynamics.compute_state_weights(), by_xi
+            )
             by_x += (
                 dynamics.combine_transposed(dynamics.tables.q, by_nu)
                 / dynamics.step_s
@@ -707,7 +694,10 @@ class MotionTranscription:
         """Work space (constraint_times, width) for linearisations; overwritten by each of them."""
         # Kept between calls: fresh pages would cost as much as the numbers in them.
         return np.zeros(
-            (self.constraint_times, self.dynamics.forces.linearisation_width)
+            (
+                self.constraint_times,
+                self.dynamics.forces.body.linearisation_width,
+            )
         )
 
     # Second derivatives -----------------------------------------------------------------------
@@ -721,7 +711,7 @@ class MotionTranscription:
         blocks = self._hessian_blocks(_state_factors)
         return BlockBand(
             self.dof_count,
-            self._hessian_starts,
+            self._list_hessian_starts(),
             blocks=blocks,
             top_rows=self.nq,
         )
@@ -736,7 +726,7 @@ class MotionTranscription:
         )
         return skew_block_band(
             self.dof_count,
-            self._hessian_starts,
+            self._list_hessian_starts(),
             blocks=blocks,
             top_rows=self.nq,
         )
@@ -747,15 +737,16 @@ class MotionTranscription:
         blocks = self._hessian_blocks(lambda p, q, pp, qq: (q * qq, 0 * q))
         return BlockBand(
             self.dof_count,
-            self._hessian_starts,
+            self._list_hessian_starts(),
             blocks=blocks,
             top_rows=self.nq,
             adds=True,
         )
 
-    @property
-    def _hessian_starts(self) -> Index:
-        """Row of the Hessian, including the nq rows of q, at which each grid time begins, (N,)."""
+    def _list_hessian_starts(self) -> Index:
+        """Return the row of the Hessian, including the nq rows of q, at which each grid time
+        begins, (N,).
+        """
         return self.nq + np.arange(self.grid_times) * self.dof_count
 
     def _hessian_blocks(self, factors: Factors) -> list[BandBlock]:
@@ -772,7 +763,7 @@ class MotionTranscription:
             lower-triangle values A and B in `BlockBand.fill`, from the stencil coefficients (N,) of
             state (p) and velocity (q) of two positions in one evaluation, see `_state_factors`.
         """
-        rows, columns, source = self.pattern.full
+        rows, columns, source = self.experiment.sparsity.full
         blocks = []
         for distance in range(self.dynamics.largest_lag + 1):
             if distance > 0 and not self._curvature_terms(
@@ -811,7 +802,7 @@ class MotionTranscription:
         factors : callable
             As for `_hessian_blocks`; the first position is that of the later row.
         """
-        p = self.dynamics.state_weights
+        p = self.dynamics.compute_state_weights()
         q = self.dynamics.tables.q / self.dynamics.step_s
         terms = []
         for i in range(self.dynamics.largest_lag + 1 - distance):
@@ -887,7 +878,9 @@ class MotionTranscription:
             self._rate_hessian.fill(
                 values, rates, b=rates, threads=self.body.threads
             )
-        skew = full_skew_values(self.pattern, curvature.position_velocity_skew)
+        skew = full_skew_values(
+            self.experiment.sparsity, curvature.position_velocity_skew
+        )
         if skew.size:
             self._skew_hessian.fill(
                 values, skew, b=skew, threads=self.body.threads
@@ -978,11 +971,12 @@ class MotionTranscription:
     @cached_property
     def _curvature_buffer(self) -> Array:
         """Work space (N, width) for second derivatives; overwritten by each evaluation."""
-        return np.zeros((self.grid_times, self.dynamics.forces.curvature_width))
+        return np.zeros(
+            (self.grid_times, self.dynamics.forces.body.curvature_width)
+        )
 
-    @property
-    def hessian_diagonal_positions(self) -> Index:
-        """Positions (N · 3n,) of the diagonal entries of x in the values of `hessian`."""
+    def find_hessian_diagonal(self) -> Index:
+        """Return the positions (N · 3n,) of the diagonal entries of x in the values of `hessian`."""
         dofs = np.arange(self.dof_count)
         return self.hessian.positions(
             np.arange(self.grid_times), 0, rows=dofs, columns=dofs

@@ -186,7 +186,9 @@ class StreamingModel:
         ).all(axis=1)
         if not unknown.any():
             return self
-        places_m = self.segment.marker_places_m(self.segment.guess_phi)
+        places_m = self.segment.marker_places_m(
+            self.segment.compute_guess_phi()
+        )
         nodes_m = x.reshape(-1, 3)
         places_m[unknown] = self.segment.association.markers.places_of_points(
             nodes_m, tracks_m[unknown]
@@ -223,16 +225,6 @@ class StreamingModel:
     def parameter_count(self) -> int:
         """Number P of parameters p."""
         return self.collocation.nq + self.collocation.nphi
-
-    @property
-    def substeps(self) -> int:
-        """Number of rows (time steps) from sample to sample."""
-        return self.collocation.substeps
-
-    @property
-    def interval_s(self) -> float:
-        """Time between two samples [s]."""
-        return self.experiment.timestep_s
 
     @cached_property
     def _mass_damping(self) -> tuple[Index, Array]:
@@ -350,7 +342,7 @@ class StreamingModel:
                     first=int(channel.known_rows[0]), delay=DELAY_STEPS
                 )
                 if not is_custom:
-                    clock_error = channel.clock_limit_s / step_s
+                    clock_error = channel.compute_clock_limit_s() / step_s
                     stencil = stencil._replace(
                         neighbours=TIMES_PER_SAMPLE, clock_error=clock_error
                     )
@@ -450,7 +442,10 @@ class StreamingModel:
         each linearisation.
         """
         return np.empty(
-            (ROWS_PER_CHUNK, self.segment.dynamics.forces.linearisation_width)
+            (
+                ROWS_PER_CHUNK,
+                self.segment.dynamics.forces.body.linearisation_width,
+            )
         )
 
     @cached_property

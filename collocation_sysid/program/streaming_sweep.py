@@ -366,24 +366,22 @@ class StreamingSweep:
         )
         most = (
             (2 * self.model.neighbouring_samples + LARGEST_SAMPLE_DELAY + 2)
-            * self.model.substeps
+            * self.model.collocation.substeps
             + 4
             + ROWS_PER_CHUNK
         )
         most += self.model.largest_delay_rows
         self.read: deque[ObservedRow] = deque(state.observed_rows, maxlen=most)
 
-    @property
     def needs_another_pass(self) -> bool:
-        """Whether an accepted correction was longer than `LARGEST_CORRECTION` body sizes, so that
-        its square is not negligible.
+        """Return whether an accepted correction was longer than `LARGEST_CORRECTION` body sizes, so
+        that its square is not negligible.
         """
         return self.longest_m > LARGEST_CORRECTION * self.model.body_size_m
 
-    @property
-    def state(self) -> SweepState:
-        """State on which the next row depends; its arrays are copied, except the columns of the
-        last rows.
+    def copy_state(self) -> SweepState:
+        """Return the state on which the next row depends; its arrays are copied, except the columns
+        of the last rows.
         """
         return SweepState(
             row=self.row,
@@ -392,7 +390,7 @@ class StreamingSweep:
             force=self.force.copy(),
             prescribed_columns=self.prescribed_columns.copy(),
             reactions=self.reactions.copy(),
-            last_rows=self.forward.state,
+            last_rows=self.forward.copy_state(),
             observed_rows=tuple(self.read),
         )
 
@@ -588,7 +586,7 @@ class StreamingSweep:
         solved: list[Array] = []
         for k, (t, right, force) in enumerate(zip(here, *sides, strict=True)):
             row = self._stencil_row(t)
-            before = forward.state
+            before = forward.copy_state()
             row_columns = np.zeros(forward.shape)
             by_position = at.by_position[k]
             by_velocity = at.by_velocity[k]
@@ -738,7 +736,9 @@ class StreamingSweep:
         """
         model = self.model
         what = f"time step {self.row}"
-        time_s = self.row * model.interval_s / model.substeps
+        time_s = (
+            self.row * model.experiment.timestep_s / model.collocation.substeps
+        )
         raise simulation_error(
             model.newton, failure, time_s=time_s, what=what
         ) from failure
@@ -805,7 +805,7 @@ class StreamingSweep:
             *(self.read[k + stencil.delay - self.row] for k in needed_rows),
             strict=True,
         )
-        step_s = model.interval_s / model.substeps
+        step_s = model.experiment.timestep_s / model.collocation.substeps
         begins_s = float(model.experiment.t_s[0])
         known_s, t_s = (
             begins_s + step_s * np.array(rows) for rows in (needed_rows, at)
@@ -853,7 +853,7 @@ class StreamingSweep:
         markers = self.model.marker_model
         back = reading.rows_back + rows
         backs = [
-            back - k * model.substeps
+            back - k * model.collocation.substeps
             for k in range(-neighbours, neighbours + 1)
         ]
         x, point_columns = (
@@ -868,7 +868,11 @@ class StreamingSweep:
             columns=self.moving,
             changes=point_columns[..., 1:],
         )
-        since_s = (self.row - 1 - back) / model.substeps * model.interval_s
+        since_s = (
+            (self.row - 1 - back)
+            / model.collocation.substeps
+            * model.experiment.timestep_s
+        )
         markers = markers.shifted(since_s)
         residual, slope = markers.linearise(
             values, slopes, phi=self.phi, size=model.parameter_count

@@ -389,7 +389,7 @@ class Sweep:
         )
         self.segment = transcription
         self.body = transcription.body
-        self.pattern = transcription.pattern
+        self.pattern = transcription.experiment.sparsity
         self.free = transcription.free_dofs
         self.sensed = transcription.sensed_dofs
         self.factoriser = Factoriser.cached(
@@ -478,7 +478,7 @@ class Sweep:
             by_p=columns[:, :, 1:],
             violation_n=march.violation_n,
             indefinite_count=march.indefinite,
-            last=march.state,
+            last=march.copy_state(),
             grasp_forces=grasp_forces,
         )
 
@@ -607,44 +607,47 @@ class Sweep:
             rows[self.dynamics.is_temporarily_prescribed[t, self.free]] = 0
         return rows
 
-    @property
-    def chunk_rows(self) -> int:
-        """Number of time steps that are linearised and factorised at a time: as many as
+    def choose_chunk_rows(self) -> int:
+        """Return the number of time steps that are linearised and factorised at a time: as many as
         `CHUNK_BYTES` allow, but at least one for each thread.
         """
         rows = self.dynamics.row_count
         # Each thread has one to factorise, however large it is.
         least = min(self.body.threads, rows)
-        most = min(rows, int(CHUNK_BYTES / self._step_bytes))
+        most = min(rows, int(CHUNK_BYTES / self._estimate_step_bytes()))
         if self.factoriser.skyline:
             most = min(most, LARGEST_CHUNK_ROWS)
         return max(least, most)
 
-    @property
-    def chunk_bytes(self) -> int:
-        """Memory of one chunk [bytes]."""
-        factor_bytes = self._factor_bytes if self.reuses_factors else 0
-        return self.chunk_rows * self._step_bytes + factor_bytes
+    def estimate_chunk_bytes(self) -> int:
+        """Return the memory of one chunk [bytes]."""
+        factor_bytes = (
+            self._estimate_factor_bytes() if self.reuses_factors else 0
+        )
+        return (
+            self.choose_chunk_rows() * self._estimate_step_bytes()
+            + factor_bytes
+        )
 
-    @property
-    def _step_bytes(self) -> int:
-        """Memory of one time step [bytes]: element results, and its factor or, where factors are
-        reused, its matrix.
+    def _estimate_step_bytes(self) -> int:
+        """Return the memory of one time step [bytes]: element results, and its factor or, where
+        factors are reused, its matrix.
         """
         results_bytes = 8 * self.body.linearisation_width
         if self.reuses_factors:
             parts = 1 + self.body.is_unsymmetric
             return results_bytes + 8 * parts * self.pattern.entry_count
-        return results_bytes + self._factor_bytes
+        return results_bytes + self._estimate_factor_bytes()
 
-    @property
-    def _factor_bytes(self) -> int:
-        """Memory of one factor [bytes], that of an unsymmetric matrix if the body's is."""
+    def _estimate_factor_bytes(self) -> int:
+        """Return the memory of one factor [bytes], that of an unsymmetric matrix if the body's
+        is.
+        """
         solver = self.factoriser
         values = (
-            solver.unsymmetric_factor_size
+            solver.estimate_unsymmetric_factor_size()
             if self.body.is_unsymmetric
-            else solver.factor_size
+            else solver.estimate_factor_size()
         )
         bytes_each = 4 if self.has_single_precision else 8
         return bytes_each * values
@@ -746,7 +749,9 @@ class Sweep:
         dynamics = self.dynamics_at(equations)
         xi, nu = dynamics.evaluation_states(x)
         starts = range(
-            max(first, dynamics.first_row), dynamics.row_count, self.chunk_rows
+            max(first, dynamics.first_row),
+            dynamics.row_count,
+            self.choose_chunk_rows(),
         )
         sequence = (
             FactorSequence(
@@ -759,11 +764,11 @@ class Sweep:
         )
         buffers = [
             self.factoriser.allocate(1 + self.body.is_unsymmetric)
-            for _ in range(self.chunk_rows)
+            for _ in range(self.choose_chunk_rows())
         ]
         for start in reversed(starts) if backward else starts:
             here = slice(
-                start, min(start + self.chunk_rows, dynamics.row_count)
+                start, min(start + self.choose_chunk_rows(), dynamics.row_count)
             )
             evaluations = slice(
                 start - dynamics.first_row, here.stop - dynamics.first_row
@@ -975,9 +980,8 @@ class ForwardSubstitution:
         ] = []
         self._known = last.history_columns
 
-    @property
-    def state(self) -> ForwardState:
-        """State that later rows depend on; its arrays are not copied."""
+    def copy_state(self) -> ForwardState:
+        """Return the state that later rows depend on; its arrays are not copied."""
         return ForwardState(
             solutions=tuple(self.past),
             increments=tuple(self.past_increments),

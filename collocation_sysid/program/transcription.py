@@ -141,8 +141,8 @@ class Transcription(MotionTranscription):
         phi : (k,) array
             Nuisance parameters in units of their priors, relative to the present association.
         x : (rows, 3n) array
-            First rows of the motion [m], at least `rows_to_follow`; it may have no rows if there
-            are no unlabelled points.
+            First rows of the motion [m], at least `count_rows_to_follow`; it may have no rows if
+            there are no unlabelled points.
 
         Returns
         -------
@@ -151,7 +151,7 @@ class Transcription(MotionTranscription):
             which the coordinates of estimated marker places refer to it.
         """
         nuisance = self.nuisance
-        places = self.markers.coordinate_parameters
+        places = self.markers.observable.coordinate_parameters
         shifts_s = (
             phi[nuisance.indices_of_rows(TIME)]
             * nuisance.scales[nuisance.indices_of_rows(TIME)]
@@ -190,7 +190,7 @@ class Transcription(MotionTranscription):
         phi : (k,) array
             Nuisance parameters; they are not modified.
         x : (rows, 3n) array
-            First rows of the motion [m], at least `rows_to_place`.
+            First rows of the motion [m], at least `count_rows_to_place`.
         only_poses : bool
             Whether to keep the correspondences of unlabelled points and align the poses of their
             sensors alone.
@@ -221,7 +221,7 @@ class Transcription(MotionTranscription):
         sample within the rows.
         """
         markers = self.experiment.markers
-        rows = self.markers.sample_rows
+        rows = self.markers.observable.rows
         if markers.located.all():
             return self.association, phi
         points_m, _ = markers.first_samples
@@ -242,23 +242,23 @@ class Transcription(MotionTranscription):
             phi, chart.markers.centre_coordinates
         )
 
-    @property
-    def rows_to_place(self) -> int:
-        """Number of rows of x that `place_unknown_markers` needs; 0 if all places are stated and
-        there are no unlabelled points.
+    def count_rows_to_place(self) -> int:
+        """Return the number of rows of x that `place_unknown_markers` needs; 0 if all places are
+        stated and there are no unlabelled points.
         """
         unknown = ~self.experiment.markers.located
         first = self.experiment.markers.is_present[:, unknown].argmax(axis=0)
         rows = (
-            [int(self.markers.sample_rows[first].max())] if len(first) else []
+            [int(self.markers.observable.rows[first].max())]
+            if len(first)
+            else []
         )
         return 1 + max(
             rows + [each.first_row for each in self.reassociable], default=-1
         )
 
-    @property
-    def rows_to_follow(self) -> int:
-        """Number of rows of x that `follow_estimates` needs: all grid times, or 0 without
+    def count_rows_to_follow(self) -> int:
+        """Return the number of rows of x that `follow_estimates` needs: all grid times, or 0 without
         unlabelled points.
         """
         return self.grid_times if self.reassociable else 0
@@ -266,13 +266,12 @@ class Transcription(MotionTranscription):
     def marker_places_m(self, phi: Array) -> Array:
         """Return the places (M, 3) of the markers on the undeformed body at φ (k,) [m]."""
         return self.association.markers.places_m(
-            np.append(phi, 0.0)[self.markers.coordinate_parameters]
+            np.append(phi, 0.0)[self.markers.observable.coordinate_parameters]
         )
 
-    @property
-    def guess_phi(self) -> Array:
-        """Nuisance parameters φ (k,) at the start of a solve: zero, except for the clock and the
-        poses of sensors in the association.
+    def compute_guess_phi(self) -> Array:
+        """Return the nuisance parameters φ (k,) at the start of a solve: zero, except for the clock
+        and the poses of sensors in the association.
         """
         phi = np.zeros(self.nuisance.size)
         time_shifts = self.nuisance.indices_of_rows(TIME)
@@ -295,7 +294,7 @@ class Transcription(MotionTranscription):
         """
         updated = phi.copy()
         estimated = self.association.markers.estimated
-        updated[self.markers.coordinate_parameters[estimated]] = (
+        updated[self.markers.observable.coordinate_parameters[estimated]] = (
             place_coordinates[estimated]
         )
         return updated

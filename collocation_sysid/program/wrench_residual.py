@@ -92,7 +92,7 @@ class WrenchResidual(MeasurementResidual):
             huber=huber,
             names=(f"force{label}", f"torque{label}"),
             t_s=wrench.t_s,
-            sigmas=wrench.sigmas[[0, 3]],
+            sigmas=wrench.stack_sigmas()[[0, 3]],
             measured=wrench.values[:, None],
             is_compared=is_compared.reshape(-1, 2, 3),
             own_parameters=np.concatenate(
@@ -102,16 +102,11 @@ class WrenchResidual(MeasurementResidual):
         )
 
     @property
-    def is_compared_by_component(self) -> NDArray[np.bool_]:
-        """Mask (S, 6) of the components (force, torque) that are compared."""
-        return self.is_compared.reshape(-1, 6)
-
-    @property
     def first_needed_s(self) -> float:
         """Time [s] up to which the motion must be known for the first sample that is compared, with
         the largest possible shift of the clock.
         """
-        return super().first_needed_s + self.observable.clock_limit_s
+        return super().first_needed_s + self.observable.compute_clock_limit_s()
 
     def is_covered(self, known: int) -> NDArray[np.bool_]:
         """Return the mask (S,) of the samples for which the first `known` times suffice,
@@ -222,7 +217,7 @@ def _is_covered(
         return np.zeros(len(t_s), dtype=bool)
     first, last = observable.t_s[[0, known - 1]]
     rounding = 1e-6 * observable.reaction_grid.step_s + TIME_TOLERANCE_S
-    limit_s = observable.clock_limit_s
+    limit_s = observable.compute_clock_limit_s()
     return (t_s >= first + limit_s - rounding) & (
         t_s <= last - limit_s + rounding
     )

@@ -110,9 +110,8 @@ class Actuator(ABC, Generic[S]):
     def _measure_on(self, body: Body) -> S:
         """Return the scalar S of a body."""
 
-    @property
-    def measure(self) -> S:
-        """Scalar S of the body's shape; an `InputError` if the actuator is on no body yet."""
+    def require_measure(self) -> S:
+        """Return the scalar S of the body's shape; an `InputError` if the actuator is on no body yet."""
         if self.body_measure is None:
             raise InputError(
                 f"{self.name} has not been placed on a body; use the one in the tendons or "
@@ -120,10 +119,9 @@ class Actuator(ABC, Generic[S]):
             )
         return self.body_measure.measure
 
-    @property
-    def calibration(self) -> Calibration:
-        """Stated calibration: factor and offset of the actuator, and zero for the logarithm of the
-        ratio of its lag to the stated one.
+    def make_calibration(self) -> Calibration:
+        """Return the stated calibration: factor and offset of the actuator, and zero for the
+        logarithm of the ratio of its lag to the stated one.
         """
         return Calibration(
             self.factor,
@@ -166,7 +164,7 @@ class Actuator(ABC, Generic[S]):
         """Return the amplitude c at the times `t_s` (T,), as (T,), with the actuator's own
         calibration.
         """
-        calibration = self.calibration
+        calibration = self.make_calibration()
         return self.energy_amplitude(
             self.declared_values.values_at(t_s),
             calibration.factor,

@@ -202,11 +202,6 @@ class Gauge(SeparateSensor):
         return np.asarray(self.t_s)
 
     @property
-    def has_values(self) -> bool:
-        """Whether measured values were given."""
-        return self.values is not None
-
-    @property
     def measured_values(self) -> Array:
         """(S, m) measured values, NaN where missing; zeros if none were given."""
         if self.values is None:

@@ -448,7 +448,7 @@ class Depth(SeparateSensor):
         """Return the time [s] by which a sample has points, and of as many samples as there are up
         to the number `fewest`.
         """
-        last = max(fewest - 1, self.first_sample_with_points)
+        last = max(fewest - 1, self.find_first_sample_with_points())
         return float(
             self.sample_times_s[min(last, len(self.sample_times_s) - 1)]
         )
@@ -471,9 +471,8 @@ class Depth(SeparateSensor):
             thinned = replace(self, spacing_m=spacing_m)
         return thinned
 
-    @property
-    def first_sample_with_points(self) -> int:
-        """Index, from 0, of the first sample that has points."""
+    def find_first_sample_with_points(self) -> int:
+        """Return the index, from 0, of the first sample that has points."""
         return next(k for k, cloud in enumerate(self.clouds) if len(cloud))
 
 

@@ -260,10 +260,9 @@ class Experiment:
             if grasp.wrench is not None
         }
 
-    @property
-    def symmetry(self) -> int:
-        """Ratio of the specimen's loads to those of the modelled part: that of the wrenches; 1 if
-        there are no wrenches, or they state different ratios.
+    def find_symmetry(self) -> int:
+        """Return the ratio of the specimen's loads to those of the modelled part: that of the
+        wrenches; 1 if there are no wrenches, or they state different ratios.
         """
         symmetries = {wrench.symmetry for wrench in self.wrenches}
         return symmetries.pop() if len(symmetries) == 1 else 1
@@ -439,10 +438,9 @@ class Experiment:
             ] * force.node_forces_n(times, n)
         return total
 
-    @property
-    def instrumented_grasps(self) -> tuple[int, ...]:
-        """Indices in `grasps`, counted from 0, of the grasps and obstacles whose force or torque is
-        measured by a wrench or a custom sensor.
+    def find_instrumented_grasps(self) -> tuple[int, ...]:
+        """Return the indices in `grasps`, counted from 0, of the grasps and obstacles whose force
+        or torque is measured by a wrench or a custom sensor.
         """
         grasps_of_gauges = {
             gauge.grasp - 1
@@ -456,15 +454,14 @@ class Experiment:
         )
         return tuple(sensed)
 
-    @property
     def has_known_force(self) -> bool:
-        """Whether a stated or measured force sets the scale of all forces.
+        """Return whether a stated or measured force sets the scale of all forces.
 
         True if a force is measured at a grasp or obstacle, the amplitude of an actuator differs
         from zero at a sample, or a point mass or stated force acts on a free dof at a sample. The
         weight of the body itself does not count.
         """
-        if self.instrumented_grasps:
+        if self.find_instrumented_grasps():
             return True
         if any(
             actuator.energy_amplitude_at(self.t_s).any()
@@ -488,12 +485,13 @@ class Experiment:
         """Tendons of the experiment, then its pressures."""
         return (*self.tendons, *self.pressures)
 
-    @property
-    def coupled_graph(self) -> JointPattern:
-        """Mesh graph of the body with the couplings of its actuators, obstacles and, where it acts,
-        air drag; computed anew at each access.
+    def build_coupled_graph(self) -> JointPattern:
+        """Return the mesh graph of the body with the couplings of its actuators, obstacles and,
+        where it acts, air drag; computed anew at each access.
         """
-        couplings = [each.measure.couplings for each in self.actuators]
+        couplings = [
+            each.require_measure().couplings for each in self.actuators
+        ]
         couplings += [each.couplings_with(self.body) for each in self.obstacles]
         couplings += [
             self.body.unit_air_drag.points.couplings
@@ -503,9 +501,9 @@ class Experiment:
     @property
     def sparsity(self) -> SymmetricPattern:
         """Sparsity pattern of the derivatives of the forces on the body, which is that of
-        `coupled_graph`.
+        `build_coupled_graph`.
         """
-        return self.coupled_graph.pattern
+        return self.build_coupled_graph().pattern
 
     def rigid_positions(self, t_s: ArrayLike) -> Array:
         """Return the node positions (T, n, 3) [m] at times `t_s` (T,) if a grasp carried the
@@ -532,9 +530,8 @@ class Experiment:
             )
         return places
 
-    @property
-    def upward_direction(self) -> Array:
-        """Unit vector (3,) against gravity; the z axis if there is no gravity."""
+    def compute_upward_direction(self) -> Array:
+        """Return the unit vector (3,) against gravity; the z axis if there is no gravity."""
         pull = np.linalg.norm(self.gravity_m_s2)
         return (
             -self.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0])
@@ -567,9 +564,8 @@ class Experiment:
         rotations, translations = self.rigid_motion(t_s)
         return np.einsum("mji,mj->mi", rotations, points_m - translations)
 
-    @property
-    def place_sigma_m(self) -> Array:
-        """Prior standard deviation (M,) of each marker's place [m].
+    def compute_place_sigma_m(self) -> Array:
+        """Return the prior standard deviation (M,) of each marker's place [m].
 
         It is that of the marker where `markers.places_sigma_m` has a finite one, and else the
         `marker_offset_m` of the nuisance parameters; zero where the place is exact. Where no place
@@ -647,7 +643,7 @@ class Experiment:
                 "the sample times of the markers differ from t_s of the experiment; expected the same "
                 "times: cs.align brings poses and markers to common times"
             )
-        if self.markers.sample_count == 0:
+        if self.markers.count_samples() == 0:
             self._require_measurements()
         self._check_grasp_times()
         self._check_custom_sensors()
@@ -720,7 +716,7 @@ class Experiment:
         """Raise an `InputError` if, besides markers, nothing is measured either: by no sensor of its
         own times and no wrench.
         """
-        if self.separate_sensors or self.instrumented_grasps:
+        if self.separate_sensors or self.find_instrumented_grasps():
             return
         if not self.markers.names:
             message = (
@@ -735,7 +731,7 @@ class Experiment:
     def require_measured_values(self) -> None:
         """Raise an `InputError` if a custom sensor has no measured values, as before a simulation."""
         for gauge in self.readings:
-            if not gauge.has_values:
+            if gauge.values is None:
                 raise InputError(
                     f"the reading '{gauge.name}' of experiment '{self.name}' has no values; "
                     "expected measured ones, or simulated ones: with_readings(experiment, values)"

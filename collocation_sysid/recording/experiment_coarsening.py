@@ -25,7 +25,10 @@ def node_sets(experiment: Experiment) -> list[Index]:
     )
     return [
         *(load.nodes for load in loads),
-        *(each.measure.faces[:, :3].ravel() for each in experiment.pressures),
+        *(
+            each.require_measure().faces[:, :3].ravel()
+            for each in experiment.pressures
+        ),
     ]
 
 
@@ -67,7 +70,7 @@ def _coarse_pressure(pressure: Pressure, relation: CoarseBody) -> Pressure:
     """Return the pressure on the coarse body; a selection by name becomes the corresponding faces,
     as the coarse mesh has no arrays and face sets.
     """
-    corners = pressure.measure.faces[:, :3]
+    corners = pressure.require_measure().faces[:, :3]
     return replace(
         pressure, faces=relation.coarse_faces(corners), body_measure=None
     )

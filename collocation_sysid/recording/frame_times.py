@@ -52,19 +52,8 @@ class FrameAssignment:
     offsets_s: Array
     jitter_s: Array
 
-    @property
-    def lost_count(self) -> int:
-        """Number of samples without a frame."""
-        return len(self.t_s) - len(self.samples)
-
-    @property
-    def longest_gap(self) -> int:
-        """Largest number of consecutive samples without a frame."""
-        return int(np.diff(self.samples).max(initial=1)) - 1
-
-    @property
-    def interval_s(self) -> float:
-        """Time between samples [s]."""
+    def compute_interval_s(self) -> float:
+        """Return the time between samples [s]."""
         return float(self.t_s[-1] - self.t_s[0]) / (len(self.t_s) - 1)
 
     def spread(self, values: Array) -> Array:
@@ -141,7 +130,7 @@ def evenly_sampled(table: MarkerTable) -> tuple[MarkerTable, list[str]]:
     if assignment is None:
         raise _irregularity(t_s)
     rounding_s = printed_rounding_s(t_s)
-    tolerance_s = STEP_TOLERANCE * assignment.interval_s + rounding_s
+    tolerance_s = STEP_TOLERANCE * assignment.compute_interval_s() + rounding_s
     is_jittered = bool(np.abs(assignment.offsets_s).max() > tolerance_s)
     offsets_s = None
     if is_jittered and table.names:
@@ -166,8 +155,8 @@ def _assignment_note(
     are only times, and the model is not compared there.
     """
     parts = []
-    if lost := assignment.lost_count:
-        longest = assignment.longest_gap
+    if lost := (len(assignment.t_s) - len(assignment.samples)):
+        longest = int(np.diff(assignment.samples).max(initial=1)) - 1
         gap = f", up to {longest} in succession" if longest > 1 else ""
         parts.append(
             f"{lost} of {len(assignment.t_s)} frames {'was' if lost == 1 else 'were'} lost{gap}: "
@@ -178,7 +167,7 @@ def _assignment_note(
         parts.append(
             f"the times of the frames deviate by {np.std(jitter_ms):.2g} ms RMS, at most "
             f"{np.abs(jitter_ms).max():.2g} ms, from an even "
-            f"{1 / assignment.interval_s:.6g} Hz"
+            f"{1 / assignment.compute_interval_s():.6g} Hz"
             + has_markers
             * ": the model is evaluated at the time of each frame"
         )

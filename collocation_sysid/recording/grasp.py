@@ -180,11 +180,6 @@ class Grasp:
         """
         return self.poses.moved_positions(nodes_m[self.nodes], t_s)
 
-    @property
-    def has_sensor(self) -> bool:
-        """Whether a force–torque sensor measures the grasp."""
-        return self.wrench is not None
-
     def without_sensor(self) -> Self:
         """Return a copy of the grasp without its force–torque sensor, if it has one."""
         return replace(self, wrench=None)
@@ -210,9 +205,12 @@ class Grasp:
             self, wrench=replace(self.wrench, t_s=t_s, values=values)
         )
 
-    @property
-    def load_times_s(self) -> Array:
-        """Sample times (S,) of the force–torque sensor [s]; empty without a sensor."""
+    def has_sensor(self) -> bool:
+        """Return whether a force–torque sensor measures the grasp."""
+        return self.wrench is not None
+
+    def list_load_times_s(self) -> Array:
+        """Return the sample times (S,) of the force–torque sensor [s]; empty without a sensor."""
         return np.zeros(0) if self.wrench is None else self.wrench.t_s
 
     def with_loads_within(self, t_s: Array, fewest: int) -> Self:

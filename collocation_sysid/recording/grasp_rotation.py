@@ -48,11 +48,6 @@ class GraspRotation:
     step_s: float
     remedy: str
 
-    @property
-    def rate_rad_s(self) -> float:
-        """Mean angular velocity within the step [rad/s]."""
-        return self.angle_rad / self.step_s
-
 
 def fastest_rotation(experiment: Experiment, substeps: int) -> GraspRotation:
     """Return the largest rotation of an experiment's grasps and obstacles within a step of the time

@@ -67,13 +67,6 @@ class HomogeneousDeformation:
     young_ratio: float = 1.0
     area_over_length_m: float = 0.0
 
-    @property
-    def needs_inner_node(self) -> bool:
-        """Whether the test prescribes all nodes of a single tetrahedron, so that a free node has to
-        be added inside the cell.
-        """
-        return not self.free
-
     def displaced_nodes(self) -> dict[int, tuple[Array, Array]]:
         """Return for each moving node of the cell, by its index from 0, the displacement by a unit
         strain e₁ and by a unit strain e₂, each (3,) [m]; nodes at rest are left out.

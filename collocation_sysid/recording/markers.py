@@ -187,9 +187,11 @@ class Markers:
             if len(self.names) <= MOST_NAMES_SHOWN
             else (*self.names[:MOST_NAMES_SHOWN], "…")
         )
-        missing = int(self.missing_counts.sum())
+        missing = int(self.count_missing().sum())
         gaps = f", {missing} missing" if missing else ""
-        return f"Markers({', '.join(shown)}: {self.sample_count} samples{gaps})"
+        return (
+            f"Markers({', '.join(shown)}: {self.count_samples()} samples{gaps})"
+        )
 
     def on_body(
         self, body: Body, undeformed_places: UndeformedPlaces | None = None
@@ -257,9 +259,8 @@ class Markers:
         """
         return cls(t_s, np.zeros((len(np.atleast_1d(t_s)), 0, 3)), sigma_m=1.0)
 
-    @property
-    def first_visible_sample(self) -> int:
-        """Index, from 0, of the first sample in which a marker is present; 0 if none is."""
+    def find_first_visible_sample(self) -> int:
+        """Return the index, from 0, of the first sample in which a marker is present; 0 if none is."""
         return int(self.is_present.any(axis=1).argmax())
 
     @cached_property
@@ -277,14 +278,12 @@ class Markers:
         """(T, M) mask of samples with all three coordinates."""
         return np.asarray(np.isfinite(self.positions_m[:, :, 0]))
 
-    @property
-    def missing_counts(self) -> Index:
-        """(M,) number of missing samples of each marker."""
+    def count_missing(self) -> Index:
+        """Return (M,) number of missing samples of each marker."""
         return (~self.is_present).sum(axis=0)
 
-    @property
-    def sample_count(self) -> int:
-        """Number of present samples over all markers."""
+    def count_samples(self) -> int:
+        """Return the number of present samples over all markers."""
         return int(self.is_present.sum())
 
     @cached_property

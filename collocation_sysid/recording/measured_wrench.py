@@ -115,7 +115,7 @@ class Wrench:
             )
 
     def __repr__(self) -> str:
-        names = ", ".join(self.component_names)
+        names = ", ".join(self.list_component_names())
         return f"Wrench({len(self.t_s)} samples of {names} in the frame of the {self.frame})"
 
     def with_zeros_at(self, t_s: Array) -> Wrench:
@@ -137,10 +137,9 @@ class Wrench:
         """(6,) whether each component is measured at any sample."""
         return np.asarray(self.is_measured.any(axis=0))
 
-    @property
-    def component_names(self) -> tuple[str, ...]:
-        """Names of the components that are measured at any sample, such as "fz", in the order of
-        `COMPONENTS`.
+    def list_component_names(self) -> tuple[str, ...]:
+        """Return the names of the components that are measured at any sample, such as "fz", in the
+        order of `COMPONENTS`.
         """
         return tuple(
             COMPONENTS[k] for k in np.flatnonzero(self.measured_components)
@@ -149,14 +148,13 @@ class Wrench:
     def component_noises(self) -> list[tuple[int, str, str, float]]:
         """Return index, name, unit and σ of each component that is measured at any sample."""
         return [
-            (k, COMPONENTS[k], UNITS[k], float(self.sigmas[k]))
+            (k, COMPONENTS[k], UNITS[k], float(self.stack_sigmas()[k]))
             for k in np.flatnonzero(self.measured_components).tolist()
         ]
 
-    @property
-    def sigmas(self) -> Array:
-        """(6,) standard deviations of the components [N, N m]; those of torques are 1 if `sigma_nm`
-        is None, as no torque is measured then.
+    def stack_sigmas(self) -> Array:
+        """Return (6,) standard deviations of the components [N, N m]; those of torques are 1 if
+        `sigma_nm` is None, as no torque is measured then.
         """
         torque = 1.0 if self.sigma_nm is None else self.sigma_nm
         return np.repeat([self.sigma_n, torque], 3)

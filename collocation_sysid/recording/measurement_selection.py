@@ -145,9 +145,9 @@ def moved_grasp(grasp: Grasp, poses: PoseSequence, t_s: Array) -> Grasp:
     components that it does not measure.
     """
     moved = replace(grasp, poses=poses)
-    if not grasp.has_sensor:
+    if not grasp.has_sensor():
         return moved
-    sample_times_s = grasp.load_times_s
+    sample_times_s = grasp.list_load_times_s()
     rate_hz = (len(sample_times_s) - 1) / max(np.ptp(sample_times_s), 1e-300)
     count = max(FEWEST_PLACEHOLDERS, 1 + int(np.ptp(t_s) * rate_hz + 1e-6))
     return moved.with_zero_loads_at(t_s[0] + np.arange(count) / rate_hz)
@@ -157,7 +157,7 @@ def measured_count(experiment: Experiment) -> int:
     """Return how many numbers the markers (coordinates) and force sensors (components) measure."""
     sensors = experiment.sensors_by_grasp.values()
     of_sensors = sum(int(each.is_measured.sum()) for each in sensors)
-    return 3 * experiment.markers.sample_count + of_sensors
+    return 3 * experiment.markers.count_samples() + of_sensors
 
 
 def main_measurement(experiments: Sequence[Experiment]) -> tuple[str, str]:
@@ -165,7 +165,7 @@ def main_measurement(experiments: Sequence[Experiment]) -> tuple[str, str]:
     noise: markers, else a sensor that measures the shape of the body, else force sensors, else any
     other sensor.
     """
-    if any(each.markers.sample_count for each in experiments):
+    if any(each.markers.count_samples() for each in experiments):
         return "markers", "sigma_m"
     sensors = [
         sensor for each in experiments for sensor in each.separate_sensors
@@ -185,6 +185,6 @@ def is_load_only(experiment: Experiment) -> bool:
     return bool(
         experiment.is_static
         and experiment.sensors_by_grasp
-        and not experiment.markers.sample_count
+        and not experiment.markers.count_samples()
         and not experiment.separate_sensors
     )

@@ -158,10 +158,9 @@ class NuisanceRow:
             axis = ", {axis}" * bool(self.axes)
             vars(self)["label"] = self.name.replace("_", " ") + which + axis
 
-    @property
-    def prior(self) -> str:
-        """Key of the prior standard deviation in the problem file: "prior", an underscore and the
-        unit in lower case, such as "prior_m".
+    def prior_key(self) -> str:
+        """Return the key of the prior standard deviation in the problem file: "prior", an
+        underscore and the unit in lower case, such as "prior_m".
 
         It is "prior" for the unit "1", "prior_sigmas" for "σ" and "prior_1_m2" for "1/m²".
         """
@@ -927,19 +926,19 @@ class Nuisance:
         """
         for row in self.own:
             _check_custom_kind(row)
-            if [each.name for each in self.kinds].count(row.name) > 1:
+            if [each.name for each in self.list_kinds()].count(row.name) > 1:
                 raise InputError(
                     f"two nuisance parameters are named {row.name!r}; expected a name that no "
                     "other kind has, custom or built-in"
                 )
-        for row in self.kinds:
+        for row in self.list_kinds():
             value = self.sigma(row)
             if value is not None and not value > 0:
                 raise InputError(
                     f"the standard deviation of the nuisance parameter {row.name!r} is {value:g}; "
                     "expected a value above 0"
                 )
-        names = [row.name for row in self.kinds]
+        names = [row.name for row in self.list_kinds()]
         for name, word in self.scope.items():
             if name not in names:
                 raise InputError(
@@ -951,9 +950,8 @@ class Nuisance:
                     f"the scope of {name} is {word!r}; expected {SCOPE_TEXT}"
                 )
 
-    @property
-    def kinds(self) -> tuple[NuisanceRow, ...]:
-        """All kinds of nuisance parameters that may be estimated: `KINDS`, then custom ones."""
+    def list_kinds(self) -> tuple[NuisanceRow, ...]:
+        """Return all kinds of nuisance parameters that may be estimated: `KINDS`, then custom ones."""
         return (*KINDS, *self.own)
 
     def sigma(self, row: NuisanceRow) -> float | None:

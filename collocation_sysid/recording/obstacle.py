@@ -70,9 +70,8 @@ class ObstacleForces:
     sigma_n: float
     frame_poses: PoseSequence | None
 
-    @property
-    def world_forces_n(self) -> Array:
-        """Forces (S, 3) along the axes of the world [N], NaN where a component is missing."""
+    def rotate_to_world_n(self) -> Array:
+        """Return the forces (S, 3) along the axes of the world [N], NaN where a component is missing."""
         if self.frame_poses is None:
             return np.array(self.forces_n)
         rotations, _ = self.frame_poses.at(self.t_s)
@@ -183,9 +182,8 @@ class Obstacle(Grasp):
         """
         return _contact_surface(body, self)
 
-    @property
-    def measured_forces(self) -> ObstacleForces | None:
-        """Measured forces on the body; None without a sensor."""
+    def find_measured_forces(self) -> ObstacleForces | None:
+        """Return the measured forces on the body; None without a sensor."""
         if self.wrench is None:
             return None
         return ObstacleForces(

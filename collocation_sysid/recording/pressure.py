@@ -157,7 +157,7 @@ class Pressure(Actuator[EnclosedVolume]):
             self.faces, Indices
         ):
             return replace(self, body_measure=None)
-        corners = self.on_body(body).measure.faces[:, :3]
+        corners = self.on_body(body).require_measure().faces[:, :3]
         return replace(
             self,
             faces=split_faces_in_four(corners, body.mesh),
@@ -255,7 +255,7 @@ class Pressure(Actuator[EnclosedVolume]):
             If the rim moves otherwise, or the pressure is on no body yet.
         """
         placed = self.body_measure
-        volume = self.measure
+        volume = self.require_measure()
         if placed is None or not volume.rim.size:
             return self
         moving_rim = volume.rim[~is_prescribed[volume.rim].all(axis=(1, 2))]

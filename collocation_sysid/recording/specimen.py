@@ -165,7 +165,7 @@ class Specimen:
                 )
         for name in ("strain", "second_strain"):
             values = getattr(self, name)
-            if values is None or self.deformation.test == "simple-shear":
+            if values is None or self.find_deformation().test == "simple-shear":
                 continue
             if (lowest := values.min(initial=0.0)) <= -1.0:
                 raise InputError(
@@ -181,7 +181,7 @@ class Specimen:
         if there is a second stress or lateral stretch that the test does not have.
         """
         of = f"a {self.test} test"
-        if (self.second_strain is None) == bool(self.deformation.second):
+        if (self.second_strain is None) == bool(self.find_deformation().second):
             fault = (
                 f"{of} needs a second strain, along its second axis"
                 if self.second_strain is None
@@ -190,14 +190,17 @@ class Specimen:
             raise InputError(fault, None, where="second_strain")
         if (
             self.second_stress_pa is not None
-            and not self.deformation.second_stress
+            and not self.find_deformation().second_stress
         ):
             raise InputError(
                 f"{of} does not have a second stress; leave it out",
                 None,
                 where="second_stress_pa",
             )
-        if self.lateral_stretch is not None and not self.deformation.lateral:
+        if (
+            self.lateral_stretch is not None
+            and not self.find_deformation().lateral
+        ):
             raise InputError(
                 f"{of} has no direction in which the specimen is free to contract; leave the lateral "
                 "stretch out",
@@ -205,9 +208,8 @@ class Specimen:
                 where="lateral_stretch",
             )
 
-    @property
-    def deformation(self) -> HomogeneousDeformation:
-        """Kind of deformation of the test, with the components of F that it prescribes.
+    def find_deformation(self) -> HomogeneousDeformation:
+        """Return the kind of deformation of the test, with the components of F that it prescribes.
 
         With `length_m` and `area_m2` it has also the area over the length of the specimen, which
         the compliance of the test bench needs.
@@ -276,7 +278,7 @@ class Specimen:
             air_density_kg_m3="none",
             nuisance=nuisance,
             validation=validation,
-            specimen=self.deformation,
+            specimen=self.find_deformation(),
         )
 
     def _grasps(self) -> list[Grasp]:
@@ -284,7 +286,7 @@ class Specimen:
         the displacements of the test at `t_s`.
         """
         assert self.t_s is not None
-        moving = self.deformation.displaced_nodes()
+        moving = self.find_deformation().displaced_nodes()
         second = (
             np.zeros_like(self.strain)
             if self.second_strain is None
@@ -305,7 +307,7 @@ class Specimen:
                     quaternions_xyzw=no_rotation,
                     interpolation="linear",
                 )
-            axes = self.deformation.prescribed_axes(node)
+            axes = self.find_deformation().prescribed_axes(node)
             grasps.append(Grasp(np.array([node]), poses, axes=axes))
         return grasps
 
@@ -316,10 +318,10 @@ class Specimen:
         assert self.t_s is not None
         sensors = []
         for name, component, values in (
-            (STRESS_NAME, self.deformation.first_stress, self.stress_pa),
+            (STRESS_NAME, self.find_deformation().first_stress, self.stress_pa),
             (
                 SECOND_STRESS_NAME,
-                self.deformation.second_stress,
+                self.find_deformation().second_stress,
                 self.second_stress_pa,
             ),
         ):
@@ -328,7 +330,7 @@ class Specimen:
                     self._stress_sensor(name, component, values=values)
                 )
         if self.lateral_stretch is not None:
-            axis = AXES.index(self.deformation.lateral)
+            axis = AXES.index(self.find_deformation().lateral)
             point_m = np.zeros(3)
             point_m[axis] = CELL_SIZE_M
             sensors.append(
@@ -440,7 +442,7 @@ def cell_body(
     The cell has an additional node inside if the test prescribes all others. The damping law has no
     effect on equilibria.
     """
-    mesh = cell_mesh(with_inner_node=DEFORMATIONS[test].needs_inner_node)
+    mesh = cell_mesh(with_inner_node=not DEFORMATIONS[test].free)
     return Body(
         mesh,
         material,

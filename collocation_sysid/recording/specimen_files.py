@@ -85,9 +85,8 @@ class SpecimenLayout:
     area_m2: float | None = None
     requires_times: bool = False
 
-    @property
-    def quantities(self) -> tuple[Quantity, ...]:
-        """Quantities that the table of this kind of test may have.
+    def list_quantities(self) -> tuple[Quantity, ...]:
+        """Return the quantities that the table of this kind of test may have.
 
         All have strain, stress, displacement and force, and all but simple shear stretch;
         "volumetric" tests have volume ratio, stretch, strain, pressure and stress only. The second
@@ -110,22 +109,20 @@ class SpecimenLayout:
             quantities += [LATERAL_STRETCH, LATERAL_STRAIN]
         return tuple(quantities)
 
-    @property
-    def deformations(self) -> tuple[Quantity, ...]:
-        """Quantities of which the table must have exactly one, the first deformation."""
+    def list_deformations(self) -> tuple[Quantity, ...]:
+        """Return the quantities of which the table must have exactly one, the first deformation."""
         known = (STRETCH, STRAIN, DISPLACEMENT, VOLUME_RATIO)
-        return tuple(each for each in known if each in self.quantities)
+        return tuple(each for each in known if each in self.list_quantities())
 
     @property
     def loads(self) -> tuple[Quantity, ...]:
         """Quantities of which the table must have exactly one, the first load."""
         known = (STRESS, TRUE_STRESS, FORCE, PRESSURE)
-        return tuple(each for each in known if each in self.quantities)
+        return tuple(each for each in known if each in self.list_quantities())
 
-    @property
-    def second_deformations(self) -> tuple[Quantity, ...]:
-        """Quantities of which the table of a "biaxial" test must have exactly one; empty for other
-        tests.
+    def list_second_deformations(self) -> tuple[Quantity, ...]:
+        """Return the quantities of which the table of a "biaxial" test must have exactly one; empty
+        for other tests.
         """
         known = (SECOND_STRETCH, SECOND_STRAIN)
         return known if self.test == "biaxial" else ()
@@ -184,7 +181,7 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         )
     table = read_columns(
         path,
-        layout.quantities,
+        layout.list_quantities(),
         column_names=layout.columns,
         blank_allowed=True,
         requires_times=layout.requires_times,
@@ -239,17 +236,17 @@ def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
     groups = [
         _column_choices(grid, group, stated=layout.columns)
         for group in (
-            layout.deformations,
-            layout.second_deformations,
+            layout.list_deformations(),
+            layout.list_second_deformations(),
             layout.loads,
         )
         if group
     ]
-    required = {*layout.deformations, *layout.second_deformations}
+    required = {*layout.list_deformations(), *layout.list_second_deformations()}
     required |= {*layout.loads}
     other = {
         quantity.key: choices[0][quantity.key]
-        for quantity in (TIME, *layout.quantities)
+        for quantity in (TIME, *layout.list_quantities())
         if quantity not in required
         and len(choices := _column_choices(grid, (quantity,), layout.columns))
         == 1
@@ -359,7 +356,7 @@ def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
         `length_m`, or a size is not positive (not tested in simple shear).
     """
     quantity = _one_of(
-        table, layout.deformations, what="deformation", layout=layout
+        table, layout.list_deformations(), what="deformation", layout=layout
     )
     values = _complete(table, quantity)
     if quantity == STRETCH:
@@ -425,7 +422,7 @@ def _second_strain(
         return None
     quantity = _one_of(
         table,
-        layout.second_deformations,
+        layout.list_second_deformations(),
         what="deformation of the second axis",
         layout=layout,
     )

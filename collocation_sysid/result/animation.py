@@ -216,7 +216,9 @@ def experiment_named(
     InputError
         If there is no experiment of that name with a trajectory, or none with a trajectory at all.
     """
-    available = {replay.name: replay for replay in replays if replay.has_shapes}
+    available = {
+        replay.name: replay for replay in replays if replay.has_shapes()
+    }
     if not available:
         raise InputError(
             "no experiment of this run has a stored motion of a body with a mesh; expected a run "

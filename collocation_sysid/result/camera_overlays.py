@@ -267,7 +267,7 @@ def visible_points(
     elif isinstance(rollout, ForwardSimulation):
         surfaces = rollout.predicted.surfaces
     return {
-        name: surface_rows(surface, experiment.upward_direction)
+        name: surface_rows(surface, experiment.compute_upward_direction())
         for name, surface in surfaces.items()
     }
 
@@ -293,17 +293,22 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
             skin,
             phi=np.zeros(nuisance.size),
             shape_m=shape_m,
-            up=experiment.upward_direction,
+            up=experiment.compute_upward_direction(),
         )
-        points_m = depth.points_m[depth.first_sample_with_points]
+        points_m = depth.points_m[depth.find_first_sample_with_points()]
         rows = shown.point_rows(
-            depth.first_sample_with_points,
+            depth.find_first_sample_with_points(),
             points_m,
-            rays=view.rays[depth.first_sample_with_points],
+            rays=view.rays[depth.find_first_sample_with_points()],
             distances_m=np.full(len(points_m), np.nan),
         )
         by_camera[depth.name] = np.vstack(
-            [rows, shown.outline_rows(depth.first_sample_with_points, shape_m)]
+            [
+                rows,
+                shown.outline_rows(
+                    depth.find_first_sample_with_points(), shape_m
+                ),
+            ]
         )
     return by_camera
 

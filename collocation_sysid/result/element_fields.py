@@ -133,14 +133,16 @@ def field_kernel(element: Element, law: PointLaw) -> ElementKernel:
         Law with the energy density at a point, and its constants.
     """
     point = quadrature_point(element, law, "x")
-    fields = ca.vertcat(*_point_fields(law, point.local_constants))
+    fields = ca.vertcat(*_point_fields(law, point.scale_constants()))
     evaluated = ca.substitute(
-        fields, _DEFORMATION_GRADIENT, ca.vec(point.material_gradient)
+        fields, _DEFORMATION_GRADIENT, ca.vec(point.compute_material_gradient())
     )
     return kernel_from_outputs(
         "fields",
         point,
-        outputs={"fields": (Derivative(point.volume * evaluated, ()),)},
+        outputs={
+            "fields": (Derivative(point.compute_volume() * evaluated, ()),)
+        },
     )
 
 

@@ -212,7 +212,10 @@ class ParameterSliders:
         by_name = {each.name: each for each in run.problem.experiments}
         name = next(iter(by_name)) if experiment is None else experiment
         require_among(name, by_name)
-        names = [each.name for each in run.start_parameters.free_scalars]
+        names = [
+            each.name
+            for each in run.solution.collocation.parameters.free_scalars
+        ]
         if not names:
             raise InputError(
                 "no parameter was estimated; expected a run with one that is not fixed, because "
@@ -220,7 +223,9 @@ class ParameterSliders:
             )
         ranges = {}
         for each in names:
-            linear, bounds = run.start_parameters.scale_and_bounds(each)
+            linear, bounds = (
+                run.solution.collocation.parameters.scale_and_bounds(each)
+            )
             ranges[each] = SliderRange.from_estimate(
                 run.estimates[each], linear=linear, bounds=bounds
             )
@@ -234,20 +239,19 @@ class ParameterSliders:
             by_name[name],
             segment=segment,
             phi=phi,
-            parameters=run.start_parameters.with_guess(
+            parameters=run.solution.collocation.parameters.with_guess(
                 {
                     each.name: run.solution.parameters[each.name]
-                    for each in run.start_parameters.free
+                    for each in run.solution.collocation.parameters.free
                 }
             ),
             ranges=ranges,
             fitted_markers_m=markers_m.get(name),
         )
 
-    @property
-    def values(self) -> dict[str, float]:
-        """All parameters by name: those of the sliders, those tied to them, and the others at the
-        optimum.
+    def read_values(self) -> dict[str, float]:
+        """Return all parameters by name: those of the sliders, those tied to them, and the others
+        at the optimum.
         """
         chosen = {name: each.value for name, each in self.sliders.items()}
         return self._parameters.with_guess(chosen).guesses
@@ -277,7 +281,7 @@ class ParameterSliders:
                 self._experiment,
                 segment=self._segment,
                 phi=self._phi,
-                parameters=self.values,
+                parameters=self.read_values(),
             )
         except (InputError, SimulationError) as error:
             self.simulation = None

@@ -50,7 +50,7 @@ def probe_section(result: Result) -> TitledParts:
             else f"{short(p.size)} ± {short(p.size_error or 0.0)}",
             *(
                 _change_with_ratios(
-                    p.moves.get(name), result.values[name].value
+                    p.moves.get(name), result.collect_estimates()[name].value
                 )
                 for name in names
             ),
@@ -131,7 +131,11 @@ def _shown_estimates(result: Result) -> list[str]:
     They are those with a statistical interval: Young's modulus of the whole body first, then
     parameters; other derived moduli, also those of regions, are left out.
     """
-    known = [n for n, each in result.values.items() if each.statistical95]
+    known = [
+        n
+        for n, each in result.collect_estimates().items()
+        if each.statistical95
+    ]
     first = [name for name in known if name in STIFFNESS_NAMES[:1]]
     return [
         *first,
@@ -221,7 +225,7 @@ def _named_change(probe: Probe, result: Result, name: str) -> str:
     """Return the symbol of the estimate `name` and its change in a refit, as text such as
     "λ +1.20 %"; KeyError if the refit or the result does not have it.
     """
-    return f"{symbol_of(name)} {_change_text(probe.moves[name], result.values[name].value)}"
+    return f"{symbol_of(name)} {_change_text(probe.moves[name], result.collect_estimates()[name].value)}"
 
 
 def _most_important_assumption(result: Result) -> Iterator[str]:

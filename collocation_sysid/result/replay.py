@@ -241,7 +241,7 @@ class MotionRecord:
             np.asarray(experiment.is_prescribed(experiment.t_s).any(axis=2))[
                 :, : len(nodes_m)
             ],
-            experiment.upward_direction,
+            experiment.compute_upward_direction(),
             markers.names,
             declared_m if places_m is None else places_m,
             np.where(markers.located[:, None], declared_m, np.nan),
@@ -305,9 +305,8 @@ class MotionRecord:
             for k, columns in enumerate(of_sensors, start=1)
         ]
 
-    @property
     def has_shapes(self) -> bool:
-        """Whether at least one sample has finite positions of all nodes."""
+        """Return whether at least one sample has finite positions of all nodes."""
         shapes_m = self.shapes_m
         return shapes_m is not None and bool(
             np.isfinite(shapes_m).all(axis=(1, 2)).any()
@@ -594,7 +593,7 @@ def run_headline(result: Result) -> str:
     """
     moduli = {
         symbol_of(n): each
-        for n, each in result.values.items()
+        for n, each in result.collect_estimates().items()
         if without_region(n) == "young_pa"
     }
     sentences = []

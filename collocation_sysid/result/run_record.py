@@ -232,7 +232,7 @@ def write_all_frames(finished: SolvedProblem, place: Path) -> None:
         here.mkdir(exist_ok=True)
         body = segment.body
         residual = np.zeros((len(positions), segment.dof_count))
-        residual[:, segment.free_dofs] = part.residual_n
+        residual[:, segment.free_dofs] = part.compute_residual_n()
         write_frames(
             here,
             segment.dynamics.t_s,
@@ -263,7 +263,7 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
     for part, readings in zip(
         finished.solution.parts, finished.solution.readings_m, strict=True
     ):
-        x = part.x[part.segment.markers.sample_rows]
+        x = part.x[part.segment.markers.observable.rows]
         fitted[part.segment.experiment.name] = (
             x.reshape(len(x), -1, 3),
             readings,
@@ -343,7 +343,7 @@ def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
             estimates[part.field_name] = np.full((len(body.cells), 4), np.nan)
             estimates[part.field_name][part.cells] = finished.fields[
                 part.field_name
-            ].by_element
+            ].stack_by_element()
     return estimates
 
 

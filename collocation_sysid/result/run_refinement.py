@@ -164,12 +164,15 @@ def with_refinement(
     )
     budget = {
         name: _updated_shares(
-            shares, before.values[name], after=after.values[name]
+            shares,
+            before.collect_estimates()[name],
+            after=after.collect_estimates()[name],
         )
         for name, shares in before.budget.items()
     }
     uncertainties = {
-        name: each.combined_std_error for name, each in after.values.items()
+        name: each.combined_std_error
+        for name, each in after.collect_estimates().items()
     }
     others = [
         each
@@ -179,7 +182,9 @@ def with_refinement(
     concerns = (
         *others,
         *numerical_concerns(optimum, uncertainties, refinement=refinement),
-        *combined_concerns(parameters, after.values, shares=budget),
+        *combined_concerns(
+            parameters, after.collect_estimates(), shares=budget
+        ),
     )
     return replace(
         after, budget=budget, trust=Assessment.from_concerns(concerns)
@@ -200,8 +205,10 @@ def _estimates_at_optimum(
         Parameters of the problem, which state what is estimated as a value instead of a logarithm.
     """
     return {
-        name: each.at_optimum(name, linear=name in parameters.linear_names)
-        for name, each in result.values.items()
+        name: each.at_optimum(
+            name, linear=name in parameters.list_linear_names()
+        )
+        for name, each in result.collect_estimates().items()
     }
 
 

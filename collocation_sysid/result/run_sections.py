@@ -238,7 +238,7 @@ def _parameter_section(result: Result) -> TitledParts:
     The remarks are on fields, on what the intervals contain, on corrections, on estimates that are
     not determined, and on the largest contributions; each is left out if it does not apply.
     """
-    values = result.values
+    values = result.collect_estimates()
     rows = tuple(
         (symbol_with_unit(name), *_estimate_row(result, name))
         for name in values
@@ -255,11 +255,11 @@ def _parameter_section(result: Result) -> TitledParts:
         parts.append(
             "there are no combined intervals, because systematic effects were not evaluated"
         )
-    if "mesh" in result.discretisation_kinds:
+    if "mesh" in result.list_discretisation_kinds():
         parts.append(refinement_table(result))
     elif corrected := [
         f"{symbol_of(name)} {100 * (error.extrapolated / optimum - 1):+.2g} %"
-        for name, error in result.numerical_errors.items()
+        for name, error in result.collect_numerical_errors().items()
         if (optimum := values[name].optimum)
         and values[name].statistical95 is not None
     ]:
@@ -295,9 +295,9 @@ def _undetermined_sentence(result: Result) -> list[str]:
     }
     sources = []
     for name, shares in result.budget.items():
-        if name in stated or name not in result.values:
+        if name in stated or name not in result.collect_estimates():
             continue
-        if not result.values[name].is_determined:
+        if not result.collect_estimates()[name].is_determined:
             source, share = next(iter(shares.items()))
             sources.append(
                 f"{symbol_of(name)} (largest contribution: {source_label(source)}, {share:.0%})"
@@ -319,12 +319,12 @@ def _coverage_sentence(result: Result) -> str:
     covered = [
         f"the {kind} error"
         for kind in kinds
-        if kind in result.discretisation_kinds
+        if kind in result.list_discretisation_kinds()
     ]
     missing = [
         f"the {kind} error"
         for kind in kinds
-        if kind not in result.discretisation_kinds
+        if kind not in result.list_discretisation_kinds()
     ]
     parts = listed(["noise", *covered, "systematic effects"])
     sentence = f"± (standard uncertainty) and intervals combine {parts}"
@@ -343,7 +343,7 @@ def _largest_contributions(result: Result) -> list[str]:
     """
     ratios = {
         name: each.combined_std_error / each.statistical_std_error
-        for name, each in result.values.items()
+        for name, each in result.collect_estimates().items()
         if each.combined_std_error
         and each.statistical_std_error
         and name in result.budget
@@ -410,7 +410,7 @@ def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
     name : str
         Name of one of its estimates; KeyError for another one.
     """
-    each = result.values[name]
+    each = result.collect_estimates()[name]
     interval = _interval_text(each.combined95)
     remark = each.reason or ""
     if each.at_bound:
@@ -429,7 +429,7 @@ def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
         _deviation_text(each.combined_std_error),
         interval,
         _deviation_text(each.statistical_std_error),
-        _deviation_text(each.systematic_std_error),
+        _deviation_text(each.compute_systematic_std_error()),
         guess,
         remark,
     )
@@ -448,13 +448,13 @@ def refinement_table(result: Result) -> Table | Line:
     Unknown numbers are empty. If no estimate has such an error, a sentence is returned that no
     estimate changed; the result must therefore be that of a refinement.
     """
-    if not result.numerical_errors:
+    if not result.collect_numerical_errors():
         return Line(
             "No estimate changes with the step or the mesh: every parameter is fixed or at a bound."
         )
     rows = []
-    for name, error in result.numerical_errors.items():
-        each = result.values[name]
+    for name, error in result.collect_numerical_errors().items():
+        each = result.collect_estimates()[name]
         rows.append(
             (
                 symbol_with_unit(name),
@@ -631,7 +631,7 @@ def _cards(result: Result) -> Cards:
     """Return the three main numbers: the most important stiffness (or else the first estimate), the
     misfit of the markers, and that of the forward simulation. The result must have an estimate.
     """
-    values = result.values
+    values = result.collect_estimates()
     fit = result.fit
     simulated = result.rollout
     name = next(

@@ -383,7 +383,7 @@ def _wrench_layouts(
 
 def _require_guesses(problem: Problem) -> None:
     """Raise an `InputError`, naming the parameter and the remedy, if a parameter has no guess."""
-    if names := problem.parameters.names_without_guess:
+    if names := problem.parameters.list_names_without_guess():
         key = f"parameters.{names[0]}"
         raise InputError(
             "this parameter has no guess, and a simulation needs a value; expected --set "

@@ -65,18 +65,16 @@ class CoarseStart:
     problem: Problem
     relations: Mapping[str, CoarseBody]
 
-    @property
-    def size(self) -> str:
-        """Numbers of nodes of the coarse and the given bodies, in words."""
+    def describe_size(self) -> str:
+        """Return the numbers of nodes of the coarse and the given bodies, in words."""
         distinct = {id(r.coarse): r for r in self.relations.values()}.values()
         coarse = sum(len(each.coarse.nodes.points_m) for each in distinct)
         given = sum(len(each.body.nodes.points_m) for each in distinct)
         return f"{coarse:,} of {given:,} nodes"
 
-    @property
-    def edge_ratio(self) -> float:
-        """Mean edge length of the coarse mesh over that of the given one, the smallest of all
-        coarsened bodies; mostly above 1.
+    def compute_edge_ratio(self) -> float:
+        """Return the mean edge length of the coarse mesh over that of the given one, the smallest
+        of all coarsened bodies; mostly above 1.
         """
         return min(
             each.coarse.mesh.quality().edge_mean_m
@@ -127,7 +125,7 @@ class CoarseStart:
             Solution on the coarse meshes.
         """
         p, _ = WarmStart.of(solution).apply_to_nuisance(collocation)
-        p = np.clip(p, *collocation.parameter_bounds)
+        p = np.clip(p, *collocation.compute_parameter_bounds())
         _, coarse_positions = solution.collocation.unpack(solution.z)
         return collocation.pack(p, self.interpolated(coarse_positions))
 
@@ -187,7 +185,7 @@ def plan_coarse_start(
     }
     if not large:
         return None
-    if problem.two_phase_fields:
+    if problem.find_two_phase_fields():
         raise NoCoarseStartError(
             "the phases of a two-phase field belong to the elements of the given mesh"
         )
@@ -278,7 +276,7 @@ def interrupted_solution(
         evaluations=0,
     )
     note = (
-        f"interrupted during the coarse start ({start.size}): the motion is interpolated and does "
+        f"interrupted during the coarse start ({start.describe_size()}): the motion is interpolated and does "
         "not satisfy the equations of motion of the given mesh"
     )
     return replace(
@@ -301,7 +299,7 @@ def undetermined_names(solution: Solution) -> tuple[str, ...]:
     """
     collocation = solution.collocation
     q = solution.q
-    lower, upper = collocation.parameters.bounds_q
+    lower, upper = collocation.parameters.compute_bounds_q()
     is_excluded = (q - lower < BOUND_DISTANCE) | (upper - q < BOUND_DISTANCE)
     p, positions = collocation.unpack(solution.z)
     rows = [segment.grid_times for segment in collocation.transcriptions]
@@ -333,7 +331,7 @@ def start_note(start: CoarseStart, coarse: Solution, given: Solution) -> str:
     time [s] of the solutions on the coarse and on the given mesh.
     """
     return (
-        f"coarse start: solved on {start.size} first, with {coarse.iterations} sweeps in "
+        f"coarse start: solved on {start.describe_size()} first, with {coarse.iterations} sweeps in "
         f"{coarse.timing.total:.2g} s, then on the given mesh with {given.iterations} sweeps in "
         f"{given.timing.total:.2g} s"
     )
@@ -359,8 +357,8 @@ def mesh_error_note(
     """
     before = parameter_values(coarse.collocation, coarse.q)
     after = parameter_values(given.collocation, given.q)
-    share = 1.0 / (start.edge_ratio**MESH_ORDER - 1.0)
-    linear = given.collocation.parameters.linear_names
+    share = 1.0 / (start.compute_edge_ratio() ** MESH_ORDER - 1.0)
+    linear = given.collocation.parameters.list_linear_names()
     errors = []
     for item in given.collocation.parameters.free_scalars:
         name = item.name

@@ -364,8 +364,8 @@ def step_error(
                 part, rollout.trajectory, rollout.predicted, share
             )
     change = change_in_observations(fit, differences)[: collocation.nq]
-    q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
-    linear = problem.parameters.linear_names
+    q = np.clip(solution.q + change, *collocation.parameters.compute_bounds_q())
+    linear = problem.parameters.list_linear_names()
     order = as_scheme(problem.scheme).order
     return Refinement(
         discretisation_errors(

@@ -35,7 +35,7 @@ def finer_step(problem: Problem) -> Problem:
     """Return a copy of the problem with half the time step, that is twice the substeps of its first
     solve.
     """
-    return replace(problem, substeps=2 * problem.first_substeps)
+    return replace(problem, substeps=2 * problem.choose_first_substeps())
 
 
 def finer_mesh(problem: Problem) -> Problem:
@@ -220,7 +220,7 @@ def _errors_from_levels(
         by_step,
         by_mesh=by_mesh,
         step_order=order,
-        linear=problem.parameters.linear_names,
+        linear=problem.parameters.list_linear_names(),
     )
     return Refinement(errors, tuple(levels))
 

@@ -300,9 +300,8 @@ class SimulatedSamples:
     p: Array
     residuals: Array
 
-    @property
-    def least_chi_squared(self) -> float:
-        """The least χ² of the samples; infinite without samples."""
+    def find_least_chi_squared(self) -> float:
+        """Return the least χ² of the samples; infinite without samples."""
         return float(min((self.residuals**2).sum(axis=1), default=np.inf))
 
     def errors(self, exponent: float) -> Array:
@@ -424,25 +423,25 @@ class PhasePosterior:
         noise = rng.normal(size=self.mean_changes.shape) @ root.T
         return self.mean_changes + noise
 
-    @property
-    def mean_logarithms(self) -> Array:
-        """Logarithms (E,) of the constant at the mean of its power y, relative to its mean."""
+    def compute_mean_logarithms(self) -> Array:
+        """Return the logarithms (E,) of the constant at the mean of its power y, relative to its
+        mean.
+        """
         powers = self.surrogate.to_power(self.contrasts)
         return self.surrogate.to_logarithm(
             powers @ self.phases / len(self.phases)
         )
 
-    @property
-    def last_phases(self) -> Array:
-        """Last phases (C, E) of the chains."""
+    def select_last_phases(self) -> Array:
+        """Return the last phases (C, E) of the chains."""
         return self.draws.phases[-1].astype(float)
 
     def simulate(self) -> SimulatedSamples:
         """Simulate the last sample of each chain."""
-        count = len(self.last_phases)
+        count = len(self.select_last_phases())
         contrasts = self.contrasts[-count:]
         return self.surrogate.simulate_errors(
-            contrasts[:, None] * self.last_phases,
+            contrasts[:, None] * self.select_last_phases(),
             changes=self.mean_changes[-count:],
         )
 

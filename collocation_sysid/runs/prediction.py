@@ -98,7 +98,7 @@ def nuisance_of_fitted_recordings(
         Solution of the fitted recordings.
     """
     nuisance = segment.nuisance
-    places = segment.markers.coordinate_parameters
+    places = segment.markers.observable.coordinate_parameters
     known: dict[str, list[float]] = {}
     for part in solution.parts:
         for entry, _, value in part.segment.nuisance.iterate_values(part.phi):

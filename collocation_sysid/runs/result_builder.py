@@ -71,7 +71,7 @@ def build_result(answer: SolvedProblem) -> Result:
         title=problem.title,
         parameters={
             item.name: values[item.name]
-            for item in answer.start_parameters.components
+            for item in answer.solution.collocation.parameters.components
         },
         derived={name: values[name] for name in answer.derived},
         basis=tuple(_reference_sentences(problem)),
@@ -207,7 +207,7 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
     is_determined = estimate.is_informed
     if not np.isfinite(estimate.deviation).all():
         return FieldResult(
-            modes.resolution,
+            modes.describe_resolution(),
             ends,
             determined_share=None,
             identified=None,
@@ -220,10 +220,10 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
         for each in modes.field.lengths_m
     }
     return FieldResult(
-        modes.resolution,
+        modes.describe_resolution(),
         ends,
         determined_share=share,
-        identified=estimate.identified_modes,
+        identified=estimate.count_identified_modes(),
         likelier=likelier,
         phases=estimate.phases,
     )
@@ -255,9 +255,9 @@ def _recordings_agreement(
         agreements[item.name] = RecordingsAgreement(
             dict(zip(scatter.recordings, values, strict=True)),
             dict(zip(scatter.recordings, deviations, strict=True)),
-            chi_squared=float(scatter.chi_squared[k]),
-            degrees_of_freedom=int(scatter.degrees_of_freedom[k]),
-            disagree=bool(scatter.is_disagreeing[k]),
+            chi_squared=float(scatter.compute_chi_squared()[k]),
+            degrees_of_freedom=int(scatter.count_degrees_of_freedom()[k]),
+            disagree=bool(scatter.find_disagreements()[k]),
         )
     return agreements
 
@@ -274,8 +274,8 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
         markers = experiment.markers
         experiments[name] = FittedExperiment(
             solution.rms_by_experiment_m[name],
-            markers.sample_count,
-            int(markers.missing_counts.sum()),
+            markers.count_samples(),
+            int(markers.count_missing().sum()),
             experiment.is_static,
             (
                 *_place_sentences(answer.places[name]),
@@ -288,14 +288,14 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
             test=experiment.specimen and experiment.specimen.test,
         )
     parts = {
-        experiment.name: experiment.symmetry
+        experiment.name: experiment.find_symmetry()
         for experiment in answer.problem.experiments
-        if experiment.symmetry > 1
+        if experiment.find_symmetry() > 1
     }
     symmetry = parts or None
     return FitResult(
         solution.rms_m,
-        answer.noise_rms_m,
+        answer.compute_noise_rms_m(),
         experiments,
         **merged_fields(
             feature.pooled_fields(solution) for feature in FEATURES
@@ -322,7 +322,7 @@ def _forward_results(answer: SolvedProblem) -> ForwardResult:
             and compared.max_m is not None
         ):
             squares.append(
-                experiment.markers.sample_count
+                experiment.markers.count_samples()
                 * np.array([compared.rms_m**2, 1.0])
             )
             largest.append(compared.max_m)
@@ -439,7 +439,7 @@ def _nuisance_sentences(
     """
     nuisance = part.segment.nuisance
     values = part.phi * nuisance.scales
-    for row in (*part.segment.experiment.nuisance.kinds, GAUGE):
+    for row in (*part.segment.experiment.nuisance.list_kinds(), GAUGE):
         here = nuisance.indices_of_rows(row).tolist()
         if row == PLACE or not here:
             continue
@@ -499,9 +499,9 @@ def _nuisance_sentence(
         limit[k]
         for limit in nuisance.bounds(part.segment.association.clock_samples)
     )
-    factor, unit = in_readable_unit(1.0, entry.unit)
+    factor, unit = in_readable_unit(1.0, entry.unit_in_label())
     if entry.row == TARE:  # of the sensor, on which the whole specimen acts
-        factor *= part.segment.experiment.symmetry
+        factor *= part.segment.experiment.find_symmetry()
     size = float(np.linalg.norm(values))
     error = entry.sigma * known.get(name, np.nan)
     allowed = low + 1e-3 < part.phi[k] < high - 1e-3

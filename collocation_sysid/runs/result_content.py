@@ -91,7 +91,7 @@ class ReportedEstimate(Estimate):
             or self.optimum == self.value
         ):
             optimum = self.value if self.optimum is None else self.optimum
-            return replace(self._statistical, value=optimum)
+            return replace(self._to_statistical(), value=optimum)
         at = IntervalCoordinate.for_estimate(
             name, (self.value, self.optimum, *self.statistical95), linear=linear
         )
@@ -111,9 +111,8 @@ class ReportedEstimate(Estimate):
             reason=self.reason,
         )
 
-    @property
-    def _statistical(self) -> Estimate:
-        """The estimate with its statistical uncertainty alone."""
+    def _to_statistical(self) -> Estimate:
+        """Return the estimate with its statistical uncertainty alone."""
         return Estimate(
             self.value,
             self.statistical_std_error,
@@ -130,10 +129,9 @@ class ReportedEstimate(Estimate):
         low, high = self.combined95
         return high - low <= abs(self.value)
 
-    @property
-    def systematic_std_error(self) -> float | None:
-        """Part of the combined standard uncertainty that is not statistical, √(combined² −
-        statistical²), at least 0; None if one of the two is unknown.
+    def compute_systematic_std_error(self) -> float | None:
+        """Return the part of the combined standard uncertainty that is not statistical, √(combined²
+        − statistical²), at least 0; None if one of the two is unknown.
         """
         if (
             self.combined_std_error is None
@@ -541,9 +539,8 @@ class Result:
         ):
             return read(cls, content)
 
-    @property
-    def values(self) -> dict[str, ReportedEstimate]:
-        """Scalar parameters, then derived moduli, by name."""
+    def collect_estimates(self) -> dict[str, ReportedEstimate]:
+        """Return the scalar parameters, then derived moduli, by name."""
         coefficients = {
             coefficient
             for name, field in self.fields.items()
@@ -556,16 +553,17 @@ class Result:
             if name not in coefficients
         }
 
-    @property
-    def discretisation_kinds(self) -> tuple[str, ...]:
-        """Kinds of discretisation error that the combined intervals contain: "step", "mesh"."""
-        return known_kinds(self.numerical_errors.values())
+    def list_discretisation_kinds(self) -> tuple[str, ...]:
+        """Return the kinds of discretisation error that the combined intervals contain: "step",
+        "mesh".
+        """
+        return known_kinds(self.collect_numerical_errors().values())
 
-    @property
-    def numerical_errors(self) -> dict[str, DiscretisationError]:
-        """Known discretisation errors, by name of the estimate."""
+    def collect_numerical_errors(self) -> dict[str, DiscretisationError]:
+        """Return the known discretisation errors, by name of the estimate."""
         errors = (
-            (name, each.numerical_error) for name, each in self.values.items()
+            (name, each.numerical_error)
+            for name, each in self.collect_estimates().items()
         )
         return {name: error for name, error in errors if error is not None}
 

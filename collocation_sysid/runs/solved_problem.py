@@ -13,7 +13,6 @@ import numpy as np
 from ..errors import InputError, hint_at
 from ..fem.laws.constants import unit_of
 from ..methods.solution import Solution
-from ..model.parameters import Parameters
 from ..problem import Problem
 from ..statistics.assessment import (
     Assessment,
@@ -126,11 +125,6 @@ class SolvedProblem:
             for name in self.solution.parameters
         }
 
-    @property
-    def start_parameters(self) -> Parameters:
-        """Parameters with the guesses from which the search that led to the solution started."""
-        return self.solution.collocation.parameters
-
     @cached_property
     def derived(self) -> dict[str, float]:
         """Moduli that follow from the parameters at the optimum, by name, in SI units."""
@@ -172,14 +166,16 @@ class SolvedProblem:
         item = next(
             (
                 each
-                for each in self.start_parameters.components
+                for each in self.solution.collocation.parameters.components
                 if each.name == name
             ),
             None,
         )
         line = self.budget.get(name)
-        error = self.discretisation_errors.get(name)
-        linear, bounds = self.start_parameters.scale_and_bounds(name)
+        error = self.collect_discretisation_errors().get(name)
+        linear, bounds = self.solution.collocation.parameters.scale_and_bounds(
+            name
+        )
         systematic = None if line is None else line.systematic
         known_effect = 0.0 if line is None else line.known_effect
         combined = combine(
@@ -216,13 +212,16 @@ class SolvedProblem:
         return budget(
             self.systematic_effects,
             self.uncertainty,
-            numerical=self.discretisation_errors,
-            parameters=self.start_parameters,
+            numerical=self.collect_discretisation_errors(),
+            parameters=self.solution.collocation.parameters,
         )
 
-    @property
-    def discretisation_errors(self) -> Mapping[str, DiscretisationError]:
-        """Known discretisation errors, by name of the estimate; empty without `refinement`."""
+    def collect_discretisation_errors(
+        self,
+    ) -> Mapping[str, DiscretisationError]:
+        """Return the known discretisation errors, by name of the estimate; empty without
+        `refinement`.
+        """
         return {} if self.refinement is None else self.refinement.errors
 
     @cached_property
@@ -234,7 +233,9 @@ class SolvedProblem:
         """
         bars = self.uncertainty
         known = {} if bars is None else {**bars.estimates, **bars.derived}
-        values = self.start_parameters.scalar_values(self.solution.q)
+        values = self.solution.collocation.parameters.scalar_values(
+            self.solution.q
+        )
         return {
             name: known.get(name, Estimate(value))
             for name, value in (values | self.derived).items()
@@ -278,17 +279,17 @@ class SolvedProblem:
         )
         shares = {name: line.shares for name, line in self.budget.items()}
         vague = combined_concerns(
-            self.start_parameters, self.estimates, shares=shares
+            self.solution.collocation.parameters, self.estimates, shares=shares
         )
         of_fields = [
             concern
             for field in self.fields.values()
-            for concern in field.concerns
+            for concern in field.list_concerns()
         ]
         if not self.omitted_checks:
             probed = probe_concerns(
                 self.probes,
-                self._discretisation_corrections,
+                self._compute_discretisation_corrections(),
                 [
                     each.experiment
                     for each in self.solution.collocation.transcriptions
@@ -317,14 +318,13 @@ class SolvedProblem:
             (interrupted, *(of_fit if self.uncertainty is not None else ()))
         )
 
-    @property
-    def _discretisation_corrections(self) -> dict[str, float]:
-        """Ratio of the reported value to the optimum of each estimated scalar parameter, by name; 1
-        if the optimum is zero.
+    def _compute_discretisation_corrections(self) -> dict[str, float]:
+        """Return the ratio of the reported value to the optimum of each estimated scalar parameter,
+        by name; 1 if the optimum is zero.
         """
         return {
             item.name: each.value / each.optimum if each.optimum else 1.0
-            for item in self.start_parameters.free_scalars
+            for item in self.solution.collocation.parameters.free_scalars
             if (each := self.estimates[item.name])
         }
 
@@ -356,10 +356,9 @@ class SolvedProblem:
         )
         return {field.name: field for each in known for field in each}
 
-    @property
-    def noise_rms_m(self) -> float:
-        """RMS distance [m] of the fitted markers that is expected from noise with the stated
-        `sigma_m`, less what the fitted parameters absorb; 0 without markers.
+    def compute_noise_rms_m(self) -> float:
+        """Return the RMS distance [m] of the fitted markers that is expected from noise with the
+        stated `sigma_m`, less what the fitted parameters absorb; 0 without markers.
         """
         return expected_rms_m(self.solution, self.uncertainty)
 

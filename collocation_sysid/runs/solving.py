@@ -126,11 +126,12 @@ def solve(
             _solve_once, solver=solver, watch=watch, workers=workers
         )
         if any(
-            not modes.has_phases for modes in problem.two_phase_fields.values()
+            not modes.has_phases()
+            for modes in problem.find_two_phase_fields().values()
         ):
             return solve_two_phases(problem, start, solve_once=solve_once)
         solution = solve_once(problem, start)
-        tried = [problem.lengths_m]
+        tried = [problem.collect_lengths_m()]
         lengths_m = _likeliest_lengths(problem, solution)
         while lengths_m is not None and lengths_m not in tried:
             tried.append(lengths_m)
@@ -197,7 +198,7 @@ def _solve_by_coarse_start(
         return interrupted_solution(coarse_start, problem, coarse)
     if not coarse.status.converged:
         raise NoCoarseStartError(
-            f"the solve on {coarse_start.size} ended with: {coarse.message}"
+            f"the solve on {coarse_start.describe_size()} ended with: {coarse.message}"
         )
     undetermined = undetermined_names(coarse)
     require_determined_moduli(undetermined)
@@ -229,7 +230,7 @@ def _solve_on_coarse_mesh(
         If no start is found on the coarser mesh, or the method refuses the problem there.
     """
     tolerance = max(solver.tolerance, COARSE_TOLERANCE)
-    with search_activity(f"coarse start on {coarse_start.size}"):
+    with search_activity(f"coarse start on {coarse_start.describe_size()}"):
         try:
             return _solve_once(
                 coarse_start.problem,
@@ -294,7 +295,7 @@ def _solve_from_coarse(
     )
     if solution.status in FAILED_STATUSES:
         raise NoCoarseStartError(
-            f"the search from the solution on {coarse_start.size} ended with: "
+            f"the search from the solution on {coarse_start.describe_size()} ended with: "
             f"{solution.message}"
         )
     notes = [
@@ -528,7 +529,7 @@ def _program_and_start(
             feature.require_valid(experiment)
     if warm_start is not None and problem.substeps == "auto":
         collocation = replace(collocation, substeps=warm_start.substeps)
-    has_guesses = not collocation.parameters.names_without_guess
+    has_guesses = not collocation.parameters.list_names_without_guess()
     if has_guesses:
         require_memory(problem, collocation, method=solver)
     collocation, scan = start_problem(

@@ -126,9 +126,9 @@ def _smooth_fit(fit: LinearisedFit) -> _SmoothFitQuality:
     it determines, from `fit`, linearised at its solution.
     """
     return _SmoothFitQuality(
-        fit.chi_squared,
+        fit.compute_chi_squared(),
         _chi_squared_per_measurement(fit),
-        determined=factorise_information(fit).determined_count,
+        determined=factorise_information(fit).count_determined(),
     )
 
 
@@ -163,7 +163,8 @@ def solve_two_phases(
     """
     search = _two_phase_search(problem)
     solution = solve_once(
-        problem.with_fields({search.name: search.modes.smooth_field}), start
+        problem.with_fields({search.name: search.modes.to_smooth_field()}),
+        start,
     )
     if not solution.status.converged:
         return solution
@@ -172,7 +173,7 @@ def solve_two_phases(
         problem, search, solution=solution, smooth=smooth
     )
     phase = _representative_phases(
-        sampled.posterior.draws.probability, search.modes.volumes_m3
+        sampled.posterior.draws.compute_probability(), search.modes.volumes_m3
     )
     best = solve_once(
         problem.with_fields({search.name: replace(search.modes, phase=phase)}),
@@ -255,14 +256,16 @@ def _sample_posterior(
             surrogate, phases, settings=USUAL, seed=2 * rounds
         )
         simulated = draft.simulate()
-        least_chi_squared = min(least_chi_squared, simulated.least_chi_squared)
+        least_chi_squared = min(
+            least_chi_squared, simulated.find_least_chi_squared()
+        )
         posterior = PhasePosterior.sample(
             simulated.corrected_surrogate(),
-            draft.last_phases,
+            draft.select_last_phases(),
             settings=USUAL,
             seed=2 * rounds + 1,
         )
-        phases = posterior.last_phases
+        phases = posterior.select_last_phases()
         mean = posterior.contrasts.mean()
         change = abs(mean - last_mean) / max(
             posterior.contrasts.std(), GIVEN_DEVIATION
@@ -296,7 +299,9 @@ def _two_phase_body(solution: Solution, search: _PhaseSearch) -> Body:
     """Return the body, among those of a solution, that has the two-phase field of `search`."""
     segments = solution.collocation.transcriptions
     return next(
-        s.body for s in segments if search.name in s.body.field_lengths_m
+        s.body
+        for s in segments
+        if search.name in s.body.collect_field_lengths_m()
     )
 
 
@@ -308,7 +313,7 @@ def _two_phase_search(problem: Problem) -> _PhaseSearch:
     InputError
         For several fields, or too many elements.
     """
-    fields = problem.two_phase_fields
+    fields = problem.find_two_phase_fields()
     if len(fields) > 1:
         raise InputError(
             f"{len(fields)} two-phase fields ({', '.join(fields)}); expected one: give the others "
@@ -321,7 +326,9 @@ def _two_phase_search(problem: Problem) -> _PhaseSearch:
             f"{MOST_ELEMENTS}: use a coarser mesh, or a region around the inclusion"
         )
     parts = next(
-        body.parts for body in problem.bodies if name in body.field_lengths_m
+        body.parts
+        for body in problem.bodies
+        if name in body.collect_field_lengths_m()
     )
     number = next(k for k, part in enumerate(parts) if part.field_name == name)
     part = parts[number]
@@ -419,7 +426,7 @@ def _linearise_at_mean(
         If the body cannot be simulated there.
     """
     before = posterior.surrogate
-    base = posterior.mean_logarithms
+    base = posterior.compute_mean_logarithms()
     p = before.p.copy()
     p[before.other_columns] += posterior.mean_changes.mean(axis=0)
     return ElementSurrogate.linearise(
@@ -528,7 +535,7 @@ def _samples(
         deviations=departures.T @ departures / len(departures),
         misfit=_chi_squared_per_measurement(fit),
         smooth_misfit=np.nan,
-        scale_reduction=posterior.draws.scale_reduction,
+        scale_reduction=posterior.draws.compute_scale_reduction(),
         is_simulated=sampled.simulated >= FEWEST_SIMULATED,
     )
 
@@ -542,7 +549,7 @@ def _contrast_of_solution(solution: Solution, search: _PhaseSearch) -> float:
 
 def _chi_squared_per_measurement(fit: LinearisedFit) -> float:
     """Return χ² per measurement of a linearised fit."""
-    return fit.chi_squared / max(1, fit.measurement_count)
+    return fit.compute_chi_squared() / max(1, fit.count_measurements())
 
 
 def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:

@@ -232,7 +232,7 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
     for experiment in (
         segment.experiment for segment in solution.collocation.transcriptions
     ):
-        if not experiment.is_static or not experiment.markers.sample_count:
+        if not experiment.is_static or not experiment.markers.count_samples():
             continue
         sigma_m = float(np.max(experiment.markers.sigma_m))
         share = sigma_m / float(np.ptp(experiment.body.nodes_m, axis=0).max())
@@ -329,7 +329,7 @@ def expected_rms_m(
         [each.is_present.sum(axis=0) for each in markers]
     ).astype(float)
     sigma_m = np.concatenate([each.sigma_m for each in markers])
-    measured = solution.collocation.measurement_count
+    measured = solution.collocation.count_measurements()
     fitted = (
         0.0
         if uncertainty is None

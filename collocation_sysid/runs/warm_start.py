@@ -170,7 +170,7 @@ class WarmStart:
         """
         places_m = []
         for segment in collocation.transcriptions:
-            here = segment.marker_places_m(segment.guess_phi)
+            here = segment.marker_places_m(segment.compute_guess_phi())
             for m, place in self._known_places(segment).items():
                 here[m] = place
             places_m.append(here)
@@ -225,6 +225,6 @@ class WarmStart:
         )
         if not matches:
             return None
-        p = np.clip(p, *collocation.parameter_bounds)
+        p = np.clip(p, *collocation.compute_parameter_bounds())
         positions, failure = simulate_trajectories(collocation, p)
         return None if failure is not None else collocation.pack(p, positions)

@@ -200,7 +200,7 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     )
     sigma_key = level.sigma_key
     return [
-        *(outlier.concern for outlier in uncertainty.outliers),
+        *(outlier.to_concern() for outlier in uncertainty.outliers),
         *concern_if(
             is_used and persistent,
             factor > GROSS_MISFIT,
@@ -235,7 +235,7 @@ def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
     disagreeing = (
         []
         if scatter is None
-        else np.flatnonzero(scatter.is_disagreeing).tolist()
+        else np.flatnonzero(scatter.find_disagreements()).tolist()
     )
     names = [
         display_name(name, is_scalar=name in uncertainty.estimates)
@@ -659,7 +659,10 @@ def rotation_step_concerns(
         Code of the concern, whose grade is "check".
     """
     turn = fastest_rotation(experiment, substeps)
-    sizes = {"step_ms": 1e3 * turn.step_s, "rate_rad_s": turn.rate_rad_s}
+    sizes = {
+        "step_ms": 1e3 * turn.step_s,
+        "rate_rad_s": turn.angle_rad / turn.step_s,
+    }
     return concern_if(
         turn.angle_rad > limit_rad, False, code=code, **vars(turn), **sizes
     )

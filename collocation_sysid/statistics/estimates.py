@@ -557,7 +557,7 @@ def noise_notes(
         Empty, or one note. Empty if the noise was requested as "estimated", if tests find that the
         residuals agree with σ, or if they differ from it by less than a factor of `NOTEWORTHY`.
     """
-    if requested == "estimated" or level.suggested_noise == "given":
+    if requested == "estimated" or level.suggest_noise() == "given":
         return []
     factor = float(np.sqrt(level.pooled))
     sigma_key = level.sigma_key
@@ -566,7 +566,7 @@ def noise_notes(
         for pick in (min, max)
     )
     if (
-        level.is_unequal
+        level.is_unequal()
         and level.factors[high] > NOTEWORTHY**2 * level.factors[low]
     ):
         least = f"{level.factors[low]:.2g} ({low})"
@@ -612,14 +612,14 @@ def correlation_notes(
     dependence : Dependence
         Tests of the residuals.
     """
-    if not dependence.is_correlated or (
+    if not dependence.is_correlated() or (
         errors != "autocorrelated" and requested != "independent"
     ):
         return []
     pattern = "are correlated between markers or axes"
-    if dependence.is_correlated_in_space:
+    if dependence.is_correlated_in_space():
         pattern = "are correlated between neighbouring points of the surface"
-    if dependence.is_correlated_in_time:
+    if dependence.is_correlated_in_time():
         pattern = f"are correlated between consecutive samples (autocorrelation {dependence.lag1:.2f})"
     if errors == "autocorrelated":
         return [
@@ -647,10 +647,10 @@ def disagreement_notes(
     ]
     return [
         f"the recordings disagree on {names[k]} (χ² "
-        f"{scatter.chi_squared[k]:.3g} for {scatter.degrees_of_freedom[k]} degrees of "
+        f"{scatter.compute_chi_squared()[k]:.3g} for {scatter.count_degrees_of_freedom()[k]} degrees of "
         f"freedom): model errors exceed the noise, and the interval of {names[k]} includes the "
         "disagreement"
-        for k in np.flatnonzero(scatter.is_disagreeing).tolist()
+        for k in np.flatnonzero(scatter.find_disagreements()).tolist()
     ]
 
 

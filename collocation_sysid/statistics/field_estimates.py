@@ -161,10 +161,9 @@ class FieldEstimate:
         factor = np.exp(self.quantile * self.deviation)
         return self.value / factor, self.value * factor
 
-    @property
-    def deviation_over_prior(self) -> Array:
-        """Standard deviation (k,) of the logarithm over that of the prior about the mean; for
-        sampled phases over `PhaseSummary.deviation`. NaN without error bars.
+    def compute_deviation_over_prior(self) -> Array:
+        """Return the standard deviation (k,) of the logarithm over that of the prior about the
+        mean; for sampled phases over `PhaseSummary.deviation`. NaN without error bars.
         """
         prior = (
             self.modes.field.deviation
@@ -178,12 +177,11 @@ class FieldEstimate:
         """Mask (k,) of the elements whose standard deviation is less than `LEAST_DETERMINED_SHARE`
         of the prior's; false without error bars.
         """
-        return self.deviation_over_prior < LEAST_DETERMINED_SHARE
+        return self.compute_deviation_over_prior() < LEAST_DETERMINED_SHARE
 
-    @property
-    def identified_modes(self) -> int:
-        """Number of independent modes whose variance the data at least halve, compared with the
-        prior.
+    def count_identified_modes(self) -> int:
+        """Return the number of independent modes whose variance the data at least halve, compared
+        with the prior.
 
         It counts the eigenvalues of `covariance`, of which the prior is the identity, below
         `LEAST_DETERMINED_SHARE`; entries that are NaN count as 1. The number means nothing if the
@@ -192,13 +190,16 @@ class FieldEstimate:
         known = np.linalg.eigvalsh(np.nan_to_num(self.covariance, nan=1.0))
         return int((known < LEAST_DETERMINED_SHARE).sum())
 
-    @property
-    def by_element(self) -> Array:
-        """Table (k, 4): value, ends of its interval, and its standard deviation over that
-        of the prior.
+    def stack_by_element(self) -> Array:
+        """Return the table (k, 4): value, ends of its interval, and its standard deviation over
+        that of the prior.
         """
         return np.column_stack(
-            [self.value, *self.statistical95, self.deviation_over_prior]
+            [
+                self.value,
+                *self.statistical95,
+                self.compute_deviation_over_prior(),
+            ]
         )
 
     @cached_property
@@ -276,11 +277,10 @@ class FieldEstimate:
             / 2
         )
 
-    @property
-    def concerns(self) -> list[Concern]:
-        """Concerns about the field: for two phases those of `phase_concerns`; for a smooth field
-        values of zero or less in some elements ("doubtful", first), and an amplitude or a length
-        that the data contradict.
+    def list_concerns(self) -> list[Concern]:
+        """Return the concerns about the field: for two phases those of `phase_concerns`; for a
+        smooth field values of zero or less in some elements ("doubtful", first), and an amplitude
+        or a length that the data contradict.
 
         The amplitude is reported if the best of `AMPLITUDES` is larger than the stated one and its
         log-evidence ratio exceeds `LIKELIER`, the length if that of half the length does.
@@ -574,7 +574,8 @@ def _mean_logarithm(
         own = body.split_theta(constants.expression(q))[part_index]
         if part.stress_field is None:
             return (
-                own[part.gamma_m_index + 1] / part.density_kg_m3
+                own[(part.law_constant_count + 2 * len(part.prony)) + 1]
+                / part.density_kg_m3
                 if part.has_free_density
                 else ca.SX(1)
             )

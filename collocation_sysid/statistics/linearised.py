@@ -215,10 +215,9 @@ class ResidualBlock:
             return self.components
         return np.repeat(self.is_present[..., None], 3, axis=2)
 
-    @property
-    def is_outlier(self) -> Mask:
-        """Mask (T, M) of the samples whose residual Huber's loss has shortened; all false without
-        Huber's loss (`misfit` is None).
+    def find_outliers(self) -> Mask:
+        """Return the mask (T, M) of the samples whose residual Huber's loss has shortened; all
+        false without Huber's loss (`misfit` is None).
         """
         if self.misfit is None:
             return np.zeros(self.is_present.shape, dtype=bool)
@@ -227,10 +226,9 @@ class ResidualBlock:
             > np.linalg.norm(self.residual, axis=2) + 1e-9
         )
 
-    @property
-    def root_weight(self) -> Array:
-        """Square root (T, M, 1) of Huber's weights, which residuals and derivatives contain
-        already; 1 without Huber's loss.
+    def compute_root_weight(self) -> Array:
+        """Return the square root (T, M, 1) of Huber's weights, which residuals and derivatives
+        contain already; 1 without Huber's loss.
         """
         if self.misfit is None:
             return np.ones((*self.is_present.shape, 1))
@@ -240,9 +238,8 @@ class ResidualBlock:
         share = np.divide(short, long, out=np.ones_like(long), where=long > 0)
         return np.sqrt(share)[..., None]
 
-    @property
-    def measurement_count(self) -> int:
-        """Number of coordinates that exist: of scalar measurements in this block."""
+    def count_measurements(self) -> int:
+        """Return the number of coordinates that exist: of scalar measurements in this block."""
         return int(self.is_measured.sum())
 
     @cached_property
@@ -343,10 +340,9 @@ class LinearisedFit:
     )
     phase_covariance: Array | None = None
 
-    @property
-    def measurement_count(self) -> int:
-        """Number of scalar measurements of all blocks, without priors."""
-        return sum(block.measurement_count for block in self.blocks)
+    def count_measurements(self) -> int:
+        """Return the number of scalar measurements of all blocks, without priors."""
+        return sum(block.count_measurements() for block in self.blocks)
 
     def with_disturbances(
         self, samples: Iterable[Array | None]
@@ -378,10 +374,9 @@ class LinearisedFit:
         at_best = self.prior_residual + self.prior_jacobian * step
         return replace(self, blocks=tuple(blocks_after), prior_residual=at_best)
 
-    @property
-    def chi_squared(self) -> float:
-        """Sum of squared residuals of all measurements, shortened as by Huber's loss, without
-        priors.
+    def compute_chi_squared(self) -> float:
+        """Return the sum of squared residuals of all measurements, shortened as by Huber's loss,
+        without priors.
         """
         return float(sum(np.sum(block.residual**2) for block in self.blocks))
 
@@ -428,7 +423,7 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
                 reading.pool_values, (residual, misfit, by_own)
             )
             slope = np.zeros((*residual.shape, len(p)))
-            slope[..., segment.parameter_indices] = by_own
+            slope[..., segment.list_parameter_indices()] = by_own
             blocks.append(
                 ResidualBlock(
                     name=experiment.name,
@@ -450,10 +445,10 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
                 )
             )
     prior_residual, prior_slope = collocation.prior_residuals(p)
-    lower, upper = collocation.parameter_bounds
+    lower, upper = collocation.compute_parameter_bounds()
     return LinearisedFit(
         blocks=tuple(blocks),
-        names=collocation.parameter_names,
+        names=collocation.list_parameter_names(),
         shared_count=collocation.nq,
         prior_residual=prior_residual,
         prior_jacobian=prior_slope,
@@ -475,7 +470,7 @@ def _covariance_by_phases(collocation: Collocation) -> Array | None:
     for body in dict.fromkeys(
         segment.body for segment in collocation.transcriptions
     ):
-        for samples in body.phase_samples:
+        for samples in body.list_phase_samples():
             places = [
                 k for k, name in enumerate(samples.names) if name in names
             ]
@@ -513,10 +508,9 @@ class Information:
     scaled_jacobians: tuple[Array, ...]
     prior: Array
 
-    @property
-    def determined_count(self) -> float:
-        """Number of parameters that the data determine, Σ tr DᵀD; one that a prior determines
-        counts in part.
+    def count_determined(self) -> float:
+        """Return the number of parameters that the data determine, Σ tr DᵀD; one that a prior
+        determines counts in part.
         """
         return float(sum(np.sum(slope**2) for slope in self.scaled_jacobians))
 

@@ -131,10 +131,9 @@ class InternalFaces:
             element_count=len(cells),
         )
 
-    @property
-    def adjacency(self) -> sp.csr_array:
-        """Symmetric sparse matrix (E, E) of the weights of the faces between elements, zero where
-        there is no face.
+    def build_adjacency(self) -> sp.csr_array:
+        """Return the symmetric sparse matrix (E, E) of the weights of the faces between elements,
+        zero where there is no face.
         """
         i, j = self.pairs.T
         both = (np.r_[self.weights, self.weights], (np.r_[i, j], np.r_[j, i]))
@@ -142,10 +141,9 @@ class InternalFaces:
             both, shape=(self.element_count, self.element_count)
         )
 
-    @property
-    def jump_operator(self) -> sp.csr_array:
-        """Sparse matrix (F, E) from values in elements to their jump across each face: the value of
-        the first element of the pair less that of the second.
+    def build_jump_operator(self) -> sp.csr_array:
+        """Return the sparse matrix (F, E) from values in elements to their jump across each face:
+        the value of the first element of the pair less that of the second.
         """
         faces = np.arange(len(self.pairs))
         ends = np.r_[faces, faces], self.pairs.T.ravel()
@@ -230,15 +228,13 @@ class PosteriorDraws:
     constants: PottsConstants
     accepted: float
 
-    @property
-    def probability(self) -> Array:
-        """Probability (E,) of phase 1 in each element."""
+    def compute_probability(self) -> Array:
+        """Return the probability (E,) of phase 1 in each element."""
         return self.phases.mean(axis=(0, 1))
 
-    @property
-    def scale_reduction(self) -> float:
-        """Potential scale reduction of s (Gelman and Rubin 1992): about 1 if all chains sample the
-        same distribution; infinite if no chain moves.
+    def compute_scale_reduction(self) -> float:
+        """Return the potential scale reduction of s (Gelman and Rubin 1992): about 1 if all chains
+        sample the same distribution; infinite if no chain moves.
         """
         within = self.contrasts.var(axis=0, ddof=1).mean()
         between = self.contrasts.mean(axis=0).var(ddof=1)
@@ -296,7 +292,7 @@ def _total_variation_estimate(
     `SamplerSettings.sharpenings` reweighted least-squares solves.
     """
     normal, score = data.eliminated
-    jumps = faces.jump_operator
+    jumps = faces.build_jump_operator()
     z = data.base
     for _ in range(settings.sharpenings):
         smoothed = np.sqrt((jumps @ z) ** 2 + settings.smallest_jump**2)
@@ -393,7 +389,7 @@ def sample_phases(
         if step >= steps // 4 and step % settings.steps_per_sample == 0:
             phases.append(chains.phases.astype(np.int8))
             contrasts.append(chains.draw_contrasts(rng))
-            means.append(chains.mean_contrasts)
+            means.append(chains.estimate_mean_contrasts())
             strengths.append(chains.constants)
     return PosteriorDraws(
         phases=np.array(phases),
@@ -451,7 +447,7 @@ class _Chains:
         self._normal = normal
         self._diagonal = np.diag(normal).copy()
         self._target = normal @ data.base - score
-        self._neighbours = faces.adjacency.toarray()
+        self._neighbours = faces.build_adjacency().toarray()
         self._degrees = self._neighbours.sum(axis=1)
         self._limit = largest_exponent
         # Sums over the elements of phase 1 in each chain.
@@ -476,15 +472,14 @@ class _Chains:
         )
         self._energies = self._flip_energies()
 
-    @property
-    def mean_contrasts(self) -> Array:
-        """Mean (C,) of s given the phases."""
+    def estimate_mean_contrasts(self) -> Array:
+        """Return the mean (C,) of s given the phases."""
         return self._moments / self._information
 
     def draw_contrasts(self, rng: np.random.Generator) -> Array:
         """Draw s (C,) given the phases."""
         noise = rng.normal(size=len(self._rows)) / np.sqrt(self._information)
-        return self.mean_contrasts + noise
+        return self.estimate_mean_contrasts() + noise
 
     def propose(self, rng: np.random.Generator) -> float:
         """Propose one flip in each chain and accept or reject it, in place; return the share of

@@ -62,10 +62,9 @@ class PoseNoise:
     sigma_rad: float
     is_estimated: bool
 
-    @property
-    def message(self) -> str:
-        """Message for the user: the size of the noise in mm and degrees, and whether it was stated
-        or estimated.
+    def describe(self) -> str:
+        """Return the message for the user: the size of the noise in mm and degrees, and whether it
+        was stated or estimated.
         """
         how = (
             "estimated from their roughness"

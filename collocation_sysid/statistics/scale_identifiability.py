@@ -110,7 +110,7 @@ def _scaled_parameters(
         experiment for experiment in experiments if not experiment.validation
     ]
     bodies = {id(e.body): e.body for e in fitted}
-    with_known_force = {id(e.body) for e in fitted if e.has_known_force}
+    with_known_force = {id(e.body) for e in fitted if e.has_known_force()}
     if len(with_known_force) == len(bodies):
         return ()
     usual = typical_parameters(parameters, SOFT_PA)

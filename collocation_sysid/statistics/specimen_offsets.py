@@ -54,15 +54,15 @@ def stress_offset_notes(
         k
         for k, block in enumerate(fit.blocks)
         if block.marker_names == (STRESS_NAME,)
-        and block.measurement_count
+        and block.count_measurements()
         and not any(
             name.startswith(f"{block.name}: stress_zero of {STRESS_NAME}")
             for name in fit.names
         )
     ]
     residual, slopes, columns = _stacked(fit, offsets)
-    measured = sum(block.measurement_count for block in fit.blocks)
-    level = np.sqrt(fit.chi_squared / max(1, measured))
+    measured = sum(block.count_measurements() for block in fit.blocks)
+    level = np.sqrt(fit.compute_chi_squared() / max(1, measured))
     count = len(offsets)
     priors = int(np.count_nonzero(fit.prior_jacobian))
     free = measured + priors - slopes.shape[1]
@@ -113,7 +113,7 @@ def _stacked(
         mask = block.is_measured
         residuals.append(block.residual[mask])
         slopes.append(block.jacobian[mask])
-        weights = (block.root_weight / block.sigma_m[:, None]) * mask
+        weights = (block.compute_root_weight() / block.sigma_m[:, None]) * mask
         here = np.zeros((int(mask.sum()), len(offsets)))
         if index in offsets:
             here[:, offsets.index(index)] = weights[mask]

@@ -73,9 +73,9 @@ def strain_stability_concerns(
             np.linspace(0, len(experiment.t_s) - 1, STATES).round().astype(int)
         )
         samples = np.unique(samples)
-        states = iterate.x[iterate.segment.markers.sample_rows[samples]]
+        states = iterate.x[iterate.segment.markers.observable.rows[samples]]
         body = experiment.body
-        theta = np.asarray(iterate.equations.theta)
+        theta = np.asarray(iterate.equations.dynamics.theta)
         if any(is_examined(part.material) for part in body.parts):
             stretches = principal_stretches(body, states, theta=theta)
             yield from _part_concerns(

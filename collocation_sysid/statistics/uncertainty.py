@@ -260,10 +260,10 @@ def uncertainty_from_fit(
     """
     factored = factorise_information(fit)
     shared = fit.shared_count
-    freedom = fit.measurement_count - round(factored.determined_count, 9)
+    freedom = fit.count_measurements() - round(factored.count_determined(), 9)
     if error_model.noise == "estimated" and freedom < 1:
         raise InputError(
-            f"the noise cannot be estimated from {fit.measurement_count} measurements, which are not "
+            f"the noise cannot be estimated from {fit.count_measurements()} measurements, which are not "
             "more than the parameters that they determine; state the standard deviation of the noise "
             "(sigma_m) and noise = 'given'"
         )
@@ -298,7 +298,7 @@ def uncertainty_from_fit(
         ),
         nuisance=dict(zip(fit.names[shared:], deviations, strict=True)),
         nuisance_covariance=of_all[shared:, shared:],
-        chi_squared=fit.chi_squared,
+        chi_squared=fit.compute_chi_squared(),
         degrees_of_freedom=freedom,
         notes=(
             *parameter_notes(parameters, estimates),
@@ -363,7 +363,7 @@ def _error_bars(
         requested.errors == "auto" and dependent
     )
     kind: Noise = (
-        level.suggested_noise if requested.noise == "auto" else requested.noise
+        level.suggest_noise() if requested.noise == "auto" else requested.noise
     )
     if requested.noise == "auto" and correlated and level.pooled < 1:
         kind = "given"
@@ -483,11 +483,12 @@ def _widen_by_scatter(
         factors = np.sqrt(
             scatter.widen(np.diag(covariance_q)) / np.diag(covariance_q)
         )
-    factors = np.where(scatter.is_disagreeing, factors, 1.0)
+    factors = np.where(scatter.find_disagreements(), factors, 1.0)
     of_few = np.maximum(
-        quantiles, student_ppf(0.975, np.maximum(scatter.degrees_of_freedom, 1))
+        quantiles,
+        student_ppf(0.975, np.maximum(scatter.count_degrees_of_freedom(), 1)),
     )
-    wide = np.where(scatter.is_disagreeing, of_few, quantiles)
+    wide = np.where(scatter.find_disagreements(), of_few, quantiles)
     return _WidenedBars(
         covariance_q * np.outer(factors, factors),
         quantiles=wide,
@@ -508,7 +509,7 @@ def _compare_recordings(
     known = {}
     sizes = relative_derivatives(parameters, q)
     for alone, step in single_fits(fit):
-        if alone.measurement_count <= len(alone.names):
+        if alone.count_measurements() <= len(alone.names):
             continue
         uncertainty = uncertainty_from_fit(
             alone, parameters, q=q, error_model=errors
@@ -554,9 +555,10 @@ def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
     level = estimate_noise_level(fit, factored)
     tested = analyse_dependence(fit, factored)
     tested = replace(
-        tested, lag1_deviation=tested.lag1_deviation * level.unevenness
+        tested,
+        lag1_deviation=tested.lag1_deviation * level.compute_unevenness(),
     )
-    return tested, tested.is_correlated and not _is_explained(
+    return tested, tested.is_correlated() and not _is_explained(
         fit, factored, level=level, result=tested
     )
 
@@ -715,7 +717,7 @@ def _std_errors_m(
     )
     errors = np.zeros(chart.centre_places_m.shape)
     for m in chart.estimated:
-        indices = at[segment.markers.coordinate_parameters[m]]
+        indices = at[segment.markers.observable.coordinate_parameters[m]]
         of_phi = uncertainty.nuisance_covariance[np.ix_(indices, indices)]
         axes_m = chart.sigma_m[m] * chart.axes[m]
         errors[m] = np.sqrt(np.einsum("ik,kl,il->i", axes_m, of_phi, axes_m))

@@ -114,10 +114,9 @@ class PlainInternalForce:
             ca.SX.sym("c", constants),
         ]
 
-    @cached_property
-    def _element_force(self) -> ca.SX:
-        """Symbolic force (3·nodes,) of one element on its nodes, elastic and viscous, without
-        mass-proportional damping.
+    def _build_element_force(self) -> ca.SX:
+        """Return the symbolic force (3·nodes,) of one element on its nodes, elastic and viscous,
+        without mass-proportional damping.
         """
         x, v, _, geometry, constants = self._symbols
         part = self.body.parts[0]
@@ -171,7 +170,7 @@ class PlainInternalForce:
         """
         x, v, w, _, constants = self._symbols
         u = ca.vertcat(x, v, constants)
-        force = self._element_force
+        force = self._build_element_force()
         second, _ = ca.hessian(ca.dot(w, force), u)
         inputs = self._symbols
         return (

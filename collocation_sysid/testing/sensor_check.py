@@ -117,10 +117,10 @@ class SensorExpression:
 
     sensor: Gauge
 
-    @property
-    def inputs(self) -> dict[str, Array]:
-        """Undeformed values of the inputs by name: for a sensor on P points positions and zeros of
-        velocity and acceleration, (3, P) each; at a grasp ones (3, 1) for force and torque.
+    def make_inputs(self) -> dict[str, Array]:
+        """Return the undeformed values of the inputs by name: for a sensor on P points positions
+        and zeros of velocity and acceleration, (3, P) each; at a grasp ones (3, 1) for force and
+        torque.
         """
         if self.sensor.grasp is not None:
             return {name: np.ones((3, 1)) for name in GRASP_INPUTS}
@@ -138,21 +138,20 @@ class SensorExpression:
             (each + SIZES[name] * rng.standard_normal(each.shape)).ravel(
                 order="F"
             )
-            for name, each in self.inputs.items()
+            for name, each in self.make_inputs().items()
         ]
         sigmas = np.array([*self.sensor.unknowns.values()], dtype=float)
         return np.concatenate(
             [*changed, sigmas * rng.standard_normal(len(sigmas))]
         )
 
-    @property
-    def scale(self) -> Array:
-        """Size of a large change of each entry of u (k,): `SIZES` for inputs, the prior standard
-        deviation for unknowns.
+    def compute_scale(self) -> Array:
+        """Return the size of a large change of each entry of u (k,): `SIZES` for inputs, the prior
+        standard deviation for unknowns.
         """
         sizes = [
             np.full(each.size, SIZES[name])
-            for name, each in self.inputs.items()
+            for name, each in self.make_inputs().items()
         ]
         return np.concatenate(
             [*sizes, np.array([*self.sensor.unknowns.values()], dtype=float)]
@@ -168,7 +167,7 @@ class SensorExpression:
         t_s : float, optional
             Time of the sample; that of the random states by default.
         """
-        shapes = [each.shape for each in self.inputs.values()]
+        shapes = [each.shape for each in self.make_inputs().values()]
         ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
         *parts, unknowns = np.split(u, ends)
         values = (
@@ -180,7 +179,7 @@ class SensorExpression:
         )
         at = Look(
             self.t_s if t_s is None else t_s,
-            **dict(zip(self.inputs, values, strict=True)),
+            **dict(zip(self.make_inputs(), values, strict=True)),
         )
         reading = self.sensor.expression(at, **named)
         column = (
@@ -196,7 +195,8 @@ class SensorExpression:
         time `t_s`.
         """
         symbols = [
-            ca.SX.sym(name, *each.shape) for name, each in self.inputs.items()
+            ca.SX.sym(name, *each.shape)
+            for name, each in self.make_inputs().items()
         ]
         unknowns = ca.SX.sym("unknowns", len(self.sensor.unknowns))
         own = ca.vertsplit(unknowns) if self.sensor.unknowns else []
@@ -229,14 +229,14 @@ def _check_derivatives(
         jacobian,
         point=u,
         statement=f"the first derivative of the expression is wrong {where}",
-        scale=expression.scale,
+        scale=expression.compute_scale(),
     )
     check.require_derivative(
         lambda at: weights @ expression.automatic.call([at, weights])[1].full(),
         hessian,
         point=u,
         statement=f"the second derivative of the expression is wrong {where}",
-        scale=expression.scale,
+        scale=expression.compute_scale(),
     )
 
 

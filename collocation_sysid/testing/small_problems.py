@@ -195,7 +195,8 @@ def shaken_variables(
     p[: collocation.nq] += 0.1 * rng.normal(size=collocation.nq)
     p[collocation.nq :] += 0.5 * rng.normal(size=collocation.nphi)
     is_lag = np.array(
-        ["lag of" in name for name in collocation.parameter_names], dtype=bool
+        ["lag of" in name for name in collocation.list_parameter_names()],
+        dtype=bool,
     )
     p[is_lag] = np.abs(p[is_lag]) + 0.1
     z = collocation.pack(p, positions)

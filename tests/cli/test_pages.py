@@ -126,7 +126,7 @@ def test_reports_link_to_the_documentation_that_the_project_states(
     links = [
         span.to
         for cure in remedy_lines(CONCERNS)
-        for span in cure.spans
+        for span in cure.to_spans()
         if span.to
     ]
     if base is None:

@@ -89,7 +89,7 @@ def drawn_motions(count: int = 12, waves: int = 1) -> list[HandMotion]:
     ]
     return [
         bounds.scale_to_limits(
-            HandMotion.from_coefficients(u, 0.3, 10.0, bounds.reach)
+            HandMotion.from_coefficients(u, 0.3, 10.0, bounds.compute_reach())
         )
         for u in drawn
     ]
@@ -321,7 +321,7 @@ def at_answer(experiments) -> tuple[Collocation, np.ndarray]:
         )
         for s in found.transcriptions
     ]
-    phi = [s.guess_phi for s in found.transcriptions]
+    phi = [s.compute_guess_phi() for s in found.transcriptions]
     return found, found.pack(np.concatenate([AT.guess_q, *phi]), rows)
 
 
@@ -370,7 +370,7 @@ def test_error_bars_are_those_that_a_run_reports():
     assert {"lambda_pa", "mu_pa", "young_pa", "poisson"} <= known.keys()
     for name, estimate in known.items():
         assert estimate.statistical_std_error is not None
-        assert found.relative[name] == pytest.approx(
+        assert found.compute_relative()[name] == pytest.approx(
             estimate.statistical_std_error / estimate.value, rel=1e-3
         )
 
@@ -388,7 +388,7 @@ def test_criteria_are_what_they_say_of_the_covariance():
         np.linalg.det(found.covariance) ** (1 / 8)
     )
     alone = DesignCriterion("D", ("poisson",)).log_size(found)
-    assert np.exp(alone) == pytest.approx(found.relative["poisson"])
+    assert np.exp(alone) == pytest.approx(found.compute_relative()["poisson"])
     assert DesignCriterion(over="mean").combine_draws([1.0, 4.0]) == 2.5
     assert DesignCriterion(over="worst").combine_draws([1.0, 4.0]) == 4.0
 
@@ -397,7 +397,9 @@ def test_what_is_not_told_at_all_has_a_size_that_compares():
     found = PredictedErrors.from_information(
         np.zeros((4, 4)), AT, ThetaMap(AT, hung_cube(3).body), AT.guess_q
     )
-    assert list(found.relative.values())[:4] == pytest.approx([100.0] * 4)
+    assert list(found.compute_relative().values())[:4] == pytest.approx(
+        [100.0] * 4
+    )
 
 
 @pytest.mark.parametrize(
@@ -507,7 +509,10 @@ def test_a_sensor_measures_at_its_own_rate_over_the_new_time():
     assert np.diff(grasp.wrench.t_s) == pytest.approx(
         np.diff(before.wrench.t_s).mean()
     )
-    assert grasp.wrench.component_names == before.wrench.component_names
+    assert (
+        grasp.wrench.list_component_names()
+        == before.wrench.list_component_names()
+    )
 
 
 def still_poses(recording: FutureRecording) -> PoseSequence:
@@ -533,9 +538,10 @@ def test_a_designed_motion_tells_more_than_a_poor_one():
     found = design_motion(Problem([poor], AT), LIMITS, 0.08, options=FEW)
     assert found.before is not None
     assert (
-        max(found.before.relative[n] for n in TRUTH) > 3 * found.minimised_error
+        max(found.before.relative[n] for n in TRUTH)
+        > 3 * found.compute_minimised_error()
     )
-    assert found.minimised_error == pytest.approx(
+    assert found.compute_minimised_error() == pytest.approx(
         max(found.after.relative[n] for n in TRUTH)
     )
     assert max(found.shares.values()) <= 1
@@ -560,7 +566,7 @@ def test_a_wrench_counts_and_the_search_then_begins_at_random():
     found = design_motion(
         Problem([sensing], AT), LIMITS, 0.08, options=DesignOptions(1, pairs=0)
     )
-    assert np.isfinite(found.minimised_error)
+    assert np.isfinite(found.compute_minimised_error())
 
 
 def test_answers_that_need_too_much_memory_are_not_sought(monkeypatch):
@@ -600,7 +606,7 @@ def test_recordings_there_are_count_where_they_are_to_be_completed():
     alone = shared_information(linearise_fit(*at_answer([experiment])))
     before = PredictedErrors.from_information(
         alone, AT, ThetaMap(AT, experiment.body), AT.guess_q
-    ).relative
+    ).compute_relative()
     assert found.before is not None
     for name in TRUTH:
         assert found.before.relative[name] == pytest.approx(

@@ -65,7 +65,8 @@ TWENTY = 20 * "9"
 def residuals(track: WindowPass, p: np.ndarray) -> list[np.ndarray]:
     """Of all readings, to first order at p."""
     return [
-        said.evaluate_at(track.model.transformed(p)) for said in track.residuals
+        said.evaluate_at(track.model.transformed(p))
+        for said in track.list_residuals()
     ]
 
 
@@ -129,12 +130,12 @@ def test_frames_one_by_one_say_what_the_batch_says(
         [point.fit.jacobian, point.fit.residual - point.fit.jacobian @ flat]
     )
     batch = rows.T @ rows
-    ours = normal_equations(live.first_pass.information.triangle)
+    ours = normal_equations(live.first_pass.sweep.information.triangle)
     scale = np.sqrt(np.outer(np.diag(batch), np.diag(batch)))
     np.testing.assert_allclose(ours / scale, batch / scale, atol=1e-8)
     priors = len(collocation.prior_residuals(p)[0]) + collocation.nq
     measured = sum(len(each.slope) for each in point.trajectories)
-    assert live.first_pass.information.row_count == measured + priors
+    assert live.first_pass.sweep.information.row_count == measured + priors
 
 
 def unknown(problem: cs.Problem) -> cs.Problem:
@@ -229,22 +230,22 @@ def test_a_pass_that_turns_goes_on_to_first_order_and_says_so(monkeypatch):
     live = streamed(problem)
     half, errors = len(live.log) // 2, []
     for size in (1e-3, 5e-4):
-        p = live.first_pass.linearisation_point + size
+        p = live.first_pass.sweep.p + size
         whole, turned = (
             WindowPass(live.model, at, live.prior, 99)
-            for at in (p, live.first_pass.linearisation_point)
+            for at in (p, live.first_pass.sweep.p)
         )
         for number, row in enumerate(live.log):
             if number == half:
                 turned.relinearise_at(p)
             turned.repeat_rows([row])
             whole.repeat_rows([row])
-        assert len(turned.linearisation_points) == 2
+        assert len(turned.linearisation_points_from(0)) == 2
         assert turned.last_relinearised_row == half
         ends = (each.blocks[-1].stored_rows[-1].x for each in (turned, whole))
         errors.append(np.abs(np.subtract(*ends)).max())
         assert_same_information(
-            turned.information, whole.information, atol=1e-2
+            turned.sweep.information, whole.sweep.information, atol=1e-2
         )
     assert 0 < errors[1] < 0.3 * errors[0] < 1e-5  # of second order
 
@@ -312,24 +313,24 @@ def test_what_leaves_the_window_stays_known_as_a_prior(monkeypatch):
     track, log, whole = (
         live.first_pass,
         list(live.log),
-        live.first_pass.information,
+        live.first_pass.sweep.information,
     )
-    track.relinearise_at(track.linearisation_point)
+    track.relinearise_at(track.sweep.p)
     left = track.drop_oldest_block()
     assert 0 < left < len(log)
-    assert len(track.linearisation_points) == 2
+    assert len(track.linearisation_points_from(0)) == 2
     assert track.last_relinearised_row == len(log) - left
-    assert track.information is whole
+    assert track.sweep.information is whole
     again = WindowPass(
         live.model,
-        track.linearisation_point,
+        track.sweep.p,
         track.prior,
         live._block_rows,
         track,
     )
     for row in log[left:]:
         again.repeat_rows([row])
-    assert_same_information(again.information, whole, atol=1e-8)
+    assert_same_information(again.sweep.information, whole, atol=1e-8)
 
 
 def test_a_pass_from_within_the_window_moves_its_first_state_along_its_slopes(
@@ -341,7 +342,7 @@ def test_a_pass_from_within_the_window_moves_its_first_state_along_its_slopes(
     way = np.full(len(live.p), 1.0)
     errors = []
     for size in (1e-3, 5e-4):
-        p = live.first_pass.linearisation_point + size * way
+        p = live.first_pass.sweep.p + size * way
         whole = WindowPass(live.model, p, live.prior, live._block_rows)
         state = live.first_pass.blocks[1]
         part = streaming_sweep.StreamingSweep(
@@ -364,11 +365,9 @@ def test_residuals_follow_damping_by_mass_that_is_wrong_by_three():
     there = WindowPass(live.model, far, live.prior, live._block_rows)
     for row in live.log:
         there.repeat_rows([row])
-    at_guess = residuals(live.first_pass, live.first_pass.linearisation_point)
+    at_guess = residuals(live.first_pass, live.first_pass.sweep.p)
     change = np.subtract(residuals(there, far), at_guess)
-    off = np.subtract(
-        residuals(there, live.first_pass.linearisation_point), at_guess
-    )
+    off = np.subtract(residuals(there, live.first_pass.sweep.p), at_guess)
     # By its logarithm they would miss 45 %.
     assert np.linalg.norm(off) < 0.03 * np.linalg.norm(change)
 
@@ -381,7 +380,7 @@ def test_rows_solved_together_miss_by_the_square_of_the_step_and_say_so(
     live = streamed(problem)
     way, errors = np.full(len(live.p), 1.0), []
     for size in (1e-3, 5e-4):
-        p = live.first_pass.linearisation_point + size * way
+        p = live.first_pass.sweep.p + size * way
         whole, together = (
             WindowPass(
                 live.model, p, live.prior, live._block_rows, live.first_pass
@@ -390,19 +389,22 @@ def test_rows_solved_together_miss_by_the_square_of_the_step_and_say_so(
         )
         for row in live.log:
             whole.repeat_rows([row])
-        assert not whole.sweep.needs_another_pass
+        assert not whole.sweep.needs_another_pass()
         monkeypatch.setattr(streaming_sweep, "CHUNK_CORRECTION_FACTOR", 1e12)
         calls = 0
         while together.rows < len(live.log):
             together.repeat_rows(live.log[together.rows :])
             calls += 1
         assert calls < len(live.log) / 4
-        assert together.sweep.needs_another_pass
+        assert together.sweep.needs_another_pass()
         ends = (t.blocks[-1].stored_rows[-1].x for t in (together, whole))
         errors.append(np.abs(np.subtract(*ends)).max())
-        assert together.information.row_count == whole.information.row_count
+        assert (
+            together.sweep.information.row_count
+            == whole.sweep.information.row_count
+        )
         assert_same_information(
-            together.information, whole.information, atol=1e-3
+            together.sweep.information, whole.sweep.information, atol=1e-3
         )
     assert 0 < errors[1] < 0.3 * errors[0] < 1e-6  # of second order
 
@@ -413,14 +415,14 @@ def test_rows_solved_together_miss_by_the_square_of_the_step_and_say_so(
 def test_a_row_far_from_its_guess_is_solved_alone(scheme, near):
     problem = replace(swing(), scheme=scheme)
     live = streamed(problem)
-    far = live.first_pass.linearisation_point + np.array([0.7, -0.7, 0.7, -0.7])
+    far = live.first_pass.sweep.p + np.array([0.7, -0.7, 0.7, -0.7])
     again, whole = (
         WindowPass(live.model, far, live.prior, live._block_rows, t)
         for t in (live.first_pass, None)
     )
     while again.rows < len(live.log):
         again.repeat_rows(live.log[again.rows :])
-        assert np.isfinite(again.sweep.state.last_rows.increments).all()
+        assert np.isfinite(again.sweep.copy_state().last_rows.increments).all()
     for row in live.log:
         whole.repeat_rows([row])
     assert (
@@ -480,7 +482,7 @@ def test_doubled_late_unordered_and_dropped_frames_are_told_and_change_little():
     assert any("late" in note for note in notes)
     assert live.first_pass.rows == whole.first_pass.rows
     for name, estimate in live._estimates_at(
-        live.first_pass.information, live.p
+        live.first_pass.sweep.information, live.p
     ).items():
         error = expected.estimates[name].statistical_std_error
         if error is not None:
@@ -495,11 +497,11 @@ def test_a_frame_that_is_too_late_is_left_out():
     frames = frames_of(problem, live)
     for frame in frames[:10] + frames[11:30]:
         live.process_frame(frame)
-    rows = live.first_pass.information.row_count
+    rows = live.first_pass.sweep.information.row_count
     update = live.process_frame(frames[10])
     assert "too late" in update.notes[0]
     assert live.counts["late"] == 1
-    assert live.first_pass.information.row_count == rows
+    assert live.first_pass.sweep.information.row_count == rows
 
 
 def test_missing_markers_say_nothing():
@@ -511,10 +513,12 @@ def test_missing_markers_say_nothing():
         if seen % 3:
             tracks[: 1 + seen % 2] = np.nan
         before = (
-            live.first_pass.information.row_count if live.first_pass else stated
+            live.first_pass.sweep.information.row_count
+            if live.first_pass
+            else stated
         )
         live.process_frame(replace(frame, tracks_m=tracks))
-        found = live.first_pass.information.row_count - before
+        found = live.first_pass.sweep.information.row_count - before
         assert found == np.isfinite(tracks).sum()
 
 
@@ -527,14 +531,14 @@ def test_a_grasp_that_is_lost_for_a_moment_is_bridged_and_for_long_it_is_told():
         update = live.process_frame(frame)
     assert live.first_pass.rows == 14
     assert (
-        live.first_pass.measured_information.row_count
+        live.first_pass.condense_measurements().row_count
         == 14 * frames[0].tracks_m.size
     )
     for frame in blind[14:30]:
         update = live.process_frame(frame)
     assert update.trust.verdict == "doubtful"
     assert "pose of the grasp has been missing" in update.trust.reasons[0]
-    known = live.first_pass.measured_information.triangle
+    known = live.first_pass.condense_measurements().triangle
     update = live.process_frame(frames[30])
     assert "restarted after a gap" in update.notes[0]
     assert live.first_pass.rows == 1
@@ -701,7 +705,10 @@ def test_memory_is_bounded():
     most = 3 * live._blocks * live._block_rows
     assert max(logged for logged, _ in sizes) <= most
     assert max(kept for _, kept in sizes) <= 2 * most
-    assert live.first_pass.information.triangle.shape == (len(live.p) + 1,) * 2
+    assert (
+        live.first_pass.sweep.information.triangle.shape
+        == (len(live.p) + 1,) * 2
+    )
     assert len(live.intake._waiting) <= 4
     assert len(live.first_pass.sweep.read) <= 30
 
@@ -761,7 +768,7 @@ def test_readings_of_ones_own_say_what_they_say_to_the_batch(monkeypatch):
     )
     batch, ours = (
         rows.T @ rows,
-        normal_equations(live.first_pass.information.triangle),
+        normal_equations(live.first_pass.sweep.information.triangle),
     )
     scale = np.sqrt(np.outer(np.diag(batch), np.diag(batch)))
     np.testing.assert_allclose(ours / scale, batch / scale, atol=1e-8)

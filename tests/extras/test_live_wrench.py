@@ -120,7 +120,7 @@ def test_load_cells_say_what_they_say_to_the_batch(
     )
     batch, ours = (
         rows.T @ rows,
-        normal_equations(live.first_pass.information.triangle),
+        normal_equations(live.first_pass.sweep.information.triangle),
     )
     scale = np.sqrt(np.outer(np.diag(batch), np.diag(batch)))
     np.testing.assert_allclose(ours / scale, batch / scale, atol=1e-8)
@@ -134,10 +134,10 @@ def test_a_pass_that_turns_moves_what_a_load_cell_looks_at_along_its_slopes(
     live = streamed(weighed(tare=0.1, tool_kg=0.01))
     half, far = len(live.log) // 2, []
     for size in (1e-2, 5e-3):
-        p = live.first_pass.linearisation_point + size
+        p = live.first_pass.sweep.p + size
         whole, turned = (
             WindowPass(live.model, at, live.prior, 99)
-            for at in (p, live.first_pass.linearisation_point)
+            for at in (p, live.first_pass.sweep.p)
         )
         for number, row in enumerate(live.log):
             if number == half:
@@ -152,7 +152,7 @@ def test_a_pass_that_turns_moves_what_a_load_cell_looks_at_along_its_slopes(
             turned.repeat_rows([row])
             whole.repeat_rows([row])
         assert_same_information(
-            turned.information, whole.information, atol=5 * size
+            turned.sweep.information, whole.sweep.information, atol=5 * size
         )
     assert 0 < far[1] < 0.3 * far[0] < 1e-4  # of second order
 
@@ -225,8 +225,8 @@ def test_samples_of_a_load_cell_may_be_late_or_missing():
     )
     delayed, found = last_estimates(problem, late)
     assert (
-        delayed.first_pass.information.row_count
-        == in_time.first_pass.information.row_count
+        delayed.first_pass.sweep.information.row_count
+        == in_time.first_pass.sweep.information.row_count
     )
     np.testing.assert_allclose(found, expected, rtol=1e-6)
     some = [
@@ -243,8 +243,8 @@ def test_samples_of_a_load_cell_may_be_late_or_missing():
         for _, _, values in f.instrument_samples
     )
     assert (
-        fewer.first_pass.information.row_count
-        == in_time.first_pass.information.row_count - lost
+        fewer.first_pass.sweep.information.row_count
+        == in_time.first_pass.sweep.information.row_count - lost
     )
     np.testing.assert_allclose(found, expected, rtol=0.1)
     far = [

@@ -418,7 +418,7 @@ def test_laws_of_damping_take_the_place_of_their_budget_entry(bar):
     for law in LAWS:
         problem = Problem.read(bar, found[law].overrides)
         assert [part.damping.name for part in problem.bodies[0].parts] == [law]
-        stated = problem.uncertainty.assumptions.deviations
+        stated = problem.uncertainty.assumptions.collect_deviations()
         assert stated["damping_law"] is None
         assert stated["rayleigh_damping"] is None
         assert problem.parameters.names == Problem.read(bar).parameters.names

@@ -197,7 +197,7 @@ def test_every_method_has_the_same_starts(tiny):
     planned = plan_comparison(
         problem, ["interior-point", "reduced-space"], (), Starts(3, seed=4)
     )
-    assert [run.label for run in planned] == [
+    assert [run.make_label() for run in planned] == [
         f"{method}, start {start}"
         for start in range(3)
         for method in ("interior-point", "reduced-space")
@@ -287,7 +287,7 @@ def test_a_sweep_has_every_combination(tiny):
         400,
         400,
     ]
-    assert planned[1].label == "mu_pa.guess=100, substeps=2"
+    assert planned[1].make_label() == "mu_pa.guess=100, substeps=2"
     assert {run.method for run in planned} == {"reduced-space"}
 
 

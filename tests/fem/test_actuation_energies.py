@@ -91,7 +91,7 @@ def test_second_derivatives_equal_those_of_a_computer_algebra(rng, states):
 @pytest.mark.parametrize("element", ["tet4", "tet10"])
 def test_a_cavity_encloses_its_volume_and_its_forces_balance(element, rng):
     body = Body(box_with_cavity(), density_kg_m3=1e3, element=element)
-    volume = Pressure(Named("wall"), 1e3).on_body(body).measure
+    volume = Pressure(Named("wall"), 1e3).on_body(body).require_measure()
     assert volume is not None
     assert not volume.rim.size
     assert volume.evaluate(body.nodes_m.reshape(1, -1))[0] == pytest.approx(
@@ -105,7 +105,7 @@ def test_a_cavity_encloses_its_volume_and_its_forces_balance(element, rng):
 
 def test_curved_faces_enclose_what_a_finer_flat_surface_does():
     body = Body(box_with_cavity(), density_kg_m3=1e3, element="tet10")
-    volume = Pressure(Named("wall"), 1e3).on_body(body).measure
+    volume = Pressure(Named("wall"), 1e3).on_body(body).require_measure()
     assert volume is not None
     centre = np.full(3, 0.015)
     away = body.nodes_m - centre
@@ -157,7 +157,7 @@ def test_a_tendon_shortens_as_its_body_does():
         element="tet10",
     )
     points = [(x, 0.004, 0.003) for x in np.linspace(0, 0.1, 12)]
-    length = Tendon(points, 1.0).on_body(body).measure
+    length = Tendon(points, 1.0).on_body(body).require_measure()
     assert length is not None
     assert length.evaluate(0.9 * body.nodes_m.reshape(1, -1))[
         0
@@ -214,7 +214,7 @@ def test_an_inflated_sphere_converges_to_its_radial_solution():
     for divisions in (2, 4):
         mesh = hollow_octant(INNER, OUTER, divisions, divisions)
         body = Body(mesh, density_kg_m3=1e3, element="tet10")
-        volume = Pressure(Named("wall"), 1.0).on_body(body).measure
+        volume = Pressure(Named("wall"), 1.0).on_body(body).require_measure()
         assert volume is not None
         x = inflated(body, volume, pressure_pa, LAMES, steps=2)
         wall = np.flatnonzero(mesh.point_arrays["wall"])
@@ -231,7 +231,7 @@ def test_faces_of_a_box_and_a_ball_are_those_with_all_their_corners_in_it():
         Ball((0.015,) * 3, 0.009),
         Box((0.009,) * 3, (0.021,) * 3),
     ):
-        volume = Pressure(selection, 1e3).on_body(body).measure
+        volume = Pressure(selection, 1e3).on_body(body).require_measure()
         assert volume is not None
         assert len(volume.faces) == 12
 

@@ -107,7 +107,7 @@ def stretched_cube(values: dict[str, float], stretch: float) -> SimpleNamespace:
     experiment = replace(hung, body=body)
     collocation = Collocation([experiment], Parameters.from_mapping(values))
     (segment,) = collocation.transcriptions
-    count = int(segment.markers.sample_rows.max()) + 1
+    count = int(segment.markers.observable.rows.max()) + 1
     across = stretch**-0.5
     shapes = np.where(
         np.arange(count)[:, None, None] > count / 2,
@@ -117,7 +117,9 @@ def stretched_cube(values: dict[str, float], stretch: float) -> SimpleNamespace:
     return SimpleNamespace(
         segment=segment,
         x=shapes.reshape(count, -1),
-        equations=SimpleNamespace(theta=body.theta_from_values(values)),
+        equations=SimpleNamespace(
+            dynamics=SimpleNamespace(theta=body.theta_from_values(values))
+        ),
     )
 
 

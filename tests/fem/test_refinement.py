@@ -198,7 +198,7 @@ def test_tendons_and_pressures_drive_the_finer_body_alike(faces: str):
     bar = driven_bar()
     if faces == "numbered":
         (pressure,) = bar.pressures
-        numbers = pressure.on_body(bar.body).measure.faces[:, :3]
+        numbers = pressure.on_body(bar.body).require_measure().faces[:, :3]
         bar = replace(
             bar, pressures=[replace(pressure, faces=numbers, body_measure=None)]
         )
@@ -210,10 +210,13 @@ def test_tendons_and_pressures_drive_the_finer_body_alike(faces: str):
         strict=True,
     ):
         at = [(e.body.nodes_m @ stretch.T).reshape(1, -1) for e in (bar, finer)]
-        values = coarse.measure.evaluate(at[0]), fine.measure.evaluate(at[1])
+        values = (
+            coarse.require_measure().evaluate(at[0]),
+            fine.require_measure().evaluate(at[1]),
+        )
         np.testing.assert_allclose(values[1], values[0], rtol=1e-9)
         assert values[0] != pytest.approx(
-            coarse.measure.evaluate(bar.body.nodes_m.reshape(1, -1))
+            coarse.require_measure().evaluate(bar.body.nodes_m.reshape(1, -1))
         )
         np.testing.assert_array_equal(
             fine.energy_amplitude_at(bar.t_s),

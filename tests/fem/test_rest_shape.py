@@ -348,7 +348,7 @@ def changes_of(
     x = simulate(experiment, TRUTH, "midpoint", substeps=1).positions_m
     z = collocation.pack(parameters.guess_q, [x.reshape(len(x), -1)])
     found = changes_of_assumptions(
-        collocation, z, Assumptions(**deviations).deviations
+        collocation, z, Assumptions(**deviations).collect_deviations()
     )
     return {name: found.blocks[0][..., k] for k, name in enumerate(found.names)}
 
@@ -502,4 +502,7 @@ def test_a_finer_mesh_keeps_what_is_stated():
     held = finer.scan_conditions.grasped_nodes(finer.nodes)
     assert np.abs(finer.nodes.points_m[held, 0]).max() < 1e-9
     assert len(held) == 25
-    assert UncertaintyOptions().assumptions.deviations["rest_shape"] == 0.58
+    assert (
+        UncertaintyOptions().assumptions.collect_deviations()["rest_shape"]
+        == 0.58
+    )

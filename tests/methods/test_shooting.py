@@ -269,7 +269,7 @@ def test_the_history_is_what_was_watched_and_its_loss_falls(gradient):
     losses = [iteration.loss for iteration in seen]
     assert losses == sorted(losses, reverse=True)
     assert seen[-1].loss == pytest.approx(
-        cube().objective(solution.z) * cube().measurement_count
+        cube().objective(solution.z) * cube().count_measurements()
     )
     timing = solution.timing
     assert min(timing.evaluations, timing.linear_algebra) > 0

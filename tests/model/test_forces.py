@@ -160,10 +160,12 @@ def test_tendons_and_pressures_are_lengths_and_volumes_times_what_drives_them(
 ):
     xi = states(Collocation([BAR], GUESS).transcriptions[0], rng)[0][:2]
     tendon, pressure = BAR.actuators
-    expected = -tension_n(FROM_S)[:, None] * tendon.measure.gradient(xi)
+    expected = -tension_n(FROM_S)[:, None] * tendon.require_measure().gradient(
+        xi
+    )
     expected -= pressure.energy_amplitude_at(FROM_S)[
         :, None
-    ] * pressure.measure.gradient(xi)
+    ] * pressure.require_measure().gradient(xi)
     given = States(xi, np.zeros_like(xi), np.zeros(0))
     found = sum(
         term.force(given)

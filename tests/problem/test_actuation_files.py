@@ -123,7 +123,7 @@ def test_a_group_of_triangles_is_the_wall(driven):
         and Problem.read(driven / "problem.toml")
         .experiments[0]
         .pressures[0]
-        .measure
+        .require_measure()
     )
     assert isinstance(volume, EnclosedVolume)
     cells = [("tetra", body.mesh.tetrahedra), ("triangle", volume.faces)]
@@ -140,7 +140,7 @@ def test_a_group_of_triangles_is_the_wall(driven):
         Problem.read(driven / "problem.toml")
         .experiments[0]
         .pressures[0]
-        .measure
+        .require_measure()
     )
     at = body.nodes_m.reshape(1, -1)
     assert again.evaluate(at)[0] == pytest.approx(

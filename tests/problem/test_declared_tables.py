@@ -31,9 +31,9 @@ def as_sentence(text: str) -> str:
 def described_prior(row: NuisanceRow) -> str:
     """Key of a prior, followed by its default if it has one."""
     return (
-        row.prior
+        row.prior_key()
         if row.sigma is None
-        else f"{row.prior}, {row.usual} by default"
+        else f"{row.prior_key()}, {row.usual} by default"
     )
 
 
@@ -78,7 +78,7 @@ def test_the_table_of_a_key_has_the_priors_of_its_kinds(
 ):
     section = prior_section(key)
     stated = section.model_fields
-    assert list(stated) == ["scope", *(row.prior for row in rows)]
+    assert list(stated) == ["scope", *(row.prior_key() for row in rows)]
     assert (
         section.__doc__
         == f"Prior of a nuisance parameter: {rows[0].description}."
@@ -88,10 +88,11 @@ def test_the_table_of_a_key_has_the_priors_of_its_kinds(
     needs_all = any(row.reference is not None for row in rows)
     for row in rows:
         assert (
-            stated[row.prior].description == f"Standard deviation [{row.unit}]."
+            stated[row.prior_key()].description
+            == f"Standard deviation [{row.unit}]."
         )
         missing = PydanticUndefined if needs_all else None
-        assert stated[row.prior].default == (row.reference or missing)
+        assert stated[row.prior_key()].default == (row.reference or missing)
 
 
 # Systematic effects ---------------------------------------------------------------------------
@@ -101,7 +102,7 @@ def test_assumptions_have_a_field_for_each_row():
     defaults = {row.name: row.sigma for row in ASSUMPTIONS}
     defaults |= {row.name: row.considered for row in KINDS}
     assert [field.name for field in fields(Assumptions)] == list(defaults)
-    assert Assumptions().deviations == defaults
+    assert Assumptions().collect_deviations() == defaults
 
 
 def test_only_effects_of_known_sign_have_a_mean():

@@ -76,7 +76,7 @@ def first_order_n(
         collocation.guess_p, [positions.reshape(len(positions), -1)]
     )
     _, blocks = changed_residuals(collocation, z, [(SOFTNESS, 1.0)])
-    sensor_sigma = experiment.wrenches[-1].sigmas.reshape(2, 3)[0, 2]
+    sensor_sigma = experiment.wrenches[-1].stack_sigmas().reshape(2, 3)[0, 2]
     return blocks[-1][:, 0, 2, 0] * sensor_sigma
 
 

@@ -71,7 +71,7 @@ def noisy(experiment: Experiment, seed: int = 0) -> Experiment:
         grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None
     ]
     values = [
-        w.values + 0.1 * w.sigmas * rng.normal(size=w.values.shape)
+        w.values + 0.1 * w.stack_sigmas() * rng.normal(size=w.values.shape)
         for w in felt
     ]
     return with_wrenches(seen, values)

@@ -219,9 +219,9 @@ def differing(
     known = values.with_fields([made])
     uneven = {
         name: 0.4 * (-1) ** k
-        for k, name in enumerate(made.field_coefficient_names)
+        for k, name in enumerate(made.list_field_coefficient_names())
     }
-    uneven |= dict.fromkeys(made.contrast_deviations, 1.7)
+    uneven |= dict.fromkeys(made.find_contrast_deviations(), 1.7)
     return program(
         replace(moved, body=made),
         parameters=known.with_guess(uneven),
@@ -833,7 +833,7 @@ def test_sensitivities_keep_the_linearised_constraints(made: Collocation, rng):
     for part in made.iterates(z):
         found.append(Sweep(part.segment).forward(part.x, part.equations).by_p)
     moving = [
-        segment.parameter_indices[segment.dynamic_parameters].tolist()
+        segment.list_parameter_indices()[segment.dynamic_parameters].tolist()
         for segment in made.transcriptions
     ]
     for place in sorted(set(chain(*moving))):
@@ -856,12 +856,12 @@ def test_the_loss_of_simulated_motions_has_one_gradient_forward_and_backward(
         made.parameters.guess_q,
         0.1 + 0.3 * np.abs(rng.normal(size=made.nphi)),
     )
-    p = np.clip(np.concatenate([q, phi]), *made.parameter_bounds)
+    p = np.clip(np.concatenate([q, phi]), *made.compute_parameter_bounds())
     z = simulate_variables(made, p)
     rows = [segment.grid_times for segment in made.transcriptions]
     point = Horizon(made, rows).evaluate(p, made.unpack(z)[1])
     forward, backward = (
-        2 * made.loss_scale * point.fit.score,
+        2 * made.loss_scale * point.fit.compute_score(),
         adjoint_gradient(made, z),
     )
     assert point.loss == pytest.approx(

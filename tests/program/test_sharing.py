@@ -66,11 +66,11 @@ def test_what_is_shared_is_saved():
     )
     saved = [
         name
-        for name in collocation.parameter_names
+        for name in collocation.list_parameter_names()
         if name.startswith("shared: ")
     ]
-    assert len(set(collocation.parameter_names)) == len(
-        alone.parameter_names
+    assert len(set(collocation.list_parameter_names())) == len(
+        alone.list_parameter_names()
     ) - len(saved)
     assert collocation.nphi == alone.nphi - len(saved)
 
@@ -95,7 +95,8 @@ def test_tares_are_shared():
     pair = [sharing(each, *names) for each in (one, swung_again(one, "second"))]
     program = with_lifted_variables(Collocation(pair, GUESS))
     assert (
-        len({name for name in program.parameter_names if "tare" in name}) == 6
+        len({name for name in program.list_parameter_names() if "tare" in name})
+        == 6
     )
 
 
@@ -268,10 +269,11 @@ def test_words_make_several_groups():
     ]
     assert places == [0, 2, 2, 0, 4]
     assert (
-        collocation.parameter_names[4] == "shared: tilt of gravity, first [rad]"
+        collocation.list_parameter_names()[4]
+        == "shared: tilt of gravity, first [rad]"
     )
     assert (
-        collocation.parameter_names[6]
+        collocation.list_parameter_names()[6]
         == "shared left: tilt of gravity, first [rad]"
     )
 

@@ -146,7 +146,7 @@ def test_the_interval_holds_the_truth_where_the_noises_alone_misses_it():
     assert not holds(noise.statistical95, TRUTH["mu_pa"])
     assert holds(coarse.interval("mu_pa"), TRUTH["mu_pa"])
     assert holds(coarse.interval("young_pa"), 720.0)
-    assert coarse.result.discretisation_kinds == ("step",)
+    assert coarse.result.list_discretisation_kinds() == ("step",)
 
 
 def test_the_value_is_corrected_for_the_step_and_lies_within_both_intervals():
@@ -173,7 +173,7 @@ def test_what_was_not_estimated_is_not_said_to_be_held():
     coarse = found(3e-4, 1)
     unseen = replace(coarse.problem, rollout=cs.RolloutOptions("scheme"))
     blind = run(unseen, seek_causes=False)
-    assert blind.result.discretisation_kinds == ()
+    assert blind.result.list_discretisation_kinds() == ()
     assert blind.estimates["mu_pa"].value == blind.optimum["mu_pa"].value
     assert (
         blind.estimates["mu_pa"].statistical95
@@ -212,7 +212,9 @@ def test_it_is_told_what_was_chosen_and_why():
 
 def test_the_guess_and_the_way_from_it_are_kept():
     finer = found(3e-4)
-    assert finer.start_parameters.guesses["mu_pa"] == pytest.approx(400.0)
+    assert finer.solution.collocation.parameters.guesses[
+        "mu_pa"
+    ] == pytest.approx(400.0)
     numbers = [line.number for line in finer.solution.history]
     assert numbers == sorted(numbers)
     assert finer.solution.history[0].parameters["mu_pa"] == pytest.approx(400.0)
@@ -236,7 +238,7 @@ def test_nothing_is_solved_twice_where_one_step_is_enough():
 def test_a_number_that_is_stated_is_kept():
     solved: list[int] = []
     twice = run(twin(3e-4, 2), counting(solved), seek_causes=False)
-    assert twice.result.discretisation_kinds == ("step",)
+    assert twice.result.list_discretisation_kinds() == ("step",)
     assert solved == [2]
 
 
@@ -298,8 +300,8 @@ def test_an_interrupt_at_finer_steps_leaves_the_first_answer_and_says_so(how):
 
 
 def test_live_estimates_take_one_step_where_none_are_stated():
-    assert model_from_problem(twin(3e-4)).substeps == 1
-    assert model_from_problem(twin(3e-4, 2)).substeps == 2
+    assert model_from_problem(twin(3e-4)).collocation.substeps == 1
+    assert model_from_problem(twin(3e-4, 2)).collocation.substeps == 2
 
 
 @pytest.mark.parametrize("given", ["some", 0, -1])

@@ -85,7 +85,9 @@ def test_the_fastest_turn_is_the_angle_between_the_poses_of_two_grid_times(
     assert turn.time_s == pytest.approx(0.08 - step_s)
     expected = 0.4 * (np.cos(20 * (0.08 - step_s)) - np.cos(20 * 0.08))
     assert turn.angle_rad == pytest.approx(expected, rel=1e-3)
-    assert turn.rate_rad_s == pytest.approx(expected / step_s, rel=1e-3)
+    assert (turn.angle_rad / turn.step_s) == pytest.approx(
+        expected / step_s, rel=1e-3
+    )
 
 
 def test_a_fast_turn_is_warned_of_with_the_substeps_that_cure_it():

@@ -168,7 +168,7 @@ def test_a_grasp_that_lets_go_tells_its_wrench_while_it_holds():
 
 
 def some_p(collocation: Collocation) -> np.ndarray:
-    low, high = collocation.parameter_bounds
+    low, high = collocation.compute_parameter_bounds()
     phi = (
         np.abs(0.3 * np.random.default_rng(1).standard_normal(collocation.nphi))
         + 0.1

@@ -255,8 +255,8 @@ def test_a_sample_needs_all_three_coordinates():
         markers.is_present,
         [[True, True], [False, True], [True, False], [True, False]],
     )
-    np.testing.assert_array_equal(markers.missing_counts, [1, 2])
-    assert markers.sample_count == 5
+    np.testing.assert_array_equal(markers.count_missing(), [1, 2])
+    assert markers.count_samples() == 5
     assert np.isnan(markers.positions_m[1, 0]).all()
 
 

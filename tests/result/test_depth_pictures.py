@@ -293,7 +293,9 @@ def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(
     (part,) = found.collocation.iterates(found.z)
     ((reading, looked),) = depth_residuals(part)
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
-    rows = surface_rows(surface, part.segment.experiment.upward_direction)
+    rows = surface_rows(
+        surface, part.segment.experiment.compute_upward_direction()
+    )
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
     used = np.isfinite(points[:, 4])
     assert used.sum() == reading.correspondences.is_compared.sum()
@@ -329,7 +331,9 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(
     (part,) = found.collocation.iterates(found.z)
     ((reading, looked),) = depth_residuals(part)
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
-    rows = surface_rows(surface, part.segment.experiment.upward_direction)
+    rows = surface_rows(
+        surface, part.segment.experiment.compute_upward_direction()
+    )
     experiment = part.segment.experiment
     x = np.repeat(part.x.reshape(1, -1, 3), 3, axis=0)
     replay = MotionRecord.from_experiment(

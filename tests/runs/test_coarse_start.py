@@ -240,10 +240,11 @@ def test_cavities_and_tendons_are_transferred():
         (moved.tendons[0], experiment.tendons[0]),
         (moved.pressures[0], experiment.pressures[0]),
     ):
-        assert mine.measure.evaluate(
+        assert mine.require_measure().evaluate(
             moved.body.nodes_m.reshape(1, -1)
         ) == pytest.approx(
-            its.measure.evaluate(body.nodes_m.reshape(1, -1)), rel=1e-6
+            its.require_measure().evaluate(body.nodes_m.reshape(1, -1)),
+            rel=1e-6,
         )
 
 

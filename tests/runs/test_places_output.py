@@ -131,9 +131,9 @@ def test_a_later_solve_starts_from_the_places_found(folder: Path, result: dict):
     found = [
         place["position_m"] for place in result["places"]["swing"].values()
     ]
-    assert segment.marker_places_m(segment.guess_phi) == pytest.approx(
-        np.array(found), abs=1e-9
-    )
+    assert segment.marker_places_m(
+        segment.compute_guess_phi()
+    ) == pytest.approx(np.array(found), abs=1e-9)
     z = earlier.simulated_variables(collocation)
     assert z is not None
     again = cs.solve(problem, "reduced-space", start=folder / "run")
@@ -151,13 +151,13 @@ def test_places_travel_to_another_mesh(folder: Path):
         cs.Problem.read(folder / "problem.toml", [*OPTIONS, *other][1::2])
     )
     (segment,) = earlier.apply_to_places(problem.collocation()).transcriptions
-    places_m = segment.marker_places_m(segment.guess_phi)
+    places_m = segment.marker_places_m(segment.compute_guess_phi())
     for m, name in enumerate(segment.experiment.markers.names):
         assert places_m[m] == pytest.approx(
             earlier.places_m["swing"][name], abs=1e-9
         )
         of_nodes, reading = segment.markers.observable.shape_functions(
-            segment.guess_phi
+            segment.compute_guess_phi()
         )
         there = reading.weights[m] @ segment.body.nodes_m[of_nodes[m]]
         assert there == pytest.approx(places_m[m], abs=1e-9)

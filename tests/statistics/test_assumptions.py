@@ -294,7 +294,8 @@ def test_without_damping_its_law_is_no_matter(changes):
     for name in ("damping_law", "rayleigh_damping"):
         row = BY_NAME[name]
         assert all(
-            row.effect(at, axis) is None for axis in range(len(row.components))
+            row.effect(at, axis) is None
+            for axis in range(len(row.list_components()))
         )
 
 

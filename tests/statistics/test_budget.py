@@ -54,7 +54,7 @@ from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.remedies import REMEDIES, remedy_for
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
-NOTHING = {name: "none" for name in Assumptions().deviations}
+NOTHING = {name: "none" for name in Assumptions().collect_deviations()}
 
 
 def problem(air_density_kg_m3: float = 0.0, **stated) -> Problem:
@@ -205,7 +205,7 @@ def test_what_is_estimated_is_not_considered():
     )
     solution = solve(Problem([wide], GUESS))
     names = changes_of_nuisances(
-        solution.collocation, solution.z, Assumptions().deviations
+        solution.collocation, solution.z, Assumptions().collect_deviations()
     ).names
     assert "calibration_scale" not in names
     assert "clock_rate" in names
@@ -213,7 +213,7 @@ def test_what_is_estimated_is_not_considered():
 
 def test_a_nuisance_that_moves_the_body_may_be_considered():
     solution = solve(Problem([measured(hung_cube(12))], GUESS))
-    stated = Assumptions(gravity_rad=0.02).deviations
+    stated = Assumptions(gravity_rad=0.02).collect_deviations()
     changes = changes_of_assumptions(solution.collocation, solution.z, stated)
     here = [k for k, name in enumerate(changes.names) if name == "gravity_rad"]
     assert len(here) == 2
@@ -221,7 +221,7 @@ def test_a_nuisance_that_moves_the_body_may_be_considered():
 
 
 def test_every_assumption_has_a_key_a_default_and_words():
-    assert set(Assumptions().deviations) == {
+    assert set(Assumptions().collect_deviations()) == {
         row.name for row in (*ASSUMPTIONS, *KINDS)
     }
     assert all(
@@ -234,7 +234,7 @@ def test_sources_need_no_nuisance_parameters():
     solution = solve(Problem([measured(hung_cube(12))], GUESS))
     fit = linearise_fit(solution.collocation, solution.z)
     changes = changes_of_assumptions(
-        solution.collocation, solution.z, Assumptions().deviations
+        solution.collocation, solution.z, Assumptions().collect_deviations()
     )
     known = uncertainty_at(solution.collocation, solution.z)
     sources = VarianceSources.from_fit(fit, changes, GUESS, solution.q, known)
@@ -395,10 +395,13 @@ def test_a_law_of_damping_that_is_known_is_no_source():
 
 
 def test_other_laws_of_damping_count_unless_the_law_is_known_and_rayleighs_only_if_stated():
-    default = Assumptions().deviations
+    default = Assumptions().collect_deviations()
     assert default["damping_law"] == 1.0
     assert default["rayleigh_damping"] is None
-    assert Assumptions(damping_law="none").deviations["damping_law"] is None
+    assert (
+        Assumptions(damping_law="none").collect_deviations()["damping_law"]
+        is None
+    )
 
 
 @pytest.mark.parametrize("stated", ["none", NOTHING])

@@ -69,7 +69,7 @@ def measured(symmetry: int, scale: float) -> Experiment:
 
 
 def solved(compliance: object, symmetry: int = 1, scale: float = 1.0):
-    known = dict.fromkeys(Assumptions().deviations, "none")
+    known = dict.fromkeys(Assumptions().collect_deviations(), "none")
     stated = Assumptions(**(known | {"machine_compliance_m_n": compliance}))
     problem = Problem(
         [measured(symmetry, scale)],

@@ -162,9 +162,9 @@ def test_what_is_expected_besides_is_no_noise():
     errors = np.sqrt(1 + variance) * rng.normal(size=variance.shape)
     fit, wrong = of.fit([errors], np.zeros(len(of.names)))
     factored = factorise_information(fit)
-    assert estimate_noise_level(fit, factored).suggested_noise == "by-marker"
+    assert estimate_noise_level(fit, factored).suggest_noise() == "by-marker"
     known = estimate_noise_level(fit.with_disturbances([extra]), factored)
-    assert known.suggested_noise == "given"
+    assert known.suggest_noise() == "given"
     assert known.pooled == pytest.approx(1.0, abs=1.0)  # a deviation of 0.32
     without, widened = (
         uncertainty_from_fit(

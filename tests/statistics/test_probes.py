@@ -59,7 +59,9 @@ def swung(fault: str = "", off: float = 0.0) -> Problem:
     parameters = Parameters.from_mapping(
         {name: Unknown(value) for name, value in TRUTH.items()}
     )
-    exact = {n: "none" for n in Assumptions().deviations if n not in FREED}
+    exact = {
+        n: "none" for n in Assumptions().collect_deviations() if n not in FREED
+    }
     stated = Assumptions(**exact, density_gradient=0.1)
     options = UncertaintyOptions(assumptions=stated)
     return Problem(
@@ -148,7 +150,9 @@ def test_each_of_several_recordings_says_what_it_has_alone():
             tracks.shape
         )
         swings.append(with_markers(swing, tracks))
-    exact = Assumptions(**{name: "none" for name in Assumptions().deviations})
+    exact = Assumptions(
+        **{name: "none" for name in Assumptions().collect_deviations()}
+    )
     options = UncertaintyOptions(assumptions=exact)
     problem = Problem(swings, GUESS, substeps=1, uncertainty=options)
     solved = run(problem, seek_causes=False, probe=True)

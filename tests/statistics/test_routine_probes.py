@@ -102,7 +102,9 @@ def swung(fault: str = "", off: float = 0.0, samples: int = 60) -> Problem:
     }
     parameters = Parameters.from_mapping(TRUTH | estimated)
     # Nothing but the probes is to give concern: all assumptions are stated as exact.
-    exact = Assumptions(**dict.fromkeys(Assumptions().deviations, "none"))
+    exact = Assumptions(
+        **dict.fromkeys(Assumptions().collect_deviations(), "none")
+    )
     options = UncertaintyOptions(assumptions=exact)
     recorded = replace(hung, markers=seen)
     return Problem(
@@ -170,7 +172,7 @@ def answered(problem: Problem) -> SolvedFit:
     collocation = replace(problem.collocation(), substeps=1)
     z, _ = initial_variables(collocation)
     fit = linearise_fit(collocation, z)
-    deviations = probed_deviations(Assumptions().deviations)
+    deviations = probed_deviations(Assumptions().collect_deviations())
     kept = {
         name: deviations[name] if name in (DRIFT, CLOCK) else None
         for name in deviations
@@ -202,7 +204,7 @@ def test_faultless_fits_have_no_significant_probe():
         fit = replace(at.fit, blocks=tuple(noisy))
         fit = fit.after_step(gauss_newton_step(fit))
         here = replace(at, fit=fit)
-        of_fit = here.uncertainty_of_refit(fit, here.parameters)
+        of_fit = here.uncertainty_of_refit(fit, here.read_parameters())
         here = replace(here, statistical={**of_fit.estimates, **of_fit.derived})
         alarms += any(probe.sentences for probe in routine_probes(here))
     assert FALSE_ALARMS == 1e-4
@@ -210,7 +212,7 @@ def test_faultless_fits_have_no_significant_probe():
 
 
 def test_what_is_stated_as_exact_is_tested_too():
-    exact = dict.fromkeys(Assumptions().deviations)
+    exact = dict.fromkeys(Assumptions().collect_deviations())
     assert {n: s for n, s in probed_deviations(exact).items() if s} == {
         DRIFT: 0.02,
         CLOCK: 1e-4,
@@ -301,7 +303,7 @@ def test_a_static_recording_shows_a_drift_only_where_its_load_returns(
     z, _ = initial_variables(collocation)
     (part,) = collocation.iterates(z)
     assert has_monotonic_load(part, collocation) is not drifts
-    none = dict.fromkeys(Assumptions().deviations)
+    none = dict.fromkeys(Assumptions().collect_deviations())
     changes = probed_changes(collocation, z, {**none, DRIFT: 0.02})
     column = changes.names.index(DRIFT)
     assert any(block[..., column].any() for block in changes.blocks) is drifts

@@ -80,9 +80,12 @@ def test_a_step_from_the_joint_answer_is_the_fit_to_one_recording():
 
 def test_recordings_that_agree_have_the_chi_squared_of_chance():
     found = [scatter(judged(seed)) for seed in range(SEEDS)]
-    values = np.array([each.chi_squared for each in found]) / (RECORDINGS - 1)
+    values = np.array([each.compute_chi_squared() for each in found]) / (
+        RECORDINGS - 1
+    )
     assert all(
-        (each.degrees_of_freedom == RECORDINGS - 1).all() for each in found
+        (each.count_degrees_of_freedom() == RECORDINGS - 1).all()
+        for each in found
     )
     low, high = (
         chi2.ppf([1e-4, 1 - 1e-4], SEEDS * (RECORDINGS - 1))
@@ -91,17 +94,23 @@ def test_recordings_that_agree_have_the_chi_squared_of_chance():
     )
     assert (low < values.mean(axis=0)).all()
     assert (values.mean(axis=0) < high).all()
-    assert sum(each.is_disagreeing.any() for each in found) <= 3
+    assert sum(each.find_disagreements().any() for each in found) <= 3
     same = np.array([4.0, 3.0, 2.0, 1.0])
     np.testing.assert_array_equal(found[0].widen(same), same)
 
 
 def test_recordings_that_disagree_widen_the_interval_of_what_they_disagree_on():
     calm, found = judged(1), judged(1, spread=SPREAD)
-    assert scatter(found).is_disagreeing.tolist() == [False, True, False, False]
+    assert scatter(found).find_disagreements().tolist() == [
+        False,
+        True,
+        False,
+        False,
+    ]
     ratio = np.sqrt(np.diag(found.covariance) / np.diag(calm.covariance))
     birge = np.sqrt(
-        scatter(found).chi_squared[1] / scatter(found).degrees_of_freedom[1]
+        scatter(found).compute_chi_squared()[1]
+        / scatter(found).count_degrees_of_freedom()[1]
     )
     assert ratio[1] == pytest.approx(birge, rel=0.3)
     assert found.quantiles[1] == pytest.approx(t.ppf(0.975, RECORDINGS - 1))

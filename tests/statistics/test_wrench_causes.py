@@ -161,7 +161,8 @@ def test_a_large_tare_is_named_although_its_prior_can_follow_it():
     (grasp,) = experiment.grasps
     assert grasp.wrench is not None
     offset = replace(
-        grasp.wrench, values=grasp.wrench.values + 40 * grasp.wrench.sigmas
+        grasp.wrench,
+        values=grasp.wrench.values + 40 * grasp.wrench.stack_sigmas(),
     )
     given = replace(experiment, grasps=[replace(grasp, wrench=offset)])
     (cause,) = wrench_mistakes(Collocation([given], GUESS)).hypotheses

@@ -81,8 +81,11 @@ def test_error_bars_are_those_of_the_slopes():
     solution = ReducedSpace()(collocation)
     markers, sensor = linearise_fit(collocation, solution.z).blocks
     assert (sensor.sigma_key, markers.sigma_key) == ("sigma_n", "sigma_m")
-    assert sensor.measurement_count == int(
-        collocation.transcriptions[0].sensors[0].is_compared_by_component.sum()
+    assert sensor.count_measurements() == int(
+        collocation.transcriptions[0]
+        .sensors[0]
+        .is_compared.reshape(-1, 6)
+        .sum()
     )
     rows = [
         b.jacobian.reshape(-1, 4)[b.is_measured.ravel()]
@@ -239,7 +242,9 @@ def test_a_sensor_tells_stiffness_and_density_apart():
     rows = np.concatenate(
         [block.jacobian.reshape(-1, 5) for block in fit.blocks]
     )
-    np.testing.assert_allclose(rows.T @ rows, point.fit.information, rtol=1e-6)
+    np.testing.assert_allclose(
+        rows.T @ rows, point.fit.compute_information(), rtol=1e-6
+    )
     seen = Problem([blind(swung())], unknown)
     told = uncertainty_at(
         seen.collocation(), seen.collocation().pack(p, x)

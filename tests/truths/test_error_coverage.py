@@ -280,7 +280,7 @@ def test_a_parameter_that_a_prior_determines_costs_no_degree_of_freedom():
     )
     found = uncertainty_from_fit(tight, PARAMETERS, wrong[:4])
     assert found.degrees_of_freedom == pytest.approx(
-        fit.measurement_count - 4, abs=1e-3
+        fit.count_measurements() - 4, abs=1e-3
     )
 
 

@@ -56,10 +56,9 @@ class BenchmarkBody:
     licence_path: str = ""
     note: str = ""
 
-    @property
-    def data_folder(self) -> Path | None:
-        """Folder with the problem file and all data of the body on this computer; None if files are
-        missing.
+    def find_data_folder(self) -> Path | None:
+        """Return the folder with the problem file and all data of the body on this computer; None
+        if files are missing.
         """
         folder = CHECKOUT / "problems" / self.folder
         if not self.script:
@@ -71,17 +70,11 @@ class BenchmarkBody:
         is_complete = all((folder / file).is_file() for file in needed)
         return folder if is_complete else None
 
-    @property
-    def licence_file(self) -> Path | None:
-        """Path of the licence of the recordings in a checkout of the repository; None if
+    def find_licence_file(self) -> Path | None:
+        """Return the path of the licence of the recordings in a checkout of the repository; None if
         `licence_path` is empty. Whether the file exists is not checked.
         """
         return CHECKOUT / self.licence_path if self.licence_path else None
-
-    @property
-    def is_available(self) -> bool:
-        """Whether the data of the body are on this computer."""
-        return self.data_folder is not None
 
     def read_problem(self) -> Problem:
         """Return the problem of the body.
@@ -91,7 +84,7 @@ class BenchmarkBody:
         InputError
             If the data are not on this computer, with the script that fetches them.
         """
-        folder = self.data_folder
+        folder = self.find_data_folder()
         if folder is None:
             remedy = (
                 f"run python scripts/{self.script} in a clone of the repository"
@@ -187,6 +180,10 @@ def chosen_bodies(name: str | None) -> tuple[BenchmarkBody, ...]:
         If there is no body of this name.
     """
     if name is None:
-        return tuple(body for body in BODIES.values() if body.is_available)
+        return tuple(
+            body
+            for body in BODIES.values()
+            if body.find_data_folder() is not None
+        )
     require_among(name, BODIES, where="--body")
     return (BODIES[name],)

@@ -100,9 +100,8 @@ class BodyTask:
             )
         return cls(body, entry, problem=problem, values=values, signals=signals)
 
-    @property
-    def experiments(self) -> list[Experiment]:
-        """Recordings to be predicted, in the order of the problem."""
+    def make_experiments(self) -> list[Experiment]:
+        """Return the recordings to be predicted, in the order of the problem."""
         return _recordings(self.problem, self.body)
 
 
@@ -215,9 +214,9 @@ def _write_body(task: BodyTask, folder: Path) -> None:
     FileExistsError
         If the folder exists; other faults of the file system are OSErrors, too.
     """
-    mesh = _mesh(task.experiments[0])
+    mesh = _mesh(task.make_experiments()[0])
     folder.mkdir()
-    if (licence := task.body.licence_file) is not None:
+    if (licence := task.body.find_licence_file()) is not None:
         shutil.copyfile(licence, folder / LICENCE_FILE)
     mesh.write(folder / "mesh.vtu")
     write_columns_csv(
@@ -232,7 +231,7 @@ def _write_body(task: BodyTask, folder: Path) -> None:
     content = _body_content(task)
     content["recordings"] = [
         _write_recording(task, experiment, folder=folder)
-        for experiment in task.experiments
+        for experiment in task.make_experiments()
     ]
     write_text_file(folder / BODY_FILE, as_json(content) + "\n")
     write_text_file(folder / README_FILE, body_readme(content))
@@ -267,7 +266,7 @@ def _body_content(task: BodyTask) -> dict[str, Any]:
     KeyError
         If `body_description` has no formula for the law or the damping law.
     """
-    experiment = task.experiments[0]
+    experiment = task.make_experiments()[0]
     body = experiment.body
     theta = body.theta_from_values(task.values)
     (part,) = body.parts
@@ -348,7 +347,7 @@ def _write_recording(
         files["markers"] = f"{name}_markers.csv"
         write_text_file(folder / files["markers"], _marker_table(experiment))
     else:
-        content["symmetry"] = experiment.symmetry
+        content["symmetry"] = experiment.find_symmetry()
     content["grasps"] = _write_grasps(experiment, folder=folder, name=name)
     return content
 

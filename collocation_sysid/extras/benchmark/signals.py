@@ -222,7 +222,9 @@ def _force_signals(
             columns.append(f"grasp_{number}_{COMPONENTS[component]}_n")
             measured.append(wrench.symmetry * wrench.values[:, component])
             simulated.append(wrench.symmetry * prediction[:, component])
-            sigma.append(wrench.symmetry * float(wrench.sigmas[component]))
+            sigma.append(
+                wrench.symmetry * float(wrench.stack_sigmas()[component])
+            )
     signal = Signal(
         "forces",
         TIME_KEY,

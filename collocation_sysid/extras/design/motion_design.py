@@ -102,7 +102,7 @@ class ErrorBars:
         """Return the error bars at the first of at least one draw of θ, the middle, with the lowest
         and the highest over all draws. `errors` are those at each draw, all with the same names.
         """
-        each = [error.relative for error in errors]
+        each = [error.compute_relative() for error in errors]
         lowest, highest = (
             {n: pick(e[n] for e in each) for n in each[0]}
             for pick in (min, max)
@@ -163,15 +163,15 @@ class Design:
         """
         return self.experiment.grasps[0].poses
 
-    @property
-    def active_limits(self) -> list[str]:
-        """Names of the robot's limits of which the motion uses more than the share `REACHED`."""
+    def list_active_limits(self) -> list[str]:
+        """Return the names of the robot's limits of which the motion uses more than the share
+        `REACHED`.
+        """
         return [name for name, share in self.shares.items() if share > REACHED]
 
-    @property
-    def minimised_error(self) -> float:
-        """Relative error bar that was minimised, 0.01 for 1 %, combined over parameters and draws
-        by the criterion.
+    def compute_minimised_error(self) -> float:
+        """Return the relative error bar that was minimised, 0.01 for 1 %, combined over parameters
+        and draws by the criterion.
         """
         return float(np.exp(self.best.value))
 
@@ -223,7 +223,7 @@ class MotionObjective:
             coefficients,
             float(recording.since_start_s[-1]),
             highest_hz=recording.highest_hz(self.limits),
-            reach=self.bounds.reach,
+            reach=self.bounds.compute_reach(),
         )
         return self.bounds.scale_to_limits(free)
 
@@ -267,7 +267,7 @@ class MotionObjective:
         KeyboardInterrupt
             If it is interrupted before the first evaluation.
         """
-        sensed = self.recording.template.grasps[0].has_sensor
+        sensed = self.recording.template.grasps[0].has_sensor()
         if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:
             return SearchResult()
         middle = self.draws[0]
@@ -474,7 +474,7 @@ def _evaluate_design(
         experiment,
         values,
         integrator=problem.scheme,
-        substeps=problem.first_substeps,
+        substeps=problem.choose_first_substeps(),
     )
     return Design(
         recording,
@@ -614,7 +614,7 @@ def _select_experiment(problem: Problem, name: str | None) -> Experiment:
 
 def _require_guesses(problem: Problem) -> None:
     """Raise `InputError` if a parameter has no guess."""
-    if names := problem.parameters.names_without_guess:
+    if names := problem.parameters.list_names_without_guess():
         key = f"parameters.{names[0]}"
         raise InputError(
             "this parameter has no guess, but a motion is designed for a value of each parameter; "

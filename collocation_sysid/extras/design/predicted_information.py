@@ -222,9 +222,10 @@ class PredictedErrors:
         chosen = names or list(self.slopes)[: self.estimated_count]
         return np.array([self.slopes[name] for name in chosen])
 
-    @property
-    def relative(self) -> dict[str, float]:
-        """Standard errors of parameters and derived moduli relative to their values, by name."""
+    def compute_relative(self) -> dict[str, float]:
+        """Return the standard errors of parameters and derived moduli relative to their values, by
+        name.
+        """
         return {
             name: float(np.sqrt(slope @ self.covariance @ slope))
             for name, slope in self.slopes.items()
@@ -296,7 +297,7 @@ def symmetric_draws(
     """
     rng = np.random.default_rng(seed)
     deviations = [root @ rng.normal(size=len(middle)) for _ in range(pairs)]
-    lower, upper = parameters.bounds_q
+    lower, upper = parameters.compute_bounds_q()
     margin = 1e-3 * np.minimum(upper - lower, 1.0)
     draws = [
         middle,
@@ -322,7 +323,7 @@ def shared_information(fit: LinearisedFit) -> Array:
     included.
     """
     alone = least_squares_of_fit(fit).marginal(fit.shared_count)
-    return alone.information - np.diag(
+    return alone.compute_information() - np.diag(
         fit.prior_jacobian[: fit.shared_count] ** 2
     )
 
@@ -403,23 +404,23 @@ class FutureRecording:
                 "the grasp holds only some axes, or only a part of the time; expected one that holds "
                 "all axes throughout"
             )
-        if not 3 <= self.samples <= MOST_SAMPLES:
+        if not 3 <= self.count_samples() <= MOST_SAMPLES:
             raise InputError(
-                f"{self.duration_s:g} s are {self.samples - 1:.6g} steps of "
+                f"{self.duration_s:g} s are {self.count_samples() - 1:.6g} steps of "
                 f"{template.timestep_s:g} s; expected 2 to {MOST_SAMPLES}",
                 where="--duration",
             )
 
-    @property
-    def samples(self) -> int:
-        """Number of samples of the designed recording, the first and the last included."""
+    def count_samples(self) -> int:
+        """Return the number of samples of the designed recording, the first and the last included."""
         return round(self.duration_s / self.template.timestep_s) + 1
 
     @cached_property
     def since_start_s(self) -> Array:
         """Times (T,) of the samples since the start [s]."""
         return np.asarray(
-            np.arange(self.samples) * self.template.timestep_s, dtype=np.float64
+            np.arange(self.count_samples()) * self.template.timestep_s,
+            dtype=np.float64,
         )
 
     @cached_property
@@ -475,7 +476,7 @@ class FutureRecording:
     @cached_property
     def pose_times_s(self) -> Array:
         """Times (P,) of the poses since the start [s], several per sample."""
-        count = POSES_PER_SAMPLE * (self.samples - 1) + 1
+        count = POSES_PER_SAMPLE * (self.count_samples() - 1) + 1
         return np.linspace(0.0, self.since_start_s[-1], count)
 
     def poses(self, motion: HandMotion) -> PoseSequence:
@@ -533,7 +534,7 @@ class FutureRecording:
             If the simulation does not reach the end.
         """
         fit, x = self.linearise(experiment, q)
-        positions = x[:: self.problem.first_substeps].reshape(
+        positions = x[:: self.problem.choose_first_substeps()].reshape(
             len(experiment.t_s), -1, 3
         )
         return SimulatedMotion(
@@ -556,7 +557,7 @@ class FutureRecording:
             [fitted],
             problem.parameters,
             scheme=problem.scheme,
-            substeps=problem.first_substeps,
+            substeps=problem.choose_first_substeps(),
         )
 
     def linearise(
@@ -594,7 +595,7 @@ class FutureRecording:
             raise failure
         self._starts[q.tobytes()] = x[:1]
         return linearise_fit(
-            alone, alone.pack(np.append(q, segment.guess_phi), [x])
+            alone, alone.pack(np.append(q, segment.compute_guess_phi()), [x])
         ), x
 
 
@@ -639,9 +640,9 @@ class LinearRecording:
         return (
             6
             * 16e-9
-            * recording.samples
+            * recording.count_samples()
             * markers
-            * len(segment.parameter_indices)
+            * len(segment.list_parameter_indices())
         )
 
     @classmethod
@@ -660,7 +661,7 @@ class LinearRecording:
             recording.experiment(_pulse_poses(recording, np.zeros(6))), q
         )[0]
         (at_rest,) = still.blocks
-        count = recording.samples
+        count = recording.count_samples()
         length = 1 << (2 * count - 1).bit_length()
         answers = []
         for k, height in enumerate(HEIGHTS):
@@ -691,7 +692,7 @@ class LinearRecording:
         transform = np.einsum("fk,kfcp->fcp", of_course, self.responses)
         (rest,) = self.rest.blocks
         change = np.fft.irfft(transform, self.length, axis=0)[
-            : recording.samples
+            : recording.count_samples()
         ]
         slope = rest.jacobian + change.reshape(rest.jacobian.shape)
         return shared_information(

@@ -156,7 +156,7 @@ def comparison_table(
             (
                 each.what,
                 *values,
-                f"{each.relative_difference:+.2%}",
+                f"{each.compute_relative_difference():+.2%}",
                 each.remark,
             )
         )

@@ -151,7 +151,7 @@ def _obstacle_cards(
         )
         deck += f"*ELEMENT,TYPE=C3D4,ELSET=W{k}\n"
         for i, nodes in enumerate(
-            wall.tetrahedra + 1, start=wall.first_cell + 1
+            wall.build_tetrahedra() + 1, start=wall.first_cell + 1
         ):
             deck += f"{i},{','.join(map(str, nodes))}\n"
         touching = body.body.mesh.surface[wall.faces].tolist()
@@ -294,7 +294,10 @@ def _material_card(
             "its volumetric energy is ½ κ ((J² − 1)/2 − ln J) instead of ½ κ (J − 1)²: both "
             "agree for small changes of volume"
         )
-    if region.terms and len(region.terms) <= MOST_TERMS:
+    if (
+        region.list_power_terms()
+        and len(region.list_power_terms()) <= MOST_TERMS
+    ):
         is_foam = region.material.startswith("hyperfoam")
         return _power_law_card(
             region, volume
@@ -317,7 +320,7 @@ def _power_law_card(region: IdentifiedRegion, volume: float) -> str:
     volume : float
         Constant D₁ = 2/κ of the volumetric energy of Ogden's law [1/Pa].
     """
-    terms = region.terms
+    terms = region.list_power_terms()
     if region.material.startswith("ogden"):
         keyword = "HYPERELASTIC,OGDEN"
         values = [

@@ -78,9 +78,8 @@ class PredictionComparison:
     unit: str
     remark: str = ""
 
-    @property
-    def relative_difference(self) -> float:
-        """Relative difference (theirs − ours) / ours; NaN if ours is zero."""
+    def compute_relative_difference(self) -> float:
+        """Return the relative difference (theirs − ours) / ours; NaN if ours is zero."""
         return (
             (self.theirs - self.ours) / self.ours if self.ours else float("nan")
         )

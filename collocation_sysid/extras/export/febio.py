@@ -155,10 +155,10 @@ def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> ElasticLaw:
             {"c1": c["c10_pa"], "c2": c["c01_pa"]},
             is_uncoupled=True,
         )
-    if region.material in CAPABILITIES.materials and region.terms:
+    if region.material in CAPABILITIES.materials and region.list_power_terms():
         # The energy of a term is c/m² (Σ λ̄^m − 3).
         values = {}
-        for number, term in enumerate(region.terms, start=1):
+        for number, term in enumerate(region.list_power_terms(), start=1):
             values |= {
                 f"c{number}": term.mu_pa * term.alpha,
                 f"m{number}": term.alpha,
@@ -272,12 +272,15 @@ def _obstacle_mesh_xml(
             for i, point in enumerate(wall.start_points_m, wall.first_node + 1)
         )
         cells = _numbered_elements(
-            "elem", wall.tetrahedra + 1, offset=wall.first_cell
+            "elem", wall.build_tetrahedra() + 1, offset=wall.first_cell
         )
         solids += f'<Nodes name="nodes_wall_{k}">\n{nodes}</Nodes>\n'
         solids += f'<Elements type="tet4" name="cells_wall_{k}">\n{cells}</Elements>\n'
         touching = body.body.nodes.nodes_of_faces(corners[wall.faces]) + 1
-        for name, sides in (("body", touching), ("wall", wall.triangles + 1)):
+        for name, sides in (
+            ("body", touching),
+            ("wall", wall.build_triangles() + 1),
+        ):
             rows = _numbered_elements(f"tri{sides.shape[1]}", sides)
             facets += f'<Surface name="{name}_side_{k}">\n{rows}</Surface>\n'
         facets += (

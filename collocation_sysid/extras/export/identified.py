@@ -115,9 +115,8 @@ class IdentifiedRegion:
         """Bulk modulus κ = λ + ⅔ μ [Pa]."""
         return self.lambda_pa + 2 / 3 * self.mu_pa
 
-    @property
-    def terms(self) -> tuple[PowerTerm, ...]:
-        """Terms of Ogden's law or of a compressible foam; empty for other materials."""
+    def list_power_terms(self) -> tuple[PowerTerm, ...]:
+        """Return the terms of Ogden's law or of a compressible foam; empty for other materials."""
         if not is_power_law(self.material):
             return ()
         c = self.constants
@@ -380,7 +379,7 @@ class IdentifiedBody:
             parameters={
                 n: each
                 for n, each in result.parameters.items()
-                if n in result.values
+                if n in result.collect_estimates()
             },
             body=body,
             theta=body.theta_from_values(values),

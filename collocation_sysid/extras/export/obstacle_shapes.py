@@ -350,23 +350,21 @@ class FacetedObstacle:
         (rotation,), (place,) = self.obstacle.poses.at([t_s])
         return self.facets.points_m @ rotation.T + place
 
-    @property
-    def triangles(self) -> Index:
-        """Node indices of the facets (f, 3) in the file of a simulator, which count on after those
-        of the body and of earlier obstacles.
+    def build_triangles(self) -> Index:
+        """Return the node indices of the facets (f, 3) in the file of a simulator, which count on
+        after those of the body and of earlier obstacles.
         """
         return self.facets.triangles + self.first_node
 
-    @property
-    def tetrahedra(self) -> Index:
-        """Node indices (f, 4), counted like those of `triangles`, of a tetrahedron under each
-        facet, whose last node is the point behind all facets.
+    def build_tetrahedra(self) -> Index:
+        """Return the node indices (f, 4), counted like those of `triangles`, of a tetrahedron under
+        each facet, whose last node is the point behind all facets.
         """
         inner = np.full(
-            (len(self.triangles), 1),
+            (len(self.build_triangles()), 1),
             self.first_node + len(self.start_points_m) - 1,
         )
-        return np.hstack([self.triangles[:, [0, 2, 1]], inner])
+        return np.hstack([self.build_triangles()[:, [0, 2, 1]], inner])
 
 
 def faceted_obstacles(body: IdentifiedBody) -> tuple[FacetedObstacle, ...]:

@@ -77,7 +77,7 @@ def write_rerun(
     result, replays = read_run(run)
     if experiment is not None:
         replays = [experiment_named(replays, experiment, run=run)]
-    replays = [replay for replay in replays if replay.has_shapes]
+    replays = [replay for replay in replays if replay.has_shapes()]
     if not replays:
         raise InputError(
             "no experiment of this run has a stored motion of a body with a mesh; expected a run "
@@ -245,7 +245,7 @@ class _Recording:
         """Write each parameter of a result with its combined interval, if known, as constant curves
         between the two times `span_s` [s].
         """
-        for name, each in result.values.items():
+        for name, each in result.collect_estimates().items():
             curves = {"value": each.value}
             if each.combined95 is not None:
                 curves |= {

@@ -143,7 +143,7 @@ def _elastic_law_xml(region: IdentifiedRegion) -> str:
     name = CAPABILITIES.materials.get(region.material, "NeoHookean")
     moduli = values_as_text((region.mu_pa, region.lambda_pa))
     if region.material == "ogden-1":
-        (term,) = region.terms
+        (term,) = region.list_power_terms()
         # The energy is μ/α² (Σ λ̄^α − 3) + ½ κ ln² J.
         moduli = values_as_text(
             (term.mu_pa * term.alpha, term.alpha, region.kappa_pa)

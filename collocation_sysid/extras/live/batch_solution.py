@@ -44,8 +44,10 @@ def recording_from_log(
         All rows, substeps included, with their samples.
     """
     experiment = model.experiment
-    at_samples = log[:: model.substeps]
-    t_s = experiment.t_s[0] + model.interval_s * np.arange(len(at_samples))
+    at_samples = log[:: model.collocation.substeps]
+    t_s = experiment.t_s[0] + model.experiment.timestep_s * np.arange(
+        len(at_samples)
+    )
     tracks_m = np.full((len(t_s), len(experiment.markers.names), 3), np.nan)
     for when, tracks in intake.marker_samples(log):
         if abs(when - round(when)) > STEP_TOLERANCE:
@@ -77,7 +79,7 @@ def recording_from_log(
         if len(inside) < FEWEST or not np.isfinite(values).any():
             continue
         series = {
-            "t_s": t_s[0] + model.interval_s * np.array(inside),
+            "t_s": t_s[0] + model.experiment.timestep_s * np.array(inside),
             "values": values,
         }
         if isinstance(gauge, Gauge):

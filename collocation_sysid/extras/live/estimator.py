@@ -170,8 +170,8 @@ def _require_phases(problem: Problem) -> None:
     """Raise an `InputError` for a problem with a two-phase field without known phases, which live
     estimation cannot find.
     """
-    for name, modes in problem.two_phase_fields.items():
-        if not modes.has_phases:
+    for name, modes in problem.find_two_phase_fields().items():
+        if not modes.has_phases():
             raise InputError(
                 f"the phases of {name} are unknown, and a live estimate does not search for them; "
                 "expected the problem of a result, `cs.run(problem).problem`, or prior = 'smooth'"
@@ -239,8 +239,8 @@ class LiveEstimator:
         )
         stencils = [each.stencil for each in model.instruments]
         self.intake = FrameBuffer(
-            model.interval_s,
-            model.substeps,
+            model.experiment.timestep_s,
+            model.collocation.substeps,
             neighbouring_samples=neighbours,
             largest_jump_m=most_motion_m,
             instruments=stencils,
@@ -250,15 +250,19 @@ class LiveEstimator:
             model.body_size_m, model.experiment.markers.sigma_m
         )
         self.samples = 0
-        self.budget_s = options.budget_s or BUDGET_FRACTION * model.interval_s
+        self.budget_s = (
+            options.budget_s or BUDGET_FRACTION * model.experiment.timestep_s
+        )
         self.rows = options.rows
         samples = max(
             LARGEST_GAP,
-            round(options.window_s / model.interval_s / WINDOW_BLOCKS),
+            round(
+                options.window_s / model.experiment.timestep_s / WINDOW_BLOCKS
+            ),
         )
-        self._block_rows = samples * model.substeps
+        self._block_rows = samples * model.collocation.substeps
         self._blocks = max(
-            2, round(options.window_s / model.interval_s / samples)
+            2, round(options.window_s / model.experiment.timestep_s / samples)
         )
         self._set_bounds()
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
@@ -270,7 +274,7 @@ class LiveEstimator:
         self.log: list[LoggedRow] = []
         self.search = (
             self._new_search()
-            if problem.parameters.names_without_guess
+            if problem.parameters.list_names_without_guess()
             else None
         )
         self.scatter = ResidualScatter()
@@ -614,7 +618,7 @@ class LiveEstimator:
                 done = first_pass.add_rows(
                     [
                         row.poses
-                        for row in rows[: first_pass.remaining_rows_of_block]
+                        for row in rows[: first_pass.count_remaining_rows()]
                     ]
                 )
         except SimulationError as error:
@@ -694,7 +698,7 @@ class LiveEstimator:
             Residuals of one sample, in standard deviations of the markers; NaN where missing.
         """
         if (
-            self.linearisation_distance > LARGEST_SETTLED_DISTANCE
+            self.distance_from_linearisation() > LARGEST_SETTLED_DISTANCE
             or not 0 < self.scatter.rms < GROSS_MISFIT
         ):
             return np.zeros(len(residual), dtype=bool)
@@ -710,7 +714,9 @@ class LiveEstimator:
         """Set the attributes `lower` and `upper`, bounds (P,) of the parameters p in the solver's
         coordinates, from the model.
         """
-        self.lower, self.upper = self.model.collocation.parameter_bounds
+        self.lower, self.upper = (
+            self.model.collocation.compute_parameter_bounds()
+        )
 
     def _new_search(self) -> StiffnessSearch:
         """Return a new search for initial values over a range of stiffness, with the present
@@ -745,7 +751,7 @@ class LiveEstimator:
                 trial.repeat_rows([row])
         except SimulationError:
             return None
-        self._estimates_at(trial.information, self.p)
+        self._estimates_at(trial.sweep.information, self.p)
         self.budget = self._measure_times(trial, row)
         return poses, trial.blocks[0].stored_rows[0].x
 
@@ -847,7 +853,7 @@ class LiveEstimator:
         anew".
         """
         if self.first_pass is not None:
-            self.prior = self.first_pass.measured_information
+            self.prior = self.first_pass.condense_measurements()
         self.first_pass = self.second_pass = None
         self.log.clear()
         self.intake.reset()
@@ -912,7 +918,7 @@ class LiveEstimator:
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
         self.search = (
             self._new_search()
-            if self.problem.parameters.names_without_guess
+            if self.problem.parameters.list_names_without_guess()
             else None
         )
         self.scatter = ResidualScatter()
@@ -922,10 +928,9 @@ class LiveEstimator:
 
     # Estimates --------------------------------------------------------------------------------
 
-    @property
-    def linearisation_distance(self) -> float:
-        """Largest distance of the estimate from the linearisation points of the rows in the window,
-        in standard errors of single material parameters.
+    def distance_from_linearisation(self) -> float:
+        """Return the largest distance of the estimate from the linearisation points of the rows in
+        the window, in standard errors of single material parameters.
 
         Infinite if there is no pass, or if it failed.
         """
@@ -957,7 +962,7 @@ class LiveEstimator:
         distances = np.abs(np.array(points) - self.model.transformed(p))[:, :nq]
         return float(
             np.max(
-                distances / first_pass.information.standard_errors[:nq],
+                distances / first_pass.sweep.information.standard_errors[:nq],
                 initial=0.0,
             )
         )
@@ -988,9 +993,9 @@ class LiveEstimator:
         known : SquareRootInformation
             Quadratic loss, in transformed parameters.
         """
-        reach = self._trust * self.model.collocation.reach_p
-        low = np.maximum(self.lower, first_pass.linearisation_point - reach)
-        high = np.minimum(self.upper, first_pass.linearisation_point + reach)
+        reach = self._trust * self.model.collocation.compute_reach_p()
+        low = np.maximum(self.lower, first_pass.sweep.p - reach)
+        high = np.minimum(self.upper, first_pass.sweep.p + reach)
         best = known.minimiser(
             self.model.transformed(low), self.model.transformed(high)
         )
@@ -1011,13 +1016,13 @@ class LiveEstimator:
             The first pass.
         """
         size = self.model.parameter_count
-        samples = len(self.log) / self.model.substeps
+        samples = len(self.log) / self.model.collocation.substeps
         deviation = POINT_PRIOR_DEVIATION * max(1.0, samples / TRIAL_SAMPLES)
         slopes = np.diag(
             1
             / (
                 deviation
-                * self.model.collocation.reach_p
+                * self.model.collocation.compute_reach_p()
                 * first_pass.sweep.rates
             )
         )
@@ -1062,7 +1067,9 @@ class LiveEstimator:
         self.counts["looked"] += 1
         estimates = self._estimates_at(self._combined.information, self.p)
         grave += data_concerns(self.scatter, self.counts, samples=self.samples)
-        grave += estimate_concerns(estimates, self.linearisation_distance)
+        grave += estimate_concerns(
+            estimates, self.distance_from_linearisation()
+        )
         return estimates, Assessment.from_concerns(grave)
 
     def _estimates_at(
@@ -1151,7 +1158,7 @@ class LiveEstimator:
                 )
             affordable = min(
                 self._affordable_rows(done, self.clock() - began),
-                second_pass.repeatable_rows,
+                second_pass.count_repeatable_rows(),
             )
             if not affordable:
                 break
@@ -1183,7 +1190,7 @@ class LiveEstimator:
         lag = len(self.log) - second_pass.rows
         elapsed_s = self.clock() - began
         if lag > min(
-            second_pass.repeatable_rows,
+            second_pass.count_repeatable_rows(),
             self._affordable_rows(0, elapsed_s + self.budget.frame_s),
         ):
             return 0
@@ -1282,7 +1289,7 @@ class LiveEstimator:
                 len(self.log) < search.rows or not at_start
             ):
                 return None
-            p = search.best if search.is_done else search.next_trial()
+            p = search.find_best() if search.is_done else search.next_trial()
             base = None
             if p is None:
                 self.search = None
@@ -1297,10 +1304,12 @@ class LiveEstimator:
             p = self._next_linearisation_point(first_pass)
             if (
                 self._largest_distance(
-                    first_pass, p, points=first_pass.linearisation_points
+                    first_pass,
+                    p,
+                    points=first_pass.linearisation_points_from(0),
                 )
                 <= REPEAT_DISTANCE
-                and not first_pass.sweep.needs_another_pass
+                and not first_pass.sweep.needs_another_pass()
             ):
                 return None
         return WindowPass(
@@ -1382,24 +1391,27 @@ class LiveEstimator:
         was_search = self.search is not None
         self.search = None
         points = [
-            *first_pass.linearisation_points,
-            second_pass.linearisation_points[0],
+            *first_pass.linearisation_points_from(0),
+            second_pass.linearisation_points_from(0)[0],
         ]
-        expected = max(first_pass.information.loss(point) for point in points)
+        expected = max(
+            first_pass.sweep.information.loss(point) for point in points
+        )
         # The loss of a pass whose linearisation point was changed is not that of a simulation.
         is_within_trust_region = (
             first_pass.last_relinearised_row
             and self._largest_distance(
                 first_pass,
-                first_pass.linearisation_point,
-                points=second_pass.linearisation_points,
+                first_pass.sweep.p,
+                points=second_pass.linearisation_points_from(0),
             )
             <= REPEAT_DISTANCE
         )
         fits = (
             first_pass.has_failed
             or is_within_trust_region
-            or second_pass.loss <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
+            or second_pass.compute_loss()
+            <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
         )
         if not second_pass.has_failed and fits:
             second_pass.base = None
@@ -1416,15 +1428,9 @@ class LiveEstimator:
                 second_pass, None
             ).scatter(second_pass.sweep.transformed)
         else:
-            reach = self.model.collocation.reach_p
+            reach = self.model.collocation.compute_reach_p()
             length = float(
-                np.abs(
-                    (
-                        second_pass.linearisation_point
-                        - first_pass.linearisation_point
-                    )
-                    / reach
-                ).max()
+                np.abs((second_pass.sweep.p - first_pass.sweep.p) / reach).max()
             )
             self._trust = max(RADIUS_REDUCTION * length, 1e-6)
             self._rejected += 1

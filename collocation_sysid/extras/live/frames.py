@@ -600,7 +600,7 @@ class FrameReader:
         ]
         t_s = parse_time(by_name["t_s"])
         instrument_samples = list[InstrumentSample]()
-        for number, columns in enumerate(self._instrument_columns, 1):
+        for number, columns in enumerate(self._list_instrument_columns(), 1):
             values = np.array(
                 [by_name.get(column, np.nan) for column in columns]
             )
@@ -622,11 +622,10 @@ class FrameReader:
         before = "" if len(self.grasps) == 1 else f"{number}."
         return [before + name for name in POSE]
 
-    @property
-    def _instrument_columns(self) -> list[Sequence[str]]:
-        """Column names of each instrument: custom sensors, then the six of each sensor of a grasp,
-        "fx_n" to "tz_nm"; the latter with the number of the grasp and a dot in front if there are
-        several.
+    def _list_instrument_columns(self) -> list[Sequence[str]]:
+        """Return the column names of each instrument: custom sensors, then the six of each sensor
+        of a grasp, "fx_n" to "tz_nm"; the latter with the number of the grasp and a dot in front if
+        there are several.
         """
         before = [
             "" if len(self.wrenches) == 1 else f"{number}."
@@ -662,7 +661,9 @@ class FrameReader:
             *(f"{m}_{a}" for m in self.names for a in ("x", "y", "z")),
         }
         known |= {
-            column for each in self._instrument_columns for column in each
+            column
+            for each in self._list_instrument_columns()
+            for column in each
         }
         if unknown := [name for name in columns if name not in known]:
             raise InputError(

@@ -45,7 +45,7 @@ class StiffnessSearch:
     """
 
     def __init__(self, model: StreamingModel, phi: Array) -> None:
-        self.rows = (TRIAL_SAMPLES - 1) * model.substeps + 1
+        self.rows = (TRIAL_SAMPLES - 1) * model.collocation.substeps + 1
         forgotten = without_guesses(model.collocation).parameters
         self._waiting = [
             typical_parameters(forgotten, young).guess_q for young in TRIED_PA
@@ -84,8 +84,8 @@ class StiffnessSearch:
         self._waiting.pop(0)
         self._tried.append(
             (
-                np.inf if trial.has_failed else trial.loss,
-                trial.linearisation_point,
+                np.inf if trial.has_failed else trial.compute_loss(),
+                trial.sweep.p,
             )
         )
         least = min(loss for loss, _ in self._tried)
@@ -93,11 +93,10 @@ class StiffnessSearch:
         if np.isfinite(least) and all(worse[-2:]) and len(worse) > 2:
             self._waiting.clear()
 
-    @property
-    def best(self) -> Array | None:
-        """Parameters p (P,) of the pass with the smallest loss, in the solver's coordinates: its
-        linearisation point at its end. None if every trial failed. At least one trial must be
-        recorded (otherwise `ValueError`).
+    def find_best(self) -> Array | None:
+        """Return the parameters p (P,) of the pass with the smallest loss, in the solver's
+        coordinates: its linearisation point at its end. None if every trial failed. At least one
+        trial must be recorded (otherwise `ValueError`).
         """
         loss, p = min(self._tried, key=lambda each: each[0])
         return p if np.isfinite(loss) else None

@@ -120,26 +120,11 @@ class WindowPass:
         self.rows = 0
         self._off: list[Array] = []
 
-    @property
-    def linearisation_point(self) -> Array:
-        """Parameters p (P,) of the current linearisation point in the solver's coordinates, not
-        transformed.
+    def compute_loss(self) -> float:
+        """Return the loss of measurements and priors, a sum of squared residuals, at the current
+        linearisation point.
         """
-        return self.sweep.p
-
-    @property
-    def information(self) -> SquareRootInformation:
-        """Information of measurements and prior at the current linearisation point, in the
-        transformed parameters (`StreamingModel.transformed`).
-        """
-        return self.sweep.information
-
-    @property
-    def loss(self) -> float:
-        """Loss of measurements and priors, a sum of squared residuals, at the current linearisation
-        point.
-        """
-        return self.information.loss(self.sweep.transformed)
+        return self.sweep.information.loss(self.sweep.transformed)
 
     def add_rows(
         self, poses: Sequence[Poses], guesses: Sequence[Array] = ()
@@ -154,7 +139,7 @@ class WindowPass:
         Parameters
         ----------
         poses : sequence of Poses
-            Poses of the moving grasps at the rows, at least one, at most `remaining_rows_of_block`.
+            Poses of the moving grasps at the rows, at least one, at most `count_remaining_rows`.
         guesses : sequence of (3n,), optional
             Initial guesses of the positions [m]; by default from the rows of `base`, if it has
             them.
@@ -168,7 +153,7 @@ class WindowPass:
             new = (
                 self.start
                 if not self.blocks
-                else (self.sweep.state, self.linearisation_point)
+                else (self.sweep.copy_state(), self.sweep.p)
             )
             self.blocks.append(WindowBlock(*new))
         rows_of_base = self._rows_of_base(len(poses))
@@ -195,9 +180,9 @@ class WindowPass:
         self.sweep = StreamingSweep(
             self.model,
             p,
-            prior_information=self.information,
-            start=self.sweep.state,
-            at=self.linearisation_point,
+            prior_information=self.sweep.information,
+            start=self.sweep.copy_state(),
+            at=self.sweep.p,
         )
         self._base_changes.append((self.rows, self.sweep.transformed))
 
@@ -208,13 +193,6 @@ class WindowPass:
         0 if never.
         """
         return self._base_changes[-1][0]
-
-    @property
-    def linearisation_points(self) -> list[Array]:
-        """Transformed parameters (P,), see `StreamingModel.transformed`, at which the rows of the
-        window are linearised, in order of the rows; one for each change of the linearisation point.
-        """
-        return self.linearisation_points_from(0)
 
     def linearisation_points_from(self, row: int) -> list[Array]:
         """Return the transformed parameters (P,) at which the rows from the index `row` of the
@@ -241,15 +219,14 @@ class WindowPass:
         self.blocks[-1].residuals += residuals
         self.sweep.add_residuals(residuals)
 
-    @property
-    def residuals(self) -> list[LinearisedResidual]:
-        """Linearised residuals of all samples in the window."""
+    def list_residuals(self) -> list[LinearisedResidual]:
+        """Return the linearised residuals of all samples in the window."""
         return [
             residual for block in self.blocks for residual in block.residuals
         ]
 
     def repeat_rows(self, rows: Sequence[LoggedRow]) -> None:
-        """Compute the first of the logged rows, at most `repeatable_rows`, and add their samples to
+        """Compute the first of the logged rows, at most `count_repeatable_rows`, and add their samples to
         the pass.
 
         Fewer rows, but at least one, are computed if an initial guess turns out to be far off. The
@@ -268,7 +245,7 @@ class WindowPass:
             If a row cannot be solved; no samples are added then.
         """
         done = self.add_rows(
-            [row.poses for row in rows[: self.repeatable_rows]]
+            [row.poses for row in rows[: self.count_repeatable_rows()]]
         )
         pairs = [
             (each, done - k)
@@ -277,23 +254,21 @@ class WindowPass:
         ]
         self.add_residuals(self.sweep.linearise_samples(pairs))
 
-    @property
-    def remaining_rows_of_block(self) -> int:
-        """Largest number of rows that can be computed at once: those left in the block, or in a new
-        one if it is full, at most `StreamingModel.rows_per_chunk`.
+    def count_remaining_rows(self) -> int:
+        """Return the largest number of rows that can be computed at once: those left in the block,
+        or in a new one if it is full, at most `StreamingModel.rows_per_chunk`.
         """
         return min(
             self.model.rows_per_chunk,
             self.block_rows - self.rows % self.block_rows,
         )
 
-    @property
-    def repeatable_rows(self) -> int:
-        """Largest number of rows that can be computed at once with initial guesses from `base`; 1
-        if there are none.
+    def count_repeatable_rows(self) -> int:
+        """Return the largest number of rows that can be computed at once with initial guesses from
+        `base`; 1 if there are none.
         """
         rows_of_base = 0 if self.base is None else self.base.rows - self.rows
-        return max(1, min(rows_of_base, self.remaining_rows_of_block))
+        return max(1, min(rows_of_base, self.count_remaining_rows()))
 
     def _rows_of_base(self, count: int) -> list[StoredRow]:
         """Return the next `count` rows of the pass `base` that is repeated, those after the rows of
@@ -372,9 +347,10 @@ class WindowPass:
         self.start = (self.blocks[0].start, self.blocks[0].linearisation_point)
         return len(block.stored_rows)
 
-    @property
-    def measured_information(self) -> SquareRootInformation:
-        """Information of all samples within the window and before it, without stated priors."""
+    def condense_measurements(self) -> SquareRootInformation:
+        """Return the information of all samples within the window and before it, without stated
+        priors.
+        """
         information = self.prior
         for block in self.blocks:
             information = self.sweep.with_residuals(
@@ -420,9 +396,9 @@ class CombinedPasses(NamedTuple):
         second_pass : WindowPass or None
             Repetition of its first rows; not changed.
         """
-        residuals = first_pass.residuals
+        residuals = first_pass.list_residuals()
         repeated = (
-            second_pass.residuals
+            second_pass.list_residuals()
             if second_pass is not None and second_pass.base is not None
             else []
         )
@@ -434,16 +410,18 @@ class CombinedPasses(NamedTuple):
             or len(remaining) > min(LARGEST_LAG, len(repeated))
         ):
             return cls(
-                first_pass.information,
+                first_pass.sweep.information,
                 residuals,
-                points=first_pass.linearisation_points,
+                points=first_pass.linearisation_points_from(0),
             )
         points = [
-            *second_pass.linearisation_points,
+            *second_pass.linearisation_points_from(0),
             *first_pass.linearisation_points_from(second_pass.rows),
         ]
         return cls(
-            first_pass.sweep.with_residuals(second_pass.information, remaining),
+            first_pass.sweep.with_residuals(
+                second_pass.sweep.information, remaining
+            ),
             [*repeated, *remaining],
             points=points,
         )

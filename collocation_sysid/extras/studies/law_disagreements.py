@@ -55,10 +55,9 @@ class Disagreement:
     combined95: tuple[float, float] | None
     share: float
 
-    @property
-    def sentence(self) -> str:
-        """One or two sentences for the user: the range of the parameter, and how the choice of the
-        law widens its interval if that is known.
+    def describe(self) -> str:
+        """Return the one or two sentences for the user: the range of the parameter, and how the
+        choice of the law widens its interval if that is known.
         """
         low = min(self.values.values())
         high = max(self.values.values())

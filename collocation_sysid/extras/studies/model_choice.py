@@ -383,7 +383,7 @@ def _reasons(rows: Sequence[Row], chosen: Row) -> str:
         *failures,
     ]
     return " ".join(
-        [*sentences, *(each.sentence for each in law_disagreements(rows))]
+        [*sentences, *(each.describe() for each in law_disagreements(rows))]
     )
 
 
@@ -613,21 +613,21 @@ def evidence_from_fit(fit: LinearisedFit) -> Evidence:
     of each block; it is the number of measurements if the residuals are zero up to rounding.
     """
     factored = factorise_information(fit)
-    rounding = ROUNDING**2 * fit.measurement_count
-    independent = float(fit.measurement_count)
-    if fit.chi_squared > rounding:
+    rounding = ROUNDING**2 * fit.count_measurements()
+    independent = float(fit.count_measurements())
+    if fit.compute_chi_squared() > rounding:
         processes = error_processes(fit, factored)
         pairs = zip(fit.blocks, processes, strict=True)
         independent = sum(
             _independent_measurements(b, p)
             for b, p in pairs
-            if b.measurement_count
+            if b.count_measurements()
         )
     return Evidence(
-        max(fit.chi_squared, rounding),
+        max(fit.compute_chi_squared(), rounding),
         float(np.sum(fit.prior_residual**2)),
-        fitted=factored.determined_count,
-        measurements=fit.measurement_count,
+        fitted=factored.count_determined(),
+        measurements=fit.count_measurements(),
         independent=independent,
     )
 
@@ -657,7 +657,9 @@ def _independent_measurements(
     channels = float(
         np.clip(total / max(sum_of_squares, 1e-300), 1.0, len(among))
     )
-    return block.measurement_count * channels / len(among) / max(1.0, in_time)
+    return (
+        block.count_measurements() * channels / len(among) / max(1.0, in_time)
+    )
 
 
 # Share of a single recording that is fitted.
@@ -753,7 +755,7 @@ def _names_at_bounds(solution: Solution) -> dict[str, str]:
     for item, coordinate, lower, upper in zip(
         parameters.free,
         np.asarray(solution.q, dtype=float),
-        *parameters.bounds_q,
+        *parameters.compute_bounds_q(),
         strict=True,
     ):
         if coordinate - lower < AT_BOUND:
@@ -787,11 +789,13 @@ def _budget_record(
             fit, parameters, q=solution.q, error_model=options
         )
         changes = changes_of_assumptions(
-            solution.collocation, solution.z, deviations=options.considered
+            solution.collocation,
+            solution.z,
+            deviations=options.collect_considered(),
         )
     except (InputError, SimulationError):
         return {}  # without error bars there is none
-    means = options.assumptions.means
+    means = options.assumptions.collect_means()
     sources = VarianceSources.from_fit(
         fit,
         changes,

@@ -91,10 +91,9 @@ class StudyReport:
     records: Mapping[str, Record]
     yardstick: SuccessCriterion
 
-    @property
-    def rows(self) -> list[Row]:
-        """One row for each planned run (`run_row`), or for each model (`model_rows`), computed anew
-        at each access.
+    def list_rows(self) -> list[Row]:
+        """Return the one row for each planned run (`run_row`), or for each model (`model_rows`),
+        computed anew at each access.
         """
         if self.kind == MODEL_STUDY:
             return model_rows(self.planned, self.records)
@@ -103,66 +102,65 @@ class StudyReport:
             for run in self.planned
         ]
 
-    @property
-    def views(self) -> list[Table]:
-        """Tables for the terminal, each within 80 columns, with short headings: of a comparison of
-        methods success, quality and cost; of a comparison of models fit, prediction and parameters,
-        and estimates in which equally good laws disagree, if there are any; of a sweep estimates,
-        and quality and cost.
+    def build_views(self) -> list[Table]:
+        """Return the tables for the terminal, each within 80 columns, with short headings: of a
+        comparison of methods success, quality and cost; of a comparison of models fit, prediction
+        and parameters, and estimates in which equally good laws disagree, if there are any; of a
+        sweep estimates, and quality and cost.
         """
         if self.kind == METHOD_STUDY:
-            return comparison_views(method_rows(self.rows))
+            return comparison_views(method_rows(self.list_rows()))
         if self.kind == MODEL_STUDY:
-            disagreements = law_disagreements(self.rows)
+            disagreements = law_disagreements(self.list_rows())
             return [
-                *model_views(self.rows),
+                *model_views(self.list_rows()),
                 *([law_table(disagreements)] if disagreements else []),
             ]
-        return sweep_views(self.rows, list(self.planned[0].varied_values))
+        return sweep_views(
+            self.list_rows(), list(self.planned[0].varied_values)
+        )
 
-    @property
-    def headline(self) -> list[str]:
-        """Result of the study in a few sentences: the advice of a comparison of models, one
-        sentence for each method, or of a sweep the number of converged runs and the ranges of the
-        estimates.
+    def build_headline(self) -> list[str]:
+        """Return the result of the study in a few sentences: the advice of a comparison of models,
+        one sentence for each method, or of a sweep the number of converged runs and the ranges of
+        the estimates.
         """
         if self.kind == MODEL_STUDY:
-            return [advice(self.rows)]
+            return [advice(self.list_rows())]
         if self.kind == METHOD_STUDY:
-            return [_method_sentence(row) for row in method_rows(self.rows)]
-        return sweep_sentences(self.rows)
+            return [
+                _method_sentence(row) for row in method_rows(self.list_rows())
+            ]
+        return sweep_sentences(self.list_rows())
 
-    @property
-    def tables(self) -> list[Table]:
-        """Tables for pages: those of `views` with headings in words, and for a comparison of
-        methods one more table with all its runs.
+    def build_tables(self) -> list[Table]:
+        """Return the tables for pages: those of `views` with headings in words, and for a
+        comparison of methods one more table with all its runs.
         """
         views = [
             replace(view, heads=tuple(map(_in_words, view.heads)))
-            for view in self.views
+            for view in self.build_views()
         ]
         return (
-            [*views, run_view(self.rows)]
+            [*views, run_view(self.list_rows())]
             if self.kind == METHOD_STUDY
             else views
         )
 
-    @property
-    def failures(self) -> list[str]:
-        """One line for each run that has a record without a result: its label, outcome and message.
-        Runs without a record do not count.
+    def list_failures(self) -> list[str]:
+        """Return the one line for each run that has a record without a result: its label, outcome
+        and message. Runs without a record do not count.
         """
         return [
-            f"{run.label}: {record['outcome']}: {record.get('message', '')}"
+            f"{run.make_label()}: {record['outcome']}: {record.get('message', '')}"
             for run in self.planned
             if (record := self.records.get(run.key)) is not None
             and not {"result", "model"} & record.keys()
         ]
 
-    @property
-    def notes(self) -> list[str]:
-        """Notes that explain the tables, the criterion of success of a comparison of methods, and
-        the number of runs without a record, if there are any.
+    def list_notes(self) -> list[str]:
+        """Return the notes that explain the tables, the criterion of success of a comparison of
+        methods, and the number of runs without a record, if there are any.
         """
         missing = len(self.planned) - len(self.records)
         notes = (
@@ -171,10 +169,10 @@ class StudyReport:
             else []
         )
         if self.kind == MODEL_STUDY:
-            return [*model_notes(self.rows), *notes]
+            return [*model_notes(self.list_rows()), *notes]
         return [
             *(
-                (self.yardstick.sentence, MEDIANS_NOTE)
+                (self.yardstick.describe(), MEDIANS_NOTE)
                 if self.kind == METHOD_STUDY
                 else ()
             ),
@@ -232,13 +230,13 @@ def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
     """
     # What no line of the tables says.
     parts: list[Shown] = (
-        [*report.headline, ""] if report.kind == MODEL_STUDY else []
+        [*report.build_headline(), ""] if report.kind == MODEL_STUDY else []
     )
-    for table in report.views:
+    for table in report.build_views():
         parts += [table, ""]
-    failures = report.failures
+    failures = report.list_failures()
     parts += [
-        *report.notes,
+        *report.list_notes(),
         *(Line(each, "doubtful") for each in failures[:SHOWN_FAILURES]),
     ]
     if len(failures) > SHOWN_FAILURES:
@@ -261,7 +259,7 @@ def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
     rows = tuple(
         (
             str(number),
-            run.label,
+            run.make_label(),
             " ".join(
                 "–" if g is None else f"{g:.4g}" for g in run.guess.values()
             ),
@@ -294,7 +292,7 @@ def write_report(report: StudyReport, folder: Path) -> None:
     InputError
         If a file cannot be written.
     """
-    rows = report.rows
+    rows = report.list_rows()
     write_text_file(folder / "runs.csv", as_csv(rows))
     if report.kind == METHOD_STUDY:
         write_text_file(folder / "summary.csv", as_csv(method_rows(rows)))
@@ -325,7 +323,7 @@ def report_json(report: StudyReport) -> dict[str, Any]:
     unknown), "within" and "methods", of models "advice" and "laws", and for a sweep
     "varied_values", the swept keys.
     """
-    rows = report.rows
+    rows = report.list_rows()
     first = report.planned[0]
     content: dict[str, Any] = {
         "schema": SCHEMA,
@@ -333,10 +331,10 @@ def report_json(report: StudyReport) -> dict[str, Any]:
         "title": report.title,
         "problem": first.problem,
         "runs": rows,
-        "headline": report.headline,
-        "notes": report.notes,
-        "tables": report.tables,
-        "failures": report.failures,
+        "headline": report.build_headline(),
+        "notes": report.list_notes(),
+        "tables": report.build_tables(),
+        "failures": report.list_failures(),
     }
     if report.kind == METHOD_STUDY:
         content |= {
@@ -366,14 +364,23 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 
 def report_section(report: StudyReport) -> TitledParts:
-    """Return sentences, notes, tables (`StudyReport.views`) and failures of a study as a section
+    """Return sentences, notes, tables (`StudyReport.build_views()`) and failures of a study as a section
     with its title, for a paper's appendix or an issue; without failures it has no part on them.
     """
-    failures = (Items(tuple(report.failures)),) if report.failures else ()
+    failures = (
+        (Items(tuple(report.list_failures())),)
+        if report.list_failures()
+        else ()
+    )
     without = tuple(
         TitledParts("Runs without a result", (each,)) for each in failures
     )
-    parts = (*report.headline, *report.notes, *report.views, *without)
+    parts = (
+        *report.build_headline(),
+        *report.list_notes(),
+        *report.build_views(),
+        *without,
+    )
     return TitledParts(report.title, parts, level=1)
 
 

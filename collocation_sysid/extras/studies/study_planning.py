@@ -70,10 +70,9 @@ class PlannedRun:
     allow_code: bool = False
     test_name: str | None = None
 
-    @property
-    def label(self) -> str:
-        """Short description of the run for the user: model and held-out recording, swept values, or
-        method and start.
+    def make_label(self) -> str:
+        """Return the short description of the run for the user: model and held-out recording, swept
+        values, or method and start.
         """
         if self.test_name is not None:
             what = f" without '{self.test_name}'" if self.test_name else ""
@@ -222,7 +221,7 @@ def plan_comparison(
     if problem.substeps == "auto":  # or each method would choose for itself
         overrides = [
             *overrides,
-            f"transcription.substeps={problem.first_substeps}",
+            f"transcription.substeps={problem.choose_first_substeps()}",
         ]
     planned = []
     for start in range(starts.starts):
@@ -325,7 +324,7 @@ def plan_models(
     """
     for each in problem.experiments:
         is_compared = (
-            each.markers.sample_count
+            each.markers.count_samples()
             or each.sensors_by_grasp
             or each.specimen is not None
         )

@@ -79,7 +79,7 @@ class StudyProgress(Watched):
         )
         count = f"{self.total - len(self._waiting)}/{self.total} runs"
         wall = record.get("wall_s") or 0.0
-        line = f"{count}: {run.label} {status} in {wall:.1f} s{self._remaining_text(worker_count)}"
+        line = f"{count}: {run.make_label()} {status} in {wall:.1f} s{self._remaining_text(worker_count)}"
         self.update(Text(line, style="dim"), line)
 
     def _remaining_text(self, worker_count: int) -> str:

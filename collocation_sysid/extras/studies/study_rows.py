@@ -145,9 +145,8 @@ class SuccessCriterion(Options):
     truth: Mapping[str, float] = field(default_factory=dict)
     within: Positive = 0.01
 
-    @property
-    def sentence(self) -> str:
-        """Explanation of the criterion for the user."""
+    def describe(self) -> str:
+        """Return the explanation of the criterion for the user."""
         if not self.truth:
             return "A run succeeds when it converges."
         return (

@@ -95,7 +95,7 @@ class SimdEvaluator:
         signature = [ctypes.c_int64] * 6 + [ctypes.c_void_p] * (
             self._fields + 5
         )
-        if kernel.point_data_count:
+        if kernel.count_point_data():
             signature += [ctypes.c_int64] + [ctypes.c_void_p] * 2
         points = self._points
         build = partial(_emit_kernel, kernel, points, lanes)
@@ -167,7 +167,7 @@ class _PhaseLayout:
     def __init__(self, phase: Phase, first: int) -> None:
         self.sx = phase.pieces
         self.contractions = list(phase.contractions.values())
-        size = 3 * phase.nodes
+        size = 3 * phase.count_nodes()
         self.lengths = [self.sx.nnz_out(k) for k in range(self.sx.n_out())]
         self.pieces = np.cumsum([0, *self.lengths]).tolist()
         contracted = {
@@ -224,7 +224,7 @@ class _KernelEmitter:
         self.points = points
         self.lanes = lanes
         self.vector = ir.VectorType(DOUBLE, lanes)
-        self.nodes = kernel.phases[0].nodes
+        self.nodes = kernel.phases[0].count_nodes()
         self.size = 3 * self.nodes
         # The kernel's own outputs come first among the totals.
         self.last = _PhaseLayout(kernel.phases[-1], 0)
@@ -252,7 +252,7 @@ class _KernelEmitter:
         self.coupling = kernel.coupling
         self.module = ir.Module()
         constants = [DOUBLES, I32S, I32S, DOUBLES, DOUBLES]
-        self.point_data_count = kernel.point_data_count
+        self.point_data_count = kernel.count_point_data()
         if self.point_data_count:
             constants += [I64, I32S, DOUBLES]
         kind = ir.FunctionType(

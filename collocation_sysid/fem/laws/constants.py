@@ -93,13 +93,6 @@ class Constant:
                 f"{zero}lower < upper{remedy}"
             )
 
-    @property
-    def lower_limit(self) -> float:
-        """Lower limit of admissible values: 0, exclusive, for a logarithmic constant, else
-        `at_least`.
-        """
-        return 0.0 if self.scale == "log" else self.at_least
-
 
 # Default bounds of a stiffness [Pa]: softer than any gel, stiffer than any rubber.
 STIFFNESS = (1.0, 1e9)

@@ -588,9 +588,8 @@ class Prony:
                 "stand before the names of its parameters"
             )
 
-    @property
-    def constants(self) -> tuple[Constant, Constant]:
-        """Constants of the branch: its share g and its relaxation time τ."""
+    def named_constants(self) -> tuple[Constant, Constant]:
+        """Return the constants of the branch: its share g and its relaxation time τ."""
         share, tau = (
             replace(c, name=f"{self.name}.{c.name}") for c in (SHARE, TAU)
         )

@@ -69,7 +69,7 @@ def averaging_kernel(
             for term in terms
         ]
         output_pieces[key] = (
-            terms[0].contraction,
+            terms[0].choose_contraction(),
             sum(summands[1:], summands[0]),
         )
     slopes: Pieces = {}
@@ -140,9 +140,8 @@ class _VolumeSums:
             own_volumes=volumes,
         )
 
-    @property
-    def stretches(self) -> ca.SX:
-        """Symbols m of the stretches, as one vector."""
+    def stack_stretches(self) -> ca.SX:
+        """Return the symbols m of the stretches, as one vector."""
         return ca.vertcat(*self.point.stretches)
 
     @property
@@ -161,7 +160,7 @@ class _VolumeSums:
             [piece for _, piece in pieces.values()]
         )
         return {
-            key: (how, ca.substitute(piece, self.stretches, m))
+            key: (how, ca.substitute(piece, self.stack_stretches(), m))
             for (key, (how, _)), piece in zip(
                 pieces.items(), expanded, strict=True
             )
@@ -229,14 +228,16 @@ class _ScalarDerivatives:
     @cached_property
     def by_stretch(self) -> ca.SX:
         """Derivatives ∂g/∂m by the stretches."""
-        return self.shape.point.gradient(self.scalar, self.shape.stretches)
+        return self.shape.point.gradient(
+            self.scalar, self.shape.stack_stretches()
+        )
 
     def second_derivative_pieces(self) -> Pieces:
         """Return the pieces whose sums couple in second derivatives: ∂²g by (m, m), (m, θ), (field,
         m).
         """
         point = self.shape.point
-        by_m = point.jacobian(self.by_stretch, self.shape.stretches)
+        by_m = point.jacobian(self.by_stretch, self.shape.stack_stretches())
         pieces: Pieces = {
             self.sum_name("second"): (
                 "none",
@@ -246,7 +247,7 @@ class _ScalarDerivatives:
                 "none",
                 ca.vec(
                     point.jacobian(
-                        self.by_stretch, point.differentiated_constants
+                        self.by_stretch, point.stack_differentiated_constants()
                     )
                 ),
             ),
@@ -275,7 +276,9 @@ class _ScalarDerivatives:
             return (
                 gradient
                 if len(by) == 1
-                else point.jacobian(gradient, point.differentiated_constants)
+                else point.jacobian(
+                    gradient, point.stack_differentiated_constants()
+                )
             )
         alpha, beta = nodal
         weights = ca.SX.sym("weights", shape.count)
@@ -317,7 +320,7 @@ class _ScalarDerivatives:
         """Return the second derivatives of g by (gradient, m) of two fields."""
         point = self.shape.point
         first, second = (
-            ca.vertcat(point.gradients[field], self.shape.stretches)
+            ca.vertcat(point.gradients[field], self.shape.stack_stretches())
             for field in (alpha, beta)
         )
         hessian = point.jacobian(point.gradient(self.scalar, first), second)
@@ -355,7 +358,7 @@ def _coupling(
     D of order 2, see `kernel`.
     """
     count = shape.count
-    constants = shape.point.differentiated_constants.numel()
+    constants = shape.point.stack_differentiated_constants().numel()
     sums = [
         shape.volume,
         shape.volumes,
@@ -376,17 +379,18 @@ def _coupling(
     couplings = []
     for terms in outputs.values():
         total = ca.SX(0, 0)
-        if terms[0].contraction != "none":
+        if terms[0].choose_contraction() != "none":
             width = constants if "theta" in terms[0].by else 1
             total = ca.SX(
-                size, size if terms[0].contraction == "pairs" else width
+                size,
+                size if terms[0].choose_contraction() == "pairs" else width,
             )
         for term in terms:
             chain = chains[id(term.scalar)]
             by_s, second_of_logarithm = _logarithm_derivatives(
                 shape.volumes, shape.volume, weights=chain.slopes
             )
-            if term.contraction == "nodes":
+            if term.choose_contraction() == "nodes":
                 relation = shape.relation_to_x(term.by[0])
                 slopes = (
                     by_thetas[id(term.scalar)]
@@ -394,7 +398,7 @@ def _coupling(
                     else chain.slopes
                 )
                 total[:count, :] += (by_s @ relation).T @ slopes
-            elif term.contraction == "pairs":
+            elif term.choose_contraction() == "pairs":
                 second = (
                     by_s.T @ seconds[id(term.scalar)] @ by_s
                     + second_of_logarithm

@@ -38,9 +38,9 @@ Expression = Callable[[QuadraturePoint, PointLaw], ca.SX]
 def _stress_by_theta(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return ∂S by the material's constants and the logarithm of a field, column after column."""
     slope = point.jacobian(
-        second_piola(point, law), point.differentiated_constants
+        second_piola(point, law), point.stack_differentiated_constants()
     )
-    of_field = slope[:, law.constant_count :]
+    of_field = slope[:, law.count_constants() :]
     return ca.vec(ca.horzcat(slope[:, : len(law.material.constants)], of_field))
 
 
@@ -51,7 +51,7 @@ def _stress_derivative(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     F = point.gradients["x"]
     piola = first_piola(point, law)
     rate = point.gradients["v"]
-    inverse = ca.inv_minor(point.material_gradient)
+    inverse = ca.inv_minor(point.compute_material_gradient())
     stress = inverse @ ca.reshape(piola, 3, 3)
     piola_rate = point.directional_derivative(piola, F, direction=rate)
     change = ca.reshape(piola_rate, 3, 3) - ca.reshape(rate, 3, 3) @ stress
@@ -61,7 +61,7 @@ def _stress_derivative(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 def _stress_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return (∂S/∂x)ᵀ σ of a point (9,), with the weights σ (6,) as its internal variables."""
     return point.gradient(
-        ca.dot(point.internal_variables, second_piola(point, law)),
+        ca.dot(point.select_internal_variables(), second_piola(point, law)),
         point.gradients["x"],
     )
 
@@ -78,7 +78,7 @@ def _memory_force_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     power = ca.jtimes(
         -memory_energy(point), point.gradients["x"], point.gradients["v"]
     )
-    return ca.gradient(power, point.internal_variables)
+    return ca.gradient(power, point.select_internal_variables())
 
 
 def _stress_jacobian(point: QuadraturePoint, law: PointLaw) -> ca.SX:
@@ -88,7 +88,9 @@ def _stress_jacobian(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 def _memory_force_jacobian(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return ∂f_H/∂H (9, 6) of a point, to be contracted to nodes."""
-    return ca.jacobian(_memory_force(point, law), point.internal_variables)
+    return ca.jacobian(
+        _memory_force(point, law), point.select_internal_variables()
+    )
 
 
 # Expression, node fields, number of data of a point, and contraction of each kernel.
@@ -464,8 +466,8 @@ class StressEvaluator:
                 [internal_columns, logs[:, None, None]], axis=-1
             )
         internal_columns = (
-            internal_columns[..., : kernel.point_data_count]
-            if kernel.point_data_count
+            internal_columns[..., : kernel.count_point_data()]
+            if kernel.count_point_data()
             else None
         )
         return KernelBatch(

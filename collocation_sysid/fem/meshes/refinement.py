@@ -137,7 +137,7 @@ def refine_body(body: Body) -> Body:
     finer = finer.with_free_densities(
         [part.name for part in body.parts if part.has_free_density]
     )
-    if not body.field_lengths_m:
+    if not body.collect_field_lengths_m():
         return finer
     fields = [part.field and part.field.split_in_eight() for part in body.parts]
     parts = zip(finer.parts, fields, strict=True)

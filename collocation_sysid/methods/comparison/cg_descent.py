@@ -201,7 +201,7 @@ def minimise_cg_descent(
             value=f,
             gradient=g,
             direction=direction,
-            error=average.error,
+            error=average.options.rounding * average.size,
             approximate=average.approximate,
             options=options,
         )
@@ -376,11 +376,6 @@ class _AverageValue:
         """
         if change <= self.options.switch * self.size:
             self.approximate = True
-
-    @property
-    def error(self) -> float:
-        """Estimated rounding error of the value: `rounding` times the average size."""
-        return self.options.rounding * self.size
 
 
 @dataclass(frozen=True, eq=False)

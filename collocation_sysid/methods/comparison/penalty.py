@@ -479,7 +479,7 @@ class _PenaltySolve:
             self.iterations = before + done
             if (done % self._every == 0 and done > 0) or not recorder.history:
                 self._record()
-            if recorder.is_late:
+            if recorder.is_late():
                 raise SearchEnded(Status.TIME_LIMIT)
             if (
                 self.iterations >= options.max_iterations

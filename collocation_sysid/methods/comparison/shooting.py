@@ -217,7 +217,7 @@ class _ShootingSearch:
         self.options = options
         self.recorder = recorder
         self.collocation = collocation = recorder.collocation
-        self.lower, self.upper = collocation.parameter_bounds
+        self.lower, self.upper = collocation.compute_parameter_bounds()
         first = (
             collocation.guess_p
             if start is None
@@ -265,7 +265,7 @@ class _ShootingSearch:
             self._residual_slope,  # pyright: ignore[reportArgumentType]
             (self.lower - self.first, self.upper - self.first),
             method="dogbox",
-            x_scale=self.collocation.reach_p,
+            x_scale=self.collocation.compute_reach_p(),
             xtol=self.options.tolerance,
             ftol=ROUNDING,
             gtol=self.options.tolerance,
@@ -388,7 +388,7 @@ class _ShootingSearch:
         """
         if self.simulations and self.simulations >= self.options.max_iterations:
             raise SearchEnded(Status.ITERATION_LIMIT)
-        if self.simulations and self.recorder.is_late:
+        if self.simulations and self.recorder.is_late():
             raise SearchEnded(Status.TIME_LIMIT)
         self.simulations += 1
         collocation = self.collocation

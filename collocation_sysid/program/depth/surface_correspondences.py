@@ -424,7 +424,7 @@ def _aligned_parameters(
     turn, shift_m = _alignment(
         camera,
         VisibleSurface.from_body(body, camera.depth),
-        x=shapes_m[camera.depth.first_sample_with_points],
+        x=shapes_m[camera.depth.find_first_sample_with_points()],
     )
     moved = camera.with_pose(phi, turn, shift_m=shift_m)
     errors = np.abs(moved[camera.parameter_indices])
@@ -473,7 +473,7 @@ def _alignment(
         camera,
         surface,
         x=x,
-        image=camera.depth.first_sample_with_points,
+        image=camera.depth.find_first_sample_with_points(),
         start=start,
     )
     known.append(_Alignment(x, turn, shift_m=shift_m))

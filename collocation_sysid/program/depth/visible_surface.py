@@ -119,7 +119,7 @@ class VisibleSurface:
         camera's first image with points [m].
         """
         return experiment.rigid_positions(
-            depth.sample_times_s[[depth.first_sample_with_points]]
+            depth.sample_times_s[[depth.find_first_sample_with_points()]]
         )[0, self.nodes]
 
     @property

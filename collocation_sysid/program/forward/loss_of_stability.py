@@ -82,9 +82,8 @@ class StabilityLoss:
             and self.smaller_stretch <= NEAREST_FACTOR * self.critical_stretch
         )
 
-    @property
-    def message(self) -> str:
-        """Message for the user: the mode, where it is largest, and what to change."""
+    def describe(self) -> str:
+        """Return the message for the user: the mode, where it is largest, and what to change."""
         x, y, z = (1e3 * self.place_m).tolist()
         where = (
             f"the largest motion is at ({x:.4g}, {y:.4g}, {z:.4g}) mm, where the stretches of the "
@@ -129,7 +128,7 @@ def explain_failure(
     if instability is None:
         return error
     explained_error = SimulationError(
-        instability.message, error.time_s, element=error.element
+        instability.describe(), error.time_s, element=error.element
     )
     explained_error.stability_loss = instability
     return explained_error

@@ -140,7 +140,7 @@ def continue_simulation(
     forces, previous_histories = _forces_and_histories(
         dynamics, x, row_count=done
     )
-    intervals = dynamics.interval_to_next_s
+    intervals = dynamics.compute_intervals_to_next_s()
     for t in range(done, dynamics.row_count):
         row = RowEquations(
             dynamics, x, forces=forces, t=t, previous=previous_histories
@@ -227,7 +227,7 @@ def _forces_and_histories(
         known_forces = dynamics.forces_with_histories(histories, rows)
         forces[rows] = known_forces.total(xi[:evaluations], nu[:evaluations])
     dynamics.zero_prescribed_forces(forces)
-    return forces, tuple(history.final_state for history in histories)
+    return forces, tuple(history.extract_final_state() for history in histories)
 
 
 def extrapolate(x: Array, first_step: Array) -> Array:
@@ -286,7 +286,7 @@ class RowEquations(StepEquations):
             self.forces = insert_previous_states(
                 self.forces,
                 previous,
-                interval_s=float(dynamics.interval_to_next_s[t - 1]),
+                interval_s=float(dynamics.compute_intervals_to_next_s()[t - 1]),
             )
         self.rest = self.forces.without_local_forces()
         self.rest_before = (

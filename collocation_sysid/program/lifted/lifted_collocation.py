@@ -166,7 +166,7 @@ def with_lifted_variables(collocation: Collocation) -> Collocation:
     """
     has_sensors = any(len(s.sensed_dofs) for s in collocation.transcriptions)
     has_complementarity = any(
-        s.dynamics.forces.complementarity_terms
+        s.dynamics.forces.find_complementarity_terms()
         for s in collocation.transcriptions
     )
     if isinstance(collocation, LiftedCollocation) or not (

@@ -174,7 +174,7 @@ class LiftedForceHistory(LiftedVariables):
         times = np.arange(first, first + self.shape[1])
         q = dynamics.tables.q / dynamics.step_s
         for lag, (of_p, of_q) in enumerate(
-            zip(dynamics.state_weights.T, q.T, strict=True)
+            zip(dynamics.compute_state_weights().T, q.T, strict=True)
         ):
             used = (times >= lag) & ((of_p[times] != 0) | (of_q[times] != 0))
             if used.any():
@@ -300,7 +300,7 @@ class LiftedForceHistory(LiftedVariables):
         length_m = self.segment.length_m
         d = self._points.dofs
         slopes = history.derivatives(slice(None))
-        places = history.input_columns
+        places = history.find_input_columns()
         by = LawDerivatives(*(-each[d:, :, :-1] / length_m for each in slopes))
         blocks = [np.ones(self.count), length_m * by.b[:, :, 1:]]
         blocks += [
@@ -337,7 +337,7 @@ class LiftedForceHistory(LiftedVariables):
         history, mu = self.weighted_history(iterate, multipliers)
         assert isinstance(history, ForceHistory)
         length_m = self.segment.length_m
-        places = history.input_columns
+        places = history.find_input_columns()
         second_derivatives = history.mixed_second_derivatives(
             mu, weights.forces
         )

@@ -48,9 +48,8 @@ class _Lag:
     stop: int
     factors: Array
 
-    @property
-    def evaluations(self) -> Index:
-        """Indices (T, 1) of the evaluations."""
+    def select_evaluations(self) -> Index:
+        """Return the indices (T, 1) of the evaluations."""
         return np.arange(self.start, self.stop)[:, None]
 
 
@@ -164,7 +163,7 @@ class LiftedMemory(LiftedVariables):
         contains; z is not used.
         """
         return (
-            _body_history(iterate).recursion_residuals / self.unit_pa
+            _body_history(iterate).compute_recursion_residuals() / self.unit_pa
         ).ravel()
 
     @property
@@ -243,7 +242,7 @@ class LiftedMemory(LiftedVariables):
     def _stress_lags(self) -> list[_Lag]:
         """Lags of S_k by x_{k−lag}; the last evaluation has no equation."""
         return self._nonzero_lags(
-            self.segment.dynamics.state_weights, 0, stop=self.shape[0]
+            self.segment.dynamics.compute_state_weights(), 0, stop=self.shape[0]
         )
 
     @cached_property
@@ -251,7 +250,7 @@ class LiftedMemory(LiftedVariables):
         """Lags of forces at evaluation k with a past by x_{k−lag}."""
         return self._nonzero_lags(
             self.segment.dynamics.tables.p,
-            self._first_evaluation,
+            max(1, self.segment.dynamics.first_row),
             stop=self.segment.grid_times,
         )
 
@@ -276,16 +275,14 @@ class LiftedMemory(LiftedVariables):
         count = self.segment.grid_times
         lags = [
             _Lag(
-                j, self._first_evaluation, stop=count - j, factors=table[j:, j]
+                j,
+                max(1, self.segment.dynamics.first_row),
+                stop=count - j,
+                factors=table[j:, j],
             )
             for j in range(table.shape[1])
         ]
         return [each for each in lags if each.factors.any()]
-
-    @property
-    def _first_evaluation(self) -> int:
-        """Index of the first evaluation whose force depends on history variables."""
-        return max(1, self.segment.dynamics.first_row)
 
     def _memory_columns(self, lag: _Lag, variables: Index) -> list[Index | int]:
         """Return arrays whose sum are the columns (T, K) in z of history variables m_{k−1} at the
@@ -293,7 +290,7 @@ class LiftedMemory(LiftedVariables):
         """
         return [
             self.offsets.variable,
-            (lag.evaluations - 1) * self.shape[1],
+            (lag.select_evaluations() - 1) * self.shape[1],
             variables,
         ]
 
@@ -303,7 +300,7 @@ class LiftedMemory(LiftedVariables):
         """
         return [
             self.segment.offsets.position,
-            (lag.evaluations - lag.lag) * self.segment.dof_count,
+            (lag.select_evaluations() - lag.lag) * self.segment.dof_count,
             dofs,
         ]
 
@@ -324,12 +321,16 @@ class LiftedMemory(LiftedVariables):
             ),
         ]
         for each in self._stress_lags:
-            rows = [self.offsets.row, each.evaluations * self.shape[1], own]
+            rows = [
+                self.offsets.row,
+                each.select_evaluations() * self.shape[1],
+                own,
+            ]
             blocks.append(EntryBlock(rows, self._position_columns(each, dofs)))
         for moved in self._motion_entries:
             for each in self._force_lags:
                 row_times = (
-                    each.evaluations
+                    each.select_evaluations()
                     + each.lag
                     - self.segment.dynamics.first_row
                 )
@@ -385,8 +386,8 @@ class LiftedMemory(LiftedVariables):
     def entry_counts(self) -> tuple[int, int]:
         """Numbers of additional entries of Jacobian and Hessian, computed without index arrays."""
         groups = self._jacobian_blocks(), self._hessian_blocks()
-        return sum(each.count for each in groups[0]), sum(
-            each.count for each in groups[1]
+        return sum(each.count_entries() for each in groups[0]), sum(
+            each.count_entries() for each in groups[1]
         )
 
     def jacobian_values(
@@ -402,14 +403,16 @@ class LiftedMemory(LiftedVariables):
             memory.repeat_over_points(-history.fading.d[:, 1:-1]), after
         )
         values = [
-            self._parameter_derivatives(history, iterate.equations.theta_q),
+            self._parameter_derivatives(
+                history, iterate.equations.theta_p[:, : iterate.equations.nq]
+            ),
             np.ones(self.count),
             fading,
         ]
         values += self._stress_derivatives(history)
         for moved in self._motion_entries:
             values += self._force_derivatives(history, moved)
-        rows = (history.recursion_residuals / self.unit_pa).ravel()
+        rows = (history.compute_recursion_residuals() / self.unit_pa).ravel()
         return rows, np.concatenate([each.ravel() for each in values])
 
     def _parameter_derivatives(
@@ -418,7 +421,7 @@ class LiftedMemory(LiftedVariables):
         """Return the derivatives (nq, N − 1, width) of the scaled equations r by q, from the
         derivatives `theta_q` (k, nq) of the k constants θ by q.
         """
-        memory = history.memory
+        memory = history.body.memory
         derivatives = np.empty((theta_q.shape[1], *self.shape))
         d_q, a_q = (
             memory.repeat_over_points(np.moveaxis(e, 1, 0))
@@ -495,8 +498,8 @@ class LiftedMemory(LiftedVariables):
         """
         segment = self.segment
         history = _body_history(iterate)
-        theta_q = iterate.equations.theta_q
-        d_q = history.memory.repeat_over_points(
+        theta_q = iterate.equations.theta_p[:, : iterate.equations.nq]
+        d_q = history.body.memory.repeat_over_points(
             np.moveaxis(
                 history.fading.jacobian_vector_product(theta_q)[0], 1, 0
             )

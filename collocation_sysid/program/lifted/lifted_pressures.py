@@ -42,11 +42,10 @@ class LiftedPressure(LiftedForceHistory):
     @property
     def unit_m(self) -> float:
         """Unit δ of the variables and of the equations [m]."""
-        return self._force.pressure_unit_m
+        return self._find_force().pressure_unit_m
 
-    @property
-    def _force(self) -> ComplementarityForce:
-        """Force that has the pressures."""
+    def _find_force(self) -> ComplementarityForce:
+        """Return the force that has the pressures."""
         term = self.segment.dynamics.forces.external_terms[self.force_index]
         assert isinstance(term, ComplementarityForce)
         return term
@@ -63,7 +62,7 @@ class LiftedPressure(LiftedForceHistory):
         positions.
         """
         xi, _ = iterate.equations.dynamics.evaluation_states(iterate.x)
-        return self._force.scaled_pressures(xi).ravel() / self.unit_m
+        return self._find_force().scaled_pressures(xi).ravel() / self.unit_m
 
     def with_lifted(
         self, iterate: ExperimentIterate, z: Array

@@ -29,14 +29,9 @@ class LiftedReactions(LiftedVariables):
     kind = "reaction"
 
     @property
-    def sensed_dofs(self) -> Index:
-        """Dofs (g,) whose reaction forces are lifted."""
-        return self.segment.sensed_dofs
-
-    @property
     def shape(self) -> tuple[int, int]:
         """Shape (times, g): grid times with equations of motion, and dofs."""
-        return self.segment.constraint_times, len(self.sensed_dofs)
+        return self.segment.constraint_times, len(self.segment.sensed_dofs)
 
     def columns_of(self, times: Index, dofs: Index) -> Index:
         """Return the columns (T, k) in z of reaction forces.
@@ -70,7 +65,9 @@ class LiftedReactions(LiftedVariables):
         by_row = (
             multipliers[self.rows].reshape(self.shape) / self.segment.force_n
         )
-        weights[self.segment.dynamics.first_row :, self.sensed_dofs] = by_row
+        weights[self.segment.dynamics.first_row :, self.segment.sensed_dofs] = (
+            by_row
+        )
         return weights
 
     @cached_property
@@ -88,8 +85,8 @@ class LiftedReactions(LiftedVariables):
         )
         return MotionJacobian(
             untaken,
-            self.sensed_dofs,
-            free_dofs=self.sensed_dofs,
+            self.segment.sensed_dofs,
+            free_dofs=self.segment.sensed_dofs,
             length_m=segment.length_m,
             force_n=segment.force_n,
         )
@@ -166,15 +163,17 @@ class LiftedReactions(LiftedVariables):
         slopes = setting.force_derivatives(
             slice(first, None), iterate.forces.by_theta
         )
-        by_p[first:] = slopes[:, self.sensed_dofs]
+        by_p[first:] = slopes[:, self.segment.sensed_dofs]
         by_p = dynamics.combine(dynamics.tables.w, by_p)
-        acceleration = dynamics.acceleration(iterate.x)[:, self.sensed_dofs]
+        acceleration = dynamics.acceleration(iterate.x)[
+            :, self.segment.sensed_dofs
+        ]
         by_p -= setting.inertia_derivatives(
-            slice(None), acceleration, dofs=self.sensed_dofs
+            slice(None), acceleration, dofs=self.segment.sensed_dofs
         )
         force = np.zeros(acceleration.shape)
-        force[first:] = iterate.forces.force[:, self.sensed_dofs]
-        mass_kg = dynamics.mass.inertia_kg[:, self.sensed_dofs]
+        force[first:] = iterate.forces.force[:, self.segment.sensed_dofs]
+        mass_kg = dynamics.mass.inertia_kg[:, self.segment.sensed_dofs]
         rows = z[self.columns] - self._scaled(
             reaction_forces(
                 dynamics, mass_kg, force=force, acceleration=acceleration
@@ -225,7 +224,7 @@ def motion_equations(
         )
     ]
     if reactions is not None:
-        sensed = reactions.sensed_dofs
+        sensed = reactions.segment.sensed_dofs
         row_of_dof = np.full(transcription.dof_count, -1)
         row_of_dof[sensed] = np.arange(len(sensed))
         equations.append(

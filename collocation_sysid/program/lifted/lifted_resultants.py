@@ -78,7 +78,9 @@ class LiftedResultant(LiftedVariables):
         count = max(1, int(self.residual.is_compared.sum()))
         sigmas = self.residual.observable_sigmas
         return np.where(
-            np.isfinite(sigmas), np.sqrt(count) * sigmas, self._reaction_unit
+            np.isfinite(sigmas),
+            np.sqrt(count) * sigmas,
+            self._compute_reaction_unit(),
         )
 
     @cached_property
@@ -86,11 +88,10 @@ class LiftedResultant(LiftedVariables):
         """Unit (6,) of the equations [N, N m], between `_unit` and that of R for good
         conditioning.
         """
-        return self._reaction_unit**0.75 * self._unit**0.25
+        return self._compute_reaction_unit() ** 0.75 * self._unit**0.25
 
-    @property
-    def _reaction_unit(self) -> Array:
-        """Unit (6,) of reaction forces and their moments [N, N m]."""
+    def _compute_reaction_unit(self) -> Array:
+        """Return the unit (6,) of reaction forces and their moments [N, N m]."""
         return self.segment.force_n * np.repeat([1.0, self.segment.length_m], 3)
 
     def with_lifted(
@@ -156,7 +157,9 @@ class LiftedResultant(LiftedVariables):
                 np.moveaxis(each.reshape(channel.count, -1, 3), 2, 0), unit
             )
             for each, unit in zip(
-                (self._position_columns, reaction_columns), units, strict=True
+                (self._compute_position_columns(), reaction_columns),
+                units,
+                strict=True,
             )
         ]
         reaction_indices = PatternIndices(
@@ -201,10 +204,9 @@ class LiftedResultant(LiftedVariables):
             )
         return tuple(terms)
 
-    @property
-    def _position_columns(self) -> Index:
-        """Columns (n, d) in z of the positions of the grasp's dofs at n grid times."""
-        dofs = self.reactions.sensed_dofs[self.observable.node_dofs]
+    def _compute_position_columns(self) -> Index:
+        """Return the columns (n, d) in z of the positions of the grasp's dofs at n grid times."""
+        dofs = self.reactions.segment.sensed_dofs[self.observable.node_dofs]
         return (
             self.segment.offsets.position
             + self.observable.known_rows[:, None] * self.segment.dof_count

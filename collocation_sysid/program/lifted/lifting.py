@@ -63,7 +63,8 @@ def lift_variables(
             offsets = groups[-1].next_offsets
             histories = 1
         for history, force in enumerate(
-            segment.dynamics.forces.terms_with_internal_variables, histories
+            segment.dynamics.forces.find_terms_with_internal_variables(),
+            histories,
         ):
             groups.append(
                 LiftedForceHistory(
@@ -77,7 +78,7 @@ def lift_variables(
             offsets = groups[-1].next_offsets
             histories = history + 1
         for history, force in enumerate(
-            segment.dynamics.forces.complementarity_terms, histories
+            segment.dynamics.forces.find_complementarity_terms(), histories
         ):
             groups.append(
                 LiftedPressure(

@@ -370,8 +370,8 @@ class Factoriser:
             return self.choice == "band"
         if self.is_supernodal:
             return False
-        return self._band_work <= max(
-            LITTLE_WORK, BAND_SPEED * self._sparse_work
+        return self._estimate_band_work() <= max(
+            LITTLE_WORK, BAND_SPEED * self._estimate_sparse_work()
         )
 
     @cached_property
@@ -381,18 +381,19 @@ class Factoriser:
         """
         if self.choice != "auto":
             return self.choice == "supernodal"
-        wide = self.half_bandwidth > NARROW and self._band_work > MUCH_WORK
+        wide = (
+            self.half_bandwidth > NARROW
+            and self._estimate_band_work() > MUCH_WORK
+        )
         return wide and load_mkl() is not None
 
-    @property
-    def _band_work(self) -> int:
-        """Operations of a banded factorisation, up to a factor."""
+    def _estimate_band_work(self) -> int:
+        """Return the operations of a banded factorisation, up to a factor."""
         return self.size * self.half_bandwidth**2
 
-    @property
-    def factor_size(self) -> int:
-        """Number of floating-point numbers in the factor of a symmetric matrix; the matrix is
-        analysed if necessary.
+    def estimate_factor_size(self) -> int:
+        """Return the number of floating-point numbers in the factor of a symmetric matrix; the
+        matrix is analysed if necessary.
         """
         if self.is_banded:
             width = (
@@ -407,12 +408,11 @@ class Factoriser:
             self._column_counts.sum()
         )  # L, U, and their row numbers at half the size
 
-    @property
-    def unsymmetric_factor_size(self) -> int:
-        """Number of floating-point numbers in the factor of an unsymmetric matrix: twice that of a
-        symmetric one within a skyline, otherwise the same.
+    def estimate_unsymmetric_factor_size(self) -> int:
+        """Return the number of floating-point numbers in the factor of an unsymmetric matrix: twice
+        that of a symmetric one within a skyline, otherwise the same.
         """
-        return (2 if self.skyline else 1) * self.factor_size
+        return (2 if self.skyline else 1) * self.estimate_factor_size()
 
     @property
     def has_single_precision(self) -> bool:
@@ -430,9 +430,8 @@ class Factoriser:
             return None
         return make_skyline(self.size, *self._ranks, self._free_entries)
 
-    @property
-    def _sparse_work(self) -> float:
-        """Operations of a factorisation by SuperLU, up to a factor."""
+    def _estimate_sparse_work(self) -> float:
+        """Return the operations of a factorisation by SuperLU, up to a factor."""
         return float(np.sum(self._column_counts.astype(float) ** 2))
 
     @cached_property

@@ -45,7 +45,7 @@ def relative_cost(factoriser: Factoriser, columns: int) -> float:
 
     The estimate depends on sizes only, so that results can be reproduced.
     """
-    entries = factoriser.factor_size / max(1, factoriser.size)
+    entries = factoriser.estimate_factor_size() / max(1, factoriser.size)
     share = (FIXED_COLUMNS + columns) / (FIXED_COLUMNS + MEASURED_COLUMNS)
     each = BAND_COST_PER_ENTRY if factoriser.is_banded else COST_PER_ENTRY
     return each * entries / share

@@ -27,9 +27,8 @@ class EntryBlock(NamedTuple):
     rows: Sequence[Index | int]
     columns: Sequence[Index | int]
 
-    @property
-    def count(self) -> int:
-        """Number of entries: the size of the broadcast arrays."""
+    def count_entries(self) -> int:
+        """Return the number of entries: the size of the broadcast arrays."""
         return int(
             np.prod(
                 np.broadcast_shapes(*map(np.shape, (*self.rows, *self.columns)))

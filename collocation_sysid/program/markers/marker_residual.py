@@ -122,28 +122,11 @@ class MarkerResidual(MeasurementResidual):
         )
 
     @property
-    def sample_rows(self) -> Index:
-        """Grid times of the observable: without `preceding_times`, the grid time (T,) of each
-        sample.
-        """
-        return self.observable.rows
-
-    @property
-    def coordinate_parameters(self) -> Index:
-        """Indices (M, k) in φ of the markers' places; −1 for exact ones."""
-        return self.observable.coordinate_parameters
-
-    @property
     def is_present(self) -> NDArray[np.bool_]:
         """Mask (T, M) of the samples that are compared."""
         return self.is_compared[..., 0]
 
     # One sample -------------------------------------------------------------------------------
-
-    @property
-    def _sample_indices(self) -> Index:
-        """Index (T,) of each sample among the observable's times."""
-        return self.preceding_times + np.arange(len(self.t_s))
 
     @cached_property
     def _neighbour_count(self) -> int:
@@ -168,7 +151,7 @@ class MarkerResidual(MeasurementResidual):
         negative before the start, where the body rests in its first state.
         """
         first = (
-            self._sample_indices
+            (self.preceding_times + np.arange(len(self.t_s)))
             + self.clock_samples
             - self._neighbour_count // 2
         )
@@ -188,7 +171,9 @@ class MarkerResidual(MeasurementResidual):
         samples, and the frame's time [s], delay included.
         """
         count = len(self.markers.names)
-        indices = self._sample_indices - self._first_neighbour
+        indices = (
+            self.preceding_times + np.arange(len(self.t_s))
+        ) - self._first_neighbour
         place = np.array(
             [
                 indices + self._offsets_s / self.nuisance.interval_s,

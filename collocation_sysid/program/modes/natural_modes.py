@@ -53,9 +53,8 @@ class Modes:
     shapes: Array
     omitted_count: int = 0
 
-    @property
-    def angular_frequencies_rad_s(self) -> Array:
-        """Undamped angular frequencies ω (k,) [rad/s]."""
+    def compute_angular_frequencies_rad_s(self) -> Array:
+        """Return the undamped angular frequencies ω (k,) [rad/s]."""
         return 2 * np.pi * self.frequencies_hz
 
 

@@ -82,9 +82,9 @@ def _instability(iterate: ExperimentIterate) -> Instability | None:
     last = len(experiment.t_s) - 1
     samples = np.unique(np.linspace(0, last, STATES).round().astype(int))
     t_s = experiment.t_s[samples]
-    rows = iterate.segment.markers.sample_rows[samples]
+    rows = iterate.segment.markers.observable.rows[samples]
     is_prescribed = experiment.is_prescribed(t_s).reshape(len(t_s), -1)
-    theta = iterate.equations.theta
+    theta = iterate.equations.dynamics.theta
     growths = np.array(
         [
             growth_rate_1_s(

@@ -256,9 +256,8 @@ class ReactionResultant:
             ),
         )
 
-    @property
-    def clock_limit_s(self) -> float:
-        """Largest shift of the sensor's clock [s]; 0 if it is not estimated."""
+    def compute_clock_limit_s(self) -> float:
+        """Return the largest shift of the sensor's clock [s]; 0 if it is not estimated."""
         clock = self.parameter_indices(SENSOR_TIME)
         return float(SENSOR_TIME.high * self.nuisance.scales[clock].sum())
 
@@ -611,7 +610,7 @@ def sensed_dofs(experiment: Experiment) -> Index:
     """Return the dofs (g,) of the nodes of all grasps that a sensor measures, ascending."""
     grasp_dofs = [
         dofs_of(experiment.grasps[k].nodes)
-        for k in experiment.instrumented_grasps
+        for k in experiment.find_instrumented_grasps()
     ]
     return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *grasp_dofs]))
 

@@ -54,7 +54,7 @@ def all_pictures(
     names = [
         n
         for n, item in result.parameters.items()
-        if not item.fixed and n in result.values
+        if not item.fixed and n in result.collect_estimates()
     ]
     pictures = (
         {"convergence": convergence(result.history, names, truth=truth)}
@@ -166,7 +166,7 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
             sensor_picture(values, names, units=units),
         )
     yield from camera_pictures(replay)
-    if replay.has_shapes:
+    if replay.has_shapes():
         yield f"shapes_{replay.name}", shapes_picture(replay)
         for name, figure in obstacle_pictures(replay).items():
             yield f"{name}_{replay.name}", figure

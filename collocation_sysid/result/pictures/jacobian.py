@@ -131,7 +131,10 @@ def _first_steps(
     ]
     short = replace(collocation, experiments=few, associations={})
     p = np.concatenate(
-        [z[: collocation.nq], *(s.guess_phi for s in short.transcriptions)]
+        [
+            z[: collocation.nq],
+            *(s.compute_guess_phi() for s in short.transcriptions),
+        ]
     )
     pairs = zip(collocation.iterates(z), short.transcriptions, strict=True)
     return short, short.pack(

@@ -86,7 +86,7 @@ def shapes_picture(
     Parameters
     ----------
     replay : MotionRecord
-        An experiment with shapes, at least one of which is finite, see `MotionRecord.has_shapes`.
+        An experiment with shapes, at least one of which is finite, see `MotionRecord.has_shapes()`.
     count : int
         Number of samples, at least 1; fewer are shown if there are not as many.
     field : SurfaceField, optional

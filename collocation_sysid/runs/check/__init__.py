@@ -211,9 +211,8 @@ class CheckResult(QuickCheck):
     notes: tuple[str, ...] = ()
     concerns: tuple[Concern, ...] = ()
 
-    @property
-    def chosen_cost(self) -> MethodCost | None:
-        """Cost of the chosen method; None if it is not known."""
+    def find_chosen_cost(self) -> MethodCost | None:
+        """Return the cost of the chosen method; None if it is not known."""
         return next(
             (cost for cost in self.costs if cost.method == self.method), None
         )
@@ -322,7 +321,7 @@ def check_problem(
     report_progress = report_progress or (lambda _: None)
     collocation = problem.collocation()
     notes = []
-    if problem.parameters.names_without_guess:
+    if problem.parameters.list_names_without_guess():
         report_progress(
             "searching for initial values, because no guess is given"
         )
@@ -402,11 +401,8 @@ def check_problem(
         *start_notes,
         *(each for m in findings.motions for each in mode_notes(m)),
     ]
-    notes += (
-        cost_notes(findings.chosen_cost, findings.costs)
-        if findings.chosen_cost
-        else []
-    )
+    chosen_cost = findings.find_chosen_cost()
+    notes += cost_notes(chosen_cost, findings.costs) if chosen_cost else []
     if simulated is first:
         notes.append(
             "only the first samples of the recordings were simulated at the guess; check --full "
@@ -448,14 +444,14 @@ def _simulated_fields(
     """
     positions_m = {}
     for part in collocation.iterates(z):
-        at_samples = part.x[part.segment.markers.sample_rows]
+        at_samples = part.x[part.segment.markers.observable.rows]
         positions_m[part.segment.experiment.name] = at_samples.reshape(
             len(at_samples), -1, 3
         )
     shared_fields = _quick_fields(problem, positions_m)
     recordings = shared_fields["recordings"]
     distances_m = [
-        r.farthest_marker.distance_m for r in recordings if r.markers
+        r.find_farthest_marker().distance_m for r in recordings if r.markers
     ]
     return shared_fields | {
         "experiments": len(recordings),
@@ -566,7 +562,7 @@ def _concerns(
     experiments = problem.experiments
     parameters = problem.parameters
     bodies = findings.bodies
-    chosen = findings.chosen_cost
+    chosen = findings.find_chosen_cost()
     body_of = {name: body for body in bodies for name in body.experiments}
     return (
         *(cause.concern() for cause in findings.causes),
@@ -592,7 +588,9 @@ def _concerns(
         *(
             each
             for e in experiments
-            for each in rotation_step_concerns(e, problem.first_substeps)
+            for each in rotation_step_concerns(
+                e, problem.choose_first_substeps()
+            )
         ),
         *(
             c

@@ -275,11 +275,6 @@ class BodyCheck:
     is_homogeneous: bool = False
 
     @property
-    def diagonal_m(self) -> float:
-        """Length of the diagonal of the body's bounding box [m]."""
-        return float(np.linalg.norm(self.size_m))
-
-    @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences of the concerns about this body."""
         return tuple(concern.message for concern in self.concerns)
@@ -309,14 +304,14 @@ def check_body(
     """
     mesh = body.mesh
     fields = {
-        part.field_name: part.field.resolution
+        part.field_name: part.field.describe_resolution()
         for part in body.parts
         if part.field
     }
     quality = mesh.quality()
     worst = worst_elements(mesh)
     shape = slenderness(mesh)
-    x, y, z = np.ptp(mesh.bounds_m, axis=0).tolist()
+    x, y, z = np.ptp(mesh.compute_bounds_m(), axis=0).tolist()
     return BodyCheck(
         experiments,
         nodes=len(body.nodes.points_m),
@@ -393,7 +388,7 @@ def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
             part.full_name("poisson"): poisson,
         }
     constants = zip(body.constants, theta.tolist(), strict=True)
-    coefficients = body.field_coefficient_names
+    coefficients = body.list_field_coefficient_names()
     return moduli | {
         name: value for name, value in constants if name not in coefficients
     }

@@ -85,14 +85,12 @@ class RecordingCheck:
     air_density_kg_m3: float = 0.0
     test: str = ""
 
-    @property
-    def farthest_marker(self) -> MarkerCheck:
-        """The marker farthest from the body; `ValueError` without markers."""
+    def find_farthest_marker(self) -> MarkerCheck:
+        """Return the marker farthest from the body; `ValueError` without markers."""
         return max(self.markers, key=lambda marker: marker.distance_m)
 
-    @property
-    def most_missing_marker(self) -> MarkerCheck:
-        """The marker with most samples missing; `ValueError` without markers."""
+    def find_most_missing_marker(self) -> MarkerCheck:
+        """Return the marker with most samples missing; `ValueError` without markers."""
         return max(self.markers, key=lambda marker: marker.missing)
 
 
@@ -116,7 +114,7 @@ def check_recording(
             markers.predict_positions(positions_m) - measured_m, axis=2
         )
     findings = []
-    missing = markers.missing_counts
+    missing = markers.count_missing()
     for k, name in enumerate(markers.names):
         present = np.flatnonzero(markers.is_present[:, k])
         findings.append(
@@ -137,7 +135,7 @@ def check_recording(
         duration_s=experiment.duration_s,
         rate_hz=1 / experiment.timestep_s,
         frames=len(experiment.t_s),
-        samples=markers.sample_count,
+        samples=markers.count_samples(),
         missing=int(missing.sum()),
         markers=tuple(findings),
         instruments=tuple(
@@ -183,8 +181,8 @@ def recording_concerns(
             "frames": frames,
         }
 
-    farthest = recording.farthest_marker
-    most_missing = recording.most_missing_marker
+    farthest = recording.find_farthest_marker()
+    most_missing = recording.find_most_missing_marker()
     worst = max(
         recording.markers, key=lambda marker: marker.start_miss_m or 0.0
     )
@@ -193,9 +191,9 @@ def recording_concerns(
         not unseen
         and most_missing.missing > LARGEST_MISSING_SHARE * recording.frames
     )
-    astray = (
-        worst.start_miss_m or 0.0
-    ) > LARGEST_START_MISS_DIAGONALS * body.diagonal_m
+    astray = (worst.start_miss_m or 0.0) > LARGEST_START_MISS_DIAGONALS * float(
+        np.linalg.norm(body.size_m)
+    )
     off = farthest.distance_m > LARGEST_DISTANCE_EDGES * body.edges_m[1]
     return [
         *concern_if(

@@ -185,15 +185,19 @@ def changes_of_nuisances(
         collocation, experiments=wider, huber=UNWEIGHTED
     )  # whatever their weights
     p, positions = collocation.unpack(z)
-    values = dict(zip(collocation.parameter_names, p.tolist(), strict=True))
+    values = dict(
+        zip(collocation.list_parameter_names(), p.tolist(), strict=True)
+    )
     at = wide.pack(
-        np.array([values.get(name, 0.0) for name in wide.parameter_names]),
+        np.array(
+            [values.get(name, 0.0) for name in wide.list_parameter_names()]
+        ),
         positions,
     )
     new = np.array(
         [
             k
-            for k, name in enumerate(wide.parameter_names)
+            for k, name in enumerate(wide.list_parameter_names())
             if name not in values
         ],
         dtype=np.int64,
@@ -201,7 +205,7 @@ def changes_of_nuisances(
     names: dict[int, str] = {}
     for segment in wide.transcriptions:
         own = zip(
-            segment.parameter_indices[wide.nq :],
+            segment.list_parameter_indices()[wide.nq :],
             segment.nuisance.entries,
             strict=True,
         )
@@ -242,7 +246,9 @@ def changed_residuals(
     ResidualChanges
         Not multiplied by Huber's weights.
     """
-    names = tuple(name for row, _ in assumptions for name in row.components)
+    names = tuple(
+        name for row, _ in assumptions for name in row.list_components()
+    )
     changes: list[Array] = []
     for part in collocation.iterates(z):
         at = ExperimentAtAnswer(
@@ -259,7 +265,7 @@ def changed_residuals(
                 sigma,
             )
             for row, sigma in assumptions
-            for axis in range(len(row.components))
+            for axis in range(len(row.list_components()))
         ]
         changes += _changes_by_effects(at, effects)
     return ResidualChanges(names, changes)

@@ -404,7 +404,9 @@ def estimate_changes(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
         slope = slope.reshape(int(np.prod(slope.shape[:-1])), len(free))
         problem = problem.with_rows(np.zeros(len(slope)), slope)
         weighted_change = (
-            change * block.root_weight[..., None] * block.is_measured[..., None]
+            change
+            * block.compute_root_weight()[..., None]
+            * block.is_measured[..., None]
         )
         score += slope.T @ weighted_change.reshape(len(slope), count)
     estimates = np.zeros((len(fit.names), count))

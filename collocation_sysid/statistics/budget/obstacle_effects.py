@@ -108,7 +108,7 @@ def contact_changes_by_size_n(dynamics: Dynamics, x: Array) -> Iterator[Array]:
     x : (N, 3n) array
         Positions [m].
     """
-    forces = dynamics.evaluated_forces
+    forces = dynamics.select_evaluated_forces()
     states_of = forces.states_of_terms(*dynamics.evaluation_states(x))
     for contact in _contacts_with_energy(forces):
         obstacle = contact.law_of_contact.obstacle
@@ -132,7 +132,7 @@ def rigid_contact_change_n(
     x : (N, 3n) array
         Positions [m].
     """
-    forces = dynamics.evaluated_forces
+    forces = dynamics.select_evaluated_forces()
     if not _contacts_with_energy(forces):
         return None
     xi, nu = dynamics.evaluation_states(x)

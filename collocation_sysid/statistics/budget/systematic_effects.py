@@ -130,11 +130,6 @@ class ExperimentAtAnswer:
         """Constants θ of the body (k,)."""
         return self.dynamics.theta
 
-    @property
-    def gravity(self) -> Array:
-        """Acceleration of gravity at each dof (3n,) [m/s²], at the answer."""
-        return self.dynamics.forces.weight.gravity
-
     @cached_property
     def own_mass_kg(self) -> Array:
         """Masses (3n,) of the dofs of the body at the answer, without point masses and air [kg]."""
@@ -221,13 +216,12 @@ class ExperimentAtAnswer:
         return (
             body.nodes.points_m
             if body.inverse_equilibrium is None
-            else self._rest_shape.positions_m
+            else self._solve_rest_shape().positions_m
         )
 
-    @cached_property
-    def _rest_shape(self) -> RestShape:
-        """Stress-free shape that follows from a mesh made under gravity; only for a body with such
-        a mesh.
+    def _solve_rest_shape(self) -> RestShape:
+        """Return the stress-free shape that follows from a mesh made under gravity; only for a body
+        with such a mesh.
         """
         assert self.body.inverse_equilibrium is not None
         return self.body.inverse_equilibrium.solve(self.theta)
@@ -294,25 +288,22 @@ class ExperimentAtAnswer:
         [N] of masses (3n,) or (N, 3n) [kg], without air.
         """
         return mass_kg * (
-            self.gravity
+            self.dynamics.forces.weight.gravity
             - self.body.tied_damping_rate(self.theta) * self.states[1]
         )
 
-    @property
-    def buoyancy_n(self) -> Array:
-        """Buoyancy (N, 3n) in the model [N]; zero in a vacuum."""
-        lifted = -self.dynamics.mass.displaced_kg * self.gravity
+    def compute_buoyancy_n(self) -> Array:
+        """Return the buoyancy (N, 3n) in the model [N]; zero in a vacuum."""
+        lifted = (
+            -self.dynamics.mass.displaced_kg
+            * self.dynamics.forces.weight.gravity
+        )
         return np.broadcast_to(lifted, self.iterate.x.shape)
-
-    @property
-    def added_mass_kg(self) -> Array:
-        """Added mass (3n,) of the air in the model [kg]; zero in a vacuum."""
-        return self.dynamics.mass.added_kg
 
     @cached_property
     def air_drag_n(self) -> Array:
         """Drag of the air (N, 3n) in the model [N]; zero in a vacuum and where nothing moves."""
-        term = self.dynamics.forces.air_drag
+        term = self.dynamics.forces.find_air_drag()
         if term is None:
             return np.zeros_like(self.states[1])
         drag = term.force(States(*self.states, self.theta))
@@ -410,10 +401,9 @@ class Assumption:
     component_names: str = ""
     of_specimens: bool = False
 
-    @property
-    def components(self) -> tuple[str, ...]:
-        """Names of the components, each after that of the assumption and a space; the name alone if
-        there is one component.
+    def list_components(self) -> tuple[str, ...]:
+        """Return the names of the components, each after that of the assumption and a space; the
+        name alone if there is one component.
         """
         return tuple(
             f"{self.name} {a}" for a in self.component_names.split()
@@ -460,10 +450,10 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
             segment.prescribed_motion.dofs, obstacle.prescribed_dofs
         )
         displacement_m[:, obstacle_dofs] = np.tile(shift_m, len(obstacle.nodes))
-    air = 3.0 * at.buoyancy_n + 2.0 * at.air_drag_n
+    air = 3.0 * at.compute_buoyancy_n() + 2.0 * at.air_drag_n
     return Effect(
         force + heavier + at.weight_and_drag(mass) + air,
-        mass + 3.0 * at.added_mass_kg,
+        mass + 3.0 * at.dynamics.mass.added_kg,
         displacement_m=displacement_m,
     )
 
@@ -600,7 +590,7 @@ def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
     ]
     if not gripped:
         return None
-    area_m2 = at.body.dof_volume_m3[prescribed.dofs] ** (2 / 3)
+    area_m2 = at.body.sum_dof_volumes_m3()[prescribed.dofs] ** (2 / 3)
     is_gripped = np.isin(prescribed.dofs, np.concatenate(gripped))
     displacement_m = np.zeros_like(at.grasp_force_n)
     displacement_m[:, is_gripped] = -at.grasp_force_n[:, is_gripped] / (
@@ -642,7 +632,7 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
             if driven[here].any():
                 force_n = at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
                 displacement_m[:, here] = -grasp.displacement_scale * force_n
-    return Effect(displacement_m=experiment.symmetry * displacement_m)
+    return Effect(displacement_m=experiment.find_symmetry() * displacement_m)
 
 
 def _machine_of_specimen(
@@ -721,16 +711,23 @@ def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 def _buoyancy(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of more buoyancy, as a share of that in the model; None in a vacuum."""
-    return Effect(at.buoyancy_n) if at.added_mass_kg.any() else None
+    return (
+        Effect(at.compute_buoyancy_n())
+        if at.dynamics.mass.added_kg.any()
+        else None
+    )
 
 
 def _added_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of more added mass, as a share of that in the model; None in a vacuum and
     for a static experiment.
     """
-    if at.iterate.segment.experiment.is_static or not at.added_mass_kg.any():
+    if (
+        at.iterate.segment.experiment.is_static
+        or not at.dynamics.mass.added_kg.any()
+    ):
         return None
-    return Effect(mass_kg=at.added_mass_kg)
+    return Effect(mass_kg=at.dynamics.mass.added_kg)
 
 
 def _air_drag(at: ExperimentAtAnswer, _: int) -> Effect | None:
@@ -1238,10 +1235,9 @@ class Assumptions(Options):
         )
         return Assumptions(**exact)
 
-    @property
-    def deviations(self) -> dict[str, float | None]:
-        """Standard deviations by name, of all fields; None for what is exact, the deviation about
-        the mean for a known effect.
+    def collect_deviations(self) -> dict[str, float | None]:
+        """Return the standard deviations by name, of all fields; None for what is exact, the
+        deviation about the mean for a known effect.
         """
         by_name: dict[str, float | None] = {}
         for name, deviation in vars(self).items():
@@ -1253,10 +1249,9 @@ class Assumptions(Options):
             by_name[name] = None if known == "none" else known
         return by_name
 
-    @property
-    def means(self) -> dict[str, float]:
-        """Known effects by name, the mean of each over its standard deviation; other assumptions
-        are omitted.
+    def collect_means(self) -> dict[str, float]:
+        """Return the known effects by name, the mean of each over its standard deviation; other
+        assumptions are omitted.
         """
         return {
             name: deviation.mean / deviation.deviation

@@ -176,7 +176,7 @@ class VarianceSources:
         all_free, known = (
             np.zeros((fit.shared_count, fit.shared_count)) for _ in range(2)
         )
-        information = least_squares_of_fit(fit).information
+        information = least_squares_of_fit(fit).compute_information()
         for own, here in ((all_free, free), (known, shared)):
             inverse = np.linalg.pinv(
                 information[np.ix_(here, here)], hermitian=True

@@ -151,7 +151,7 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
     places_m = markers.predict_positions(
         experiment.rigid_positions(experiment.t_s)
     )
-    size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
+    size_m = float(np.linalg.norm(np.ptp(body.mesh.compute_bounds_m(), axis=0)))
 
     def remaining_misfit(tracks_m: Array) -> float:
         """Return the median distance of tracks (T, M, 3) from the rigid positions [m], with a floor
@@ -160,7 +160,7 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
         distances_m = np.linalg.norm(tracks_m - places_m, axis=2)
         return float(np.hypot(np.nanmedian(distances_m), DEFORMED * size_m))
 
-    if markers.sample_count:
+    if markers.count_samples():
         trial = HypothesisTest(
             remaining_misfit(markers.positions_at_samples_m),
             remaining_misfit,

@@ -58,7 +58,7 @@ def obstacle_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     for obstacle in experiment.obstacles:
         strokes = list(_long_stroke(experiment, obstacle))
         yield from strokes
-        forces = obstacle.measured_forces
+        forces = obstacle.find_measured_forces()
         if forces is None or strokes:
             continue
         yield from _pulling(experiment, obstacle, forces)
@@ -109,7 +109,7 @@ def _normal_and_tangential_n(
     shape = obstacle.shape
     if not isinstance(shape, Plane):
         return np.zeros(0), np.zeros(0)
-    forces_n = forces.world_forces_n
+    forces_n = forces.rotate_to_world_n()
     complete = np.isfinite(forces_n).all(axis=1)
     rotations, _ = obstacle.poses.at(forces.t_s[complete])
     normals = rotations @ shape.normal
@@ -166,7 +166,7 @@ def _load_along_motion_n(
     )
     if not stroke_m[axis] or not monotonic:
         return np.zeros(0)
-    load_n = np.sign(stroke_m[axis]) * forces.world_forces_n[:, axis]
+    load_n = np.sign(stroke_m[axis]) * forces.rotate_to_world_n()[:, axis]
     return load_n[np.isfinite(load_n)]
 
 

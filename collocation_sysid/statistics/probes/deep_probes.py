@@ -171,10 +171,11 @@ def _part_probe(
     step : array
         Parameters of the part's fit less those of the joint one.
     """
-    if alone.measurement_count <= len(alone.names):
+    if alone.count_measurements() <= len(alone.names):
         return
     uncertainty = at.uncertainty_of_refit(
-        alone, at.parameters[: alone.shared_count] + step[: alone.shared_count]
+        alone,
+        at.read_parameters()[: alone.shared_count] + step[: alone.shared_count],
     )
     remaining = least_squares_of_fit(alone)
     falls = remaining.loss(-step) - remaining.loss(np.zeros(len(step)))
@@ -213,7 +214,7 @@ def _relaxed_probes(at: SolvedFit) -> Iterator[Probe]:
             block.jacobian[..., len(at.fit.names) :].any()
             for block in wide.blocks
         ):
-            yield relaxed_probe(at, name, wide=wide, p=at.parameters)
+            yield relaxed_probe(at, name, wide=wide, p=at.read_parameters())
 
 
 def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
@@ -244,7 +245,7 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
     wide = with_relaxed_assumption(
         at.fit, at.changes, name=probe.name, widening=_widening(probe.name)
     )
-    p = at.parameters
+    p = at.read_parameters()
     _, positions = collocation.unpack(at.z)
     for _ in range(STEPS):
         step = gauss_newton_step(wide)[:first]

@@ -189,9 +189,8 @@ class SolvedFit:
                 )
         return changes
 
-    @property
-    def parameters(self) -> Array:
-        """All parameters (p,) at the answer."""
+    def read_parameters(self) -> Array:
+        """Return all parameters (p,) at the answer."""
         return self.collocation.parameters_from(self.z)
 
 
@@ -305,7 +304,7 @@ def with_relaxed_assumption(
     for block, change in zip(fit.blocks, changes.blocks, strict=True):
         more = (
             change[..., columns]
-            * (block.root_weight * block.is_measured)[..., None]
+            * (block.compute_root_weight() * block.is_measured)[..., None]
         )
         blocks.append(
             replace(

@@ -89,7 +89,7 @@ def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
             for block in wide.blocks
         ):
             probe = relaxed_probe(
-                solved_fit, name, wide=wide, p=solved_fit.parameters
+                solved_fit, name, wide=wide, p=solved_fit.read_parameters()
             )
             significant = (name,) if probe.is_beyond(limit) else ()
             probes.append(replace(probe, routine=True, sentences=significant))

@@ -323,28 +323,25 @@ class Dependence:
     shared_p: float
     space_p: float = 1.0
 
-    @property
     def is_correlated_in_time(self) -> bool:
-        """Whether the absolute `lag1` is significant at the level `SIGNIFICANCE` and above
+        """Return whether the absolute `lag1` is significant at the level `SIGNIFICANCE` and above
         `NOTICEABLE`; false if its deviation is infinite.
         """
         limit = float(normal_isf(SIGNIFICANCE / 2)) * self.lag1_deviation
         return abs(self.lag1) > max(limit, NOTICEABLE)
 
-    @property
     def is_correlated_in_space(self) -> bool:
-        """Whether errors of neighbours on the surface are correlated: `space_p` below
+        """Return whether errors of neighbours on the surface are correlated: `space_p` below
         `SIGNIFICANCE`.
         """
         return self.space_p < SIGNIFICANCE
 
-    @property
     def is_correlated(self) -> bool:
-        """Whether the errors are correlated in any of these ways."""
+        """Return whether the errors are correlated in any of these ways."""
         return (
-            self.is_correlated_in_time
+            self.is_correlated_in_time()
             or self.shared_p < SIGNIFICANCE
-            or self.is_correlated_in_space
+            or self.is_correlated_in_space()
         )
 
 
@@ -386,7 +383,7 @@ def analyse_dependence(
     Without consecutive samples `lag1` is 0 with an infinite deviation. Huber's weights are those of
     the residuals of the fit.
     """
-    if fit.chi_squared <= ROUNDING**2 * fit.measurement_count:
+    if fit.compute_chi_squared() <= ROUNDING**2 * fit.count_measurements():
         return Dependence(0.0, np.inf, shared_p=1.0)
     pairs = zip(fit.blocks, information.scaled_jacobians, strict=True)
     tested = (each for each in pairs if not each[0].has_noise_floor)

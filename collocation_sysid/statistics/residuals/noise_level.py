@@ -78,18 +78,16 @@ class NoiseLevel:
     known_score_covariance: Array = field(repr=False)
     sigma_key: str = "sigma_m"
 
-    @property
     def is_unequal(self) -> bool:
-        """Whether markers differ more than by chance: `unequal_p` below `UNEQUAL`."""
+        """Return whether markers differ more than by chance: `unequal_p` below `UNEQUAL`."""
         return self.unequal_p < UNEQUAL
 
-    @property
-    def suggested_noise(self) -> Noise:
-        """Source of the variance that the residuals suggest: "by-marker" if markers are unequal,
-        else "estimated" if the residuals are significantly larger (`LARGER`) or smaller than σ,
-        else "given".
+    def suggest_noise(self) -> Noise:
+        """Return the source of the variance that the residuals suggest: "by-marker" if markers are
+        unequal, else "estimated" if the residuals are significantly larger (`LARGER`) or smaller
+        than σ, else "given".
         """
-        if self.is_unequal:
+        if self.is_unequal():
             return "by-marker"
         return (
             "estimated"
@@ -104,12 +102,11 @@ class NoiseLevel:
             zip(self.names, np.sqrt(self.variances).tolist(), strict=True)
         )
 
-    @property
-    def unevenness(self) -> float:
-        """Factor by which unequal markers increase the standard deviation of a mean over
+    def compute_unevenness(self) -> float:
+        """Return the factor by which unequal markers increase the standard deviation of a mean over
         all of them; 1 if they are equal.
         """
-        if not self.is_unequal:
+        if not self.is_unequal():
             return 1.0
         weights = self.variances * self.freedoms
         equal = weights.sum() ** 2 / self.freedoms.sum()
@@ -239,7 +236,7 @@ def _prior_score_covariance(block: ResidualBlock, slope: Array) -> Array:
     rows = slope.reshape(slope.shape[0] * slope.shape[1], slope.shape[2])
     share = rows.T @ rows
     degrees_of_freedom = max(
-        1.0, block.measurement_count - float(np.trace(share))
+        1.0, block.count_measurements() - float(np.trace(share))
     )
     factor = max(
         1.0,
@@ -418,7 +415,9 @@ def shortened_power(block: ResidualBlock) -> float:
 
     It is E min(χ², k²) / E χ² for three axes and the largest shortened residual k.
     """
-    if not block.is_outlier.any():
+    if not block.find_outliers().any():
         return 1.0
-    squared = float(np.sum(block.residual[block.is_outlier] ** 2, axis=1).max())
+    squared = float(
+        np.sum(block.residual[block.find_outliers()] ** 2, axis=1).max()
+    )
     return float(squared * chi2_sf(squared, 3) / 3 + chi2_cdf(squared, 5))

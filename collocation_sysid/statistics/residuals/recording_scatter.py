@@ -74,10 +74,9 @@ class RecordingComparison:
     deviations: Array
     sensitivities: Array
 
-    @property
-    def chi_squared(self) -> Array:
-        """χ² of the disagreement on each parameter (nq,); recordings that do not determine it (NaN)
-        are left out.
+    def compute_chi_squared(self) -> Array:
+        """Return χ² of the disagreement on each parameter (nq,); recordings that do not determine
+        it (NaN) are left out.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             weight = np.nan_to_num(1 / self.deviations**2)
@@ -88,20 +87,18 @@ class RecordingComparison:
             weight * np.nan_to_num(self.differences - mean) ** 2, axis=0
         )
 
-    @property
-    def degrees_of_freedom(self) -> NDArray[np.int64]:
-        """Degrees of freedom (nq,) of χ²: the number of recordings that determine the parameter,
-        less one, at least 0.
+    def count_degrees_of_freedom(self) -> NDArray[np.int64]:
+        """Return the degrees of freedom (nq,) of χ²: the number of recordings that determine the
+        parameter, less one, at least 0.
         """
         return np.maximum(np.isfinite(self.deviations).sum(axis=0) - 1, 0)
 
-    @property
-    def is_disagreeing(self) -> NDArray[np.bool_]:
-        """Mask (nq,) of the parameters on which the recordings disagree more than by chance:
-        p-value of χ² below `SIGNIFICANT` over the number of parameters.
+    def find_disagreements(self) -> NDArray[np.bool_]:
+        """Return the mask (nq,) of the parameters on which the recordings disagree more than by
+        chance: p-value of χ² below `SIGNIFICANT` over the number of parameters.
         """
-        freedom = self.degrees_of_freedom
-        p = chi2_sf(self.chi_squared, np.maximum(freedom, 1))
+        freedom = self.count_degrees_of_freedom()
+        p = chi2_sf(self.compute_chi_squared(), np.maximum(freedom, 1))
         return np.asarray((freedom > 0) & (p < SIGNIFICANT / len(freedom)))
 
     def widen(self, variances: Array) -> Array:
@@ -109,13 +106,15 @@ class RecordingComparison:
         recordings disagree: to χ²/f times the lesser of the variance and that of the mean of the
         recordings, if that is more. The argument is not modified.
         """
-        ratio = self.chi_squared / np.maximum(self.degrees_of_freedom, 1)
+        ratio = self.compute_chi_squared() / np.maximum(
+            self.count_degrees_of_freedom(), 1
+        )
         with np.errstate(invalid="ignore", divide="ignore"):
             of_all = 1 / np.nansum(1 / self.deviations**2, axis=0)
             enough = np.maximum(
                 variances, ratio * np.minimum(variances, of_all)
             )
-        return np.where(self.is_disagreeing, enough, variances)
+        return np.where(self.find_disagreements(), enough, variances)
 
 
 def blocks_by_recording(fit: LinearisedFit) -> dict[str, list[int]]:
@@ -256,11 +255,11 @@ def _sensitivities_to_differences(
         least_squares_of_blocks(fit, blocks_by_recording(fit)[name])
         for name in names
     ]
-    each = np.array([o.information for o in own])
-    scores = np.array([o.score for o in own])
+    each = np.array([o.compute_information() for o in own])
+    scores = np.array([o.compute_score() for o in own])
     together = least_squares_of_fit(fit)
-    information = together.information
-    score = together.score
+    information = together.compute_information()
+    score = together.compute_score()
     free = np.flatnonzero(~fit.at_bound)
     inverse = np.linalg.pinv(information[np.ix_(free, free)], hermitian=True)
     shared = free[free < fit.shared_count]

@@ -184,7 +184,7 @@ def _diagnose_marker(
         experiment=block.name,
         marker=block.marker_names[marker],
         samples=samples,
-        wild=int(block.is_outlier[:, marker].sum()),
+        wild=int(block.find_outliers()[:, marker].sum()),
         rms_m=_rms_m(block, marker),
         noise_factor=level.factors[name],
         offset_m=mean,
@@ -196,7 +196,7 @@ def _diagnose_marker(
         sentence="",
     )
     if name in outliers:
-        message = outliers[name].concern.message.removeprefix(f"{name}: ")
+        message = outliers[name].to_concern().message.removeprefix(f"{name}: ")
         return replace(
             diagnosis,
             sentence=f"{name}: {1e3 * diagnosis.rms_m:.2g} mm RMS; {message}",
@@ -409,10 +409,9 @@ class Outlier:
     deviations: float
     is_relaxed_start: bool
 
-    @property
-    def concern(self) -> Concern:
-        """Concern about this sample, of grade "check": "residuals/first" for a relaxed start, else
-        "residuals/outlier".
+    def to_concern(self) -> Concern:
+        """Return the concern about this sample, of grade "check": "residuals/first" for a relaxed
+        start, else "residuals/outlier".
         """
         code = (
             "residuals/first" if self.is_relaxed_start else "residuals/outlier"
