@@ -62,7 +62,9 @@ class GeneratedFunction:
         The axes … of the result are those of the data, also if their product is zero; (0, …) are
         data of an expression that uses none.
         """
-        return self._evaluate_at_instances(self._value, u, data)[0][:, 0]
+        return self._evaluate_at_instances("value", self._value, u, data)[0][
+            :, 0
+        ]
 
     def evaluate_with_jacobian(
         self, u: Array, data: Array
@@ -76,7 +78,9 @@ class GeneratedFunction:
         data : (d, …)
             Data, which are not differentiated; their axes after the first are the instances.
         """
-        value, slopes = self._evaluate_at_instances(self._slopes, u, data)
+        value, slopes = self._evaluate_at_instances(
+            "slopes", self._slopes, u, data
+        )
         return value[:, 0], slopes
 
     def weighted_hessian(
@@ -96,7 +100,9 @@ class GeneratedFunction:
             if weights is None
             else weights
         )
-        return self._evaluate_at_instances(self._curvature, u, data, weights)[0]
+        return self._evaluate_at_instances(
+            "curvature", self._curvature, u, data, weights
+        )[0]
 
     @cached_property
     def dependent_inputs(self) -> NDArray[np.bool_]:
@@ -180,7 +186,7 @@ class GeneratedFunction:
         )
 
     def _evaluate_at_instances(
-        self, function: ca.Function, u: Array, *others: Array
+        self, name: str, function: ca.Function, u: Array, *others: Array
     ) -> list[Array]:
         """Return the outputs of a CasADi function at all instances, each (rows, columns, …).
 
@@ -200,7 +206,6 @@ class GeneratedFunction:
             u = np.broadcast_to(
                 u.reshape(-1, *(1 for _ in shape)), (len(u), *shape)
             )
-        name = function.name()
         if name not in self._output_sizes:
             self._output_sizes[name] = [
                 function.size_out(k) for k in range(function.n_out())

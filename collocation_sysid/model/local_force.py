@@ -72,6 +72,24 @@ class CandidatePoints:
             skew_factors=np.sign(row - column) / 2,
         )
 
+    def positions(self, x: Array) -> Array:
+        """Return the positions (i, 3) [m] of the candidates, or their velocities, from those of all
+        nodes x (n, 3).
+        """
+        nodes, weights = self._interpolation
+        return weights @ x[nodes]
+
+    @cached_property
+    def _interpolation(self) -> tuple[Index, Array]:
+        """Nodes (m,) of the faces of all candidates, and their weights (i, m) at the candidates."""
+        nodes, places = np.unique(self.nodes, return_inverse=True)
+        weights = np.zeros((len(self.nodes), len(nodes)))
+        rows = np.arange(len(self.nodes))[:, None]
+        np.add.at(
+            weights, (rows, places.reshape(self.nodes.shape)), self.weights
+        )
+        return nodes, weights
+
     def assemble(self, push: Array, size: int) -> Array:
         """Return forces (size,) [N] on the dofs of a body from forces `push` (3, i) [N] on the i
         candidates.

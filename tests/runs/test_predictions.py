@@ -199,8 +199,9 @@ def test_gate_and_rms_of_depth_belong_to_the_same_points():
         bad.rms_m**2 - (1 - bad.share_beyond_gate) * bad.rms_within_gate_m**2
     )
     assert bad.gate_m < np.sqrt(beyond / bad.share_beyond_gate) <= bad.reach_m
-    assert f"{bad.share_beyond_gate:.0%} beyond the gate of 10 mm" in shown(
-        image_predicted(0.3e5)
+    assert (
+        f"{bad.share_beyond_gate:.0%} beyond the limit of 10 mm (gate_m)"
+        in shown(image_predicted(0.3e5))
     )
 
 

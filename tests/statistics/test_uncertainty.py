@@ -114,7 +114,7 @@ def test_sensitivities_fit_every_layout_and_several_experiments(options):
 def assert_constraints_are_kept(collocation, z):
     found = sensitivities(collocation, z)
     moving = [
-        segment.parameter_indices[segment.dynamic_parameters]
+        segment.list_parameter_indices()[segment.dynamic_parameters]
         for segment in collocation.transcriptions
     ]
     assert [b.shape for b in found] == [

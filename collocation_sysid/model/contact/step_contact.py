@@ -105,15 +105,11 @@ class ContactCandidates:
             Length of the time step over which the pressure is averaged [s]; 0 if it is not.
         """
         frame = self.law.obstacle.nodes
-        nodes = self.points.nodes
         moving = [
             each.reshape(-1, 3)
             for each in (xi, nu)[: 1 + self.law.depends_on_velocity]
         ]
-        own = [
-            np.einsum("ik,ikj->ji", self.points.weights, x[nodes] - x[frame[0]])
-            for x in moving
-        ]
+        own = [(self.points.positions(x) - x[frame[0]]).T for x in moving]
         ends = [(x[frame[1:]] - x[frame[0]]).ravel() for x in moving]
         same = np.concatenate([*ends, theta[self.law.constant_columns]])
         return LawInputs(

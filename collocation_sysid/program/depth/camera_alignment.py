@@ -195,7 +195,6 @@ def align_camera(
     surface: VisibleSurface,
     x: Array,
     image: int,
-    start: tuple[Array, Array] | None = None,
 ) -> tuple[Array, Array]:
     """Return the rotation vector (3,) [rad] and translation (3,) [m] of the camera error that align
     the points of an image with a shape, see `DepthCameraModel.with_pose`.
@@ -216,9 +215,6 @@ def align_camera(
         Surface nodes [m].
     image : int
         Index of the image, which must have points.
-    start : ((3,) array, (3,) array), optional
-        The result for a similar shape, from which alone the search then starts, with the narrower
-        half of the gates.
     """
     rotations, translations = camera.poses
     corners = ((x - translations[image]) @ rotations[image])[
@@ -250,19 +246,15 @@ def align_camera(
     iterate = partial(
         iterate_alignments, camera, places=places, normals=normals
     )
-    if start is None:
-        candidates = _first_candidates(
-            clouds.narrow.points_m, places, gate_m=float(gates[0])
+    candidates = _first_candidates(
+        clouds.narrow.points_m, places, gate_m=float(gates[0])
+    )
+    for some_gates in np.array_split(wide_gates, CHOICES):
+        candidates = distinct_poses(
+            iterate(cloud=clouds.wide, gates=some_gates, starts=candidates),
+            size_m=size_m,
+            same_m=SAME_POSE * some_gates[-1],
         )
-        for some_gates in np.array_split(wide_gates, CHOICES):
-            candidates = distinct_poses(
-                iterate(cloud=clouds.wide, gates=some_gates, starts=candidates),
-                size_m=size_m,
-                same_m=SAME_POSE * some_gates[-1],
-            )
-    else:
-        turn, shift_m = start
-        candidates = [AlignedPose(Rotation.from_rotvec(turn), shift_m)]
     best = min(
         iterate(
             cloud=clouds.narrow,

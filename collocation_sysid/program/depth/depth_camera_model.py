@@ -98,11 +98,6 @@ class DepthCameraModel:
         return {}
 
     @cached_property
-    def alignments(self) -> list[Any]:
-        """Alignments of the camera with shapes so far, in their order; empty at first."""
-        return []
-
-    @cached_property
     def alignment_clouds(self) -> dict[int, Any]:
         """Points of images for alignments, by index of the image; empty at first."""
         return {}
@@ -139,20 +134,11 @@ class DepthCameraModel:
         pinhole = self.depth.camera.matrix is not None
         return [p / p[:, 2:] if pinhole else np.zeros_like(p) for p in clouds]
 
-    def share_alignments(self, other: DepthCameraModel) -> None:
-        """Store alignments together with another model of the camera from now on, if both give the
-        same: points, pivot and priors of the pose are equal.
+    def share_alignment_clouds(self, other: DepthCameraModel) -> None:
+        """Use the points for alignments of another model of the camera from now on, if both have the
+        same measured points.
         """
-        is_same = (
-            self.depth is other.depth
-            and (self.pivot_m == other.pivot_m).all()
-            and all(
-                (self.prior_weights(row) == other.prior_weights(row)).all()
-                for row in (DEPTH_TURN, DEPTH_SHIFT)
-            )
-        )
-        if is_same:
-            vars(self)["alignments"] = other.alignments
+        if self.depth is other.depth:
             vars(self)["alignment_clouds"] = other.alignment_clouds
 
     def corrected_expression(

@@ -37,8 +37,6 @@ SPREAD = 6.0
 NARROWER = 0.8
 # Shapes that change by less than this share of σ keep their correspondences.
 SAME = 0.2
-# Shapes that differ by less than this share of the gate are aligned from the same pose.
-SIMILAR = 0.25
 # Largest alignment in standard deviations of its prior; more belongs to something else.
 FARTHEST = 4.0
 # Reasons for leaving points out, in the order in which they are tested.
@@ -266,10 +264,10 @@ class SurfaceCorrespondences(Correspondences):
         )
 
     def with_camera(self, camera: DepthCameraModel) -> SurfaceCorrespondences:
-        """Return the same correspondences with another model of their camera, which shares the
-        alignments of the present one if points, pivot and priors of the pose are the same.
+        """Return the same correspondences with another model of their camera, which uses the points
+        for alignments of the present one if both have the same measured points.
         """
-        camera.share_alignments(self.camera)
+        camera.share_alignment_clouds(self.camera)
         return replace(self, camera=camera)
 
     def is_aligned_with(self, shapes_m: Array, phi: Array) -> bool:
@@ -421,63 +419,14 @@ def _aligned_parameters(
     that has points; φ itself if the pose would differ from the stated one by more than `FARTHEST`
     prior standard deviations. The arguments are those of `SurfaceCorrespondences.from_alignment`.
     """
-    turn, shift_m = _alignment(
-        camera,
-        VisibleSurface.from_body(body, camera.depth),
-        x=shapes_m[camera.depth.find_first_sample_with_points()],
+    first = camera.depth.find_first_sample_with_points()
+    surface = VisibleSurface.from_body(body, camera.depth)
+    turn, shift_m = align_camera(
+        camera, surface, x=shapes_m[first], image=first
     )
     moved = camera.with_pose(phi, turn, shift_m=shift_m)
     errors = np.abs(moved[camera.parameter_indices])
     return phi if errors.max(initial=0.0) > FARTHEST else moved
-
-
-class _Alignment(NamedTuple):
-    """Pose of a camera that is aligned with a shape, see `align_camera`.
-
-    Attributes
-    ----------
-    x : (n, 3) array
-        Surface nodes of the shape [m].
-    turn : (3,) array
-        Rotation vector of the camera's error [rad].
-    shift_m : (3,) array
-        Translation of the camera's error [m].
-    """
-
-    x: Array
-    turn: Array
-    shift_m: Array
-
-
-def _alignment(
-    camera: DepthCameraModel, surface: VisibleSurface, x: Array
-) -> tuple[Array, Array]:
-    """Return the rotation vector (3,) [rad] and the translation (3,) [m] of the camera's error that
-    align its first image with points with a shape x (n, 3) [m].
-
-    Alignments are stored with the camera: that of the same shape (to the share `SAME` of σ) is
-    returned again, and that of a shape that differs by less than the share `SIMILAR` of the gate is
-    where the search starts.
-    """
-    known = camera.alignments
-    apart_m = [float(np.abs(each.x - x).max(initial=0.0)) for each in known]
-    nearest = int(np.argmin(apart_m)) if known else None
-    start = None
-    if nearest is not None:
-        pose = known[nearest].turn, known[nearest].shift_m
-        if apart_m[nearest] < SAME * camera.depth.sigma_m:
-            return pose
-        if apart_m[nearest] < SIMILAR * camera.depth.gate_m:
-            start = pose
-    turn, shift_m = align_camera(
-        camera,
-        surface,
-        x=x,
-        image=camera.depth.find_first_sample_with_points(),
-        start=start,
-    )
-    known.append(_Alignment(x, turn, shift_m=shift_m))
-    return turn, shift_m
 
 
 class _NearestPoints(NamedTuple):

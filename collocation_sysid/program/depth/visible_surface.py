@@ -19,6 +19,8 @@ from ...recording.placement import nearest_points_of_triangles
 
 # Number of triangles, nearest by their middles, among which the nearest point is searched.
 NEARBY = 10
+# Relative difference of distances below which triangles are equally near.
+TIE = 1e-9
 # Largest number of Newton steps to the nearest point on a curved face.
 SETTLING = 3
 # Change of barycentric coordinates below which these steps end.
@@ -473,29 +475,28 @@ def _nearest_of_triangles(
     beside = np.maximum(np.maximum(beyond[0], beyond[1]), beyond[2])
     bounds = np.hypot(height, np.maximum(beside, 0.0))
     is_above = (beside <= 0) & has_area[neighbours]
+    exact = np.where(is_above, bounds, np.inf)
+    bounds[is_above] = np.inf
+    # First the one with the smallest bound, then all whose bounds are not larger than the least
+    # distance.
+    is_lowest = np.arange(neighbours.shape[1]) == bounds.argmin(axis=1)[:, None]
+    for is_next in (is_lowest, ~is_lowest):
+        least = exact.min(axis=1, keepdims=True)
+        point, rank = np.nonzero(is_next & (bounds <= (1 + TIE) * least))
+        on = nearest_points_of_triangles(
+            points[point], triangles[neighbours[point, rank]]
+        )
+        exact[point, rank] = np.linalg.norm(on - points[point], axis=1)
+    # Of equally near triangles the one with the nearest middle counts, not a rounding error.
     rows = np.arange(len(points))
-    rank = np.where(is_above, bounds, np.inf).argmin(axis=1)
-    least = np.where(is_above[rows, rank], bounds[rows, rank], np.inf)
+    is_nearest = exact <= (1 + TIE) * exact.min(axis=1, keepdims=True)
+    rank = is_nearest.argmax(axis=1)
     nearest = neighbours[rows, rank]
     feet = points - height[rows, rank, None] * normals[nearest]
-    # Then the one with the smallest bound, and all others whose bounds are smaller than its distance.
-    bounds[is_above] = np.inf
-    lowest = bounds.argmin(axis=1)
-    for only in (True, False):
-        is_possible = bounds < least[:, None]
-        if only:
-            is_possible &= np.arange(neighbours.shape[1]) == lowest[:, None]
-        point, rank = np.nonzero(is_possible)
-        bounds[point, rank] = np.inf
-        triangle = neighbours[point, rank]
-        on = nearest_points_of_triangles(points[point], triangles[triangle])
-        apart = np.linalg.norm(on - points[point], axis=1)
-        # Of several triangles of a point, the nearest is written last.
-        order = np.argsort(-apart, kind="stable")
-        order = order[apart[order] < least[point[order]]]
-        nearest[point[order]] = triangle[order]
-        feet[point[order]] = on[order]
-        least[point[order]] = apart[order]
+    (beside_them,) = np.nonzero(~is_above[rows, rank])
+    feet[beside_them] = nearest_points_of_triangles(
+        points[beside_them], triangles[nearest[beside_them]]
+    )
     return nearest, _barycentric(feet, triangles[nearest])
 
 

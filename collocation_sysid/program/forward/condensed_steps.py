@@ -312,18 +312,29 @@ class CondensedStiffness:
 
     @classmethod
     def at_dofs(
-        cls, dofs: Index, compliance: Compliance, stiffness: Array
+        cls,
+        dofs: Index,
+        compliance: Compliance,
+        stiffness: Array,
+        previous: CondensedStiffness | None = None,
     ) -> CondensedStiffness:
         """Return the matrices at sorted free dofs (s,) with a stiffness (s, s) of
         local forces.
+
+        The compliance is that of `previous` matrices with the same body if these have the same
+        dofs (the same object).
 
         Raises
         ------
         CondensationError
             If the matrix is singular.
         """
-        columns = compliance.columns_at(dofs)
-        flexibility = columns[:, dofs].T
+        if previous is not None and previous.dofs is dofs:
+            columns = previous.columns
+            flexibility = previous.compliance
+        else:
+            columns = compliance.columns_at(dofs)
+            flexibility = np.asfortranarray(columns[:, dofs].T)
         matrix = flexibility @ stiffness
         matrix.flat[:: len(dofs) + 1] += 1.0
         lu, pivots, info = _getrf(matrix)
@@ -421,6 +432,7 @@ class CondensedSteps:
                 self._condensed = condensed
                 self._last = now
                 return step
+            self._condensed = condensed
             condensed = self._condensed_at(start, now)
         raise CondensationError
 
@@ -485,7 +497,10 @@ class CondensedSteps:
             places = np.searchsorted(dofs, now.dofs)
             stiffness[np.ix_(places, places)] = present
         return CondensedStiffness.at_dofs(
-            dofs, self._compliance, stiffness=stiffness
+            dofs,
+            self._compliance,
+            stiffness=stiffness,
+            previous=self._condensed,
         )
 
     def _advanced(self, x: Array, step: Array) -> Array:
