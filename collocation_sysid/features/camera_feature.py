@@ -197,7 +197,7 @@ def simulated_hypotheses(
     if not has_images or not may_be_images(check.causes):
         return (), ()
     check.report_progress("comparing depth images with equilibria and motion")
-    found = depth_image_hypotheses(
+    hypotheses = depth_image_hypotheses(
         check.problem, check.parts, most_nodes=None if check.is_full else NODES
     )
     is_omitted = not check.is_full and any(
@@ -207,7 +207,7 @@ def simulated_hypotheses(
         "depth images were not compared with equilibria of many stiffnesses, which takes long for "
         f"more than {NODES} nodes; check --full does it"
     )
-    return found, (note,) * is_omitted
+    return hypotheses, (note,) * is_omitted
 
 
 def may_be_images(causes: Sequence[Hypothesis]) -> bool:

@@ -170,7 +170,7 @@ class Horizon:
         known = (
             known_iterate.trajectories if known_iterate else self._repeat(None)
         )
-        swept = self.workers.map_experiments(
+        sweep_results = self.workers.map_experiments(
             sweep,
             self.solvers,
             self.segments,
@@ -180,7 +180,7 @@ class Horizon:
             self._repeat(None),
             self._repeat(accuracy),
         )
-        return self._iterate_from(p, swept)
+        return self._iterate_from(p, sweep_results)
 
     @one_blas_thread()
     def evaluate_step(
@@ -213,7 +213,7 @@ class Horizon:
         SearchEnded
             If the workers are lost.
         """
-        swept = self.workers.map_experiments(
+        sweep_results = self.workers.map_experiments(
             sweep_after_step,
             self.solvers,
             self.segments,
@@ -222,7 +222,7 @@ class Horizon:
             self._by_experiment(step),
             self._repeat(accuracy),
         )
-        return self._iterate_from(p, swept)
+        return self._iterate_from(p, sweep_results)
 
     @one_blas_thread()
     def reassociate(self, p: Array, iterate: Iterate) -> Iterate:

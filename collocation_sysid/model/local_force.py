@@ -274,5 +274,5 @@ class LocalForces:
         """Return the points on which each force with candidates acts at ξ and ν, (1, 3n) each;
         `rates` are the derivatives of both by the unknown positions.
         """
-        found = (part.active_points(xi, nu, rates) for part in self.parts)
-        return [points for points in found if points is not None]
+        all_points = (part.active_points(xi, nu, rates) for part in self.parts)
+        return [points for points in all_points if points is not None]

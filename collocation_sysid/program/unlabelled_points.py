@@ -59,11 +59,11 @@ def initial_correspondences(
     if not experiment.depths:
         return ()
     nuisance = NuisanceMap.from_experiment(experiment)
-    found = []
+    correspondences = []
     for camera in sensor_models(experiment, nuisance):
         nodes = VisibleSurface.from_body(experiment.body, camera.depth).nodes
         shapes_m = experiment.rigid_positions(camera.depth.sample_times_s)
-        found.append(
+        correspondences.append(
             SurfaceCorrespondences.from_alignment(
                 camera,
                 experiment.body,
@@ -71,7 +71,7 @@ def initial_correspondences(
                 phi=np.zeros(nuisance.size),
             )
         )
-    return tuple(found)
+    return tuple(correspondences)
 
 
 def residuals_of_points(

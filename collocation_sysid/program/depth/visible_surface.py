@@ -472,9 +472,9 @@ def _nearest_of_triangles(
         _affine_values(slopes, through=origin, points=points, rows=neighbours)
         for slopes, origin in zip(functions, through, strict=True)
     )
-    beside = np.maximum(np.maximum(beyond[0], beyond[1]), beyond[2])
-    bounds = np.hypot(height, np.maximum(beside, 0.0))
-    is_above = (beside <= 0) & has_area[neighbours]
+    side_distance = np.maximum(np.maximum(beyond[0], beyond[1]), beyond[2])
+    bounds = np.hypot(height, np.maximum(side_distance, 0.0))
+    is_above = (side_distance <= 0) & has_area[neighbours]
     exact = np.where(is_above, bounds, np.inf)
     bounds[is_above] = np.inf
     # First the one with the smallest bound, then all whose bounds are not larger than the least
@@ -493,9 +493,9 @@ def _nearest_of_triangles(
     rank = is_nearest.argmax(axis=1)
     nearest = neighbours[rows, rank]
     feet = points - height[rows, rank, None] * normals[nearest]
-    (beside_them,) = np.nonzero(~is_above[rows, rank])
-    feet[beside_them] = nearest_points_of_triangles(
-        points[beside_them], triangles[nearest[beside_them]]
+    (not_above,) = np.nonzero(~is_above[rows, rank])
+    feet[not_above] = nearest_points_of_triangles(
+        points[not_above], triangles[nearest[not_above]]
     )
     return nearest, _barycentric(feet, triangles[nearest])
 

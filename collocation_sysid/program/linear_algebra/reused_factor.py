@@ -245,27 +245,27 @@ class _Columns:
         """
         self._descend(direction)
 
-    def keep(self, is_kept: NDArray[np.bool_]) -> None:
-        """Continue with those of the active columns for which `is_kept` (active,) is true."""
-        if is_kept.all():
+    def keep(self, is_active: NDArray[np.bool_]) -> None:
+        """Continue with those of the active columns for which `is_active` (active,) is true."""
+        if is_active.all():
             return
-        self.active = self.active[is_kept]
-        self.residual = self.residual[:, is_kept]
+        self.active = self.active[is_active]
+        self.residual = self.residual[:, is_active]
         self._directions = [
-            (d[:, is_kept], q[:, is_kept], size[is_kept])
+            (d[:, is_active], q[:, is_active], size[is_active])
             for d, q, size in self._directions
         ]
 
     def forget_directions(self) -> None:
-        """Begin anew from the present solution, for another preconditioner."""
+        """Delete all directions: continue from the present solution with another preconditioner."""
         self._directions = []
 
     def _descend(self, direction: Array) -> None:
         image = self.product(direction)
-        for earlier, earlier_image, size in self._directions:
-            share = self._inner(image, earlier_image) / size
-            direction = direction - share * earlier
-            image = image - share * earlier_image
+        for previous, previous_image, size in self._directions:
+            share = self._inner(image, previous_image) / size
+            direction = direction - share * previous
+            image = image - share * previous_image
         curvature = np.einsum("ij,ij->j", direction, image)
         self.is_definite &= bool((curvature >= 0).all())
         size = self._inner(image, image)
