@@ -168,7 +168,7 @@ def run_isolated(
 
 
 def killed_by(code: int) -> str:
-    """Return "its process was killed by SIGNAL" from the exit code of a process; "" if it ended by
+    """Return "the process was killed by SIGNAL" from the exit code of a process; "" if it ended by
     itself (a code of 0 or more) or the signal is unknown.
     """
     if code < 0:

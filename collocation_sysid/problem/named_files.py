@@ -23,7 +23,7 @@ def existing_file(folder: Path, name: str, key: str) -> Path:
     if not stored_files(file):
         fault = "is a folder" if file.is_dir() else "does not exist"
         hint = folder / "README.md"
-        see = f"; {hint} explains how to get it" if hint.is_file() else ""
+        see = f"; {hint} may explain how to get it" if hint.is_file() else ""
         message = (
             f"{file} {fault}; expected a file: the path is relative to the folder of the problem "
             f"file{see}"

@@ -311,10 +311,11 @@ def _require_not_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
     bad = np.flatnonzero(volumes <= DEGENERATE_RATIO * cubes)
     if len(bad):
         raise InputError(
-            f"element {bad[0]} with nodes {tetrahedra[bad[0]].tolist()} is degenerate: its volume "
-            f"is {volumes[bad[0]]:.3g} m³; expected more than {DEGENERATE_RATIO:g} times the cube "
-            f"of its mean edge length, {cubes[bad[0]]:.3g} m³ (number of such elements: {len(bad)}): "
-            "remove it, or mesh the body again"
+            f"element {bad[0]} (counted from 0) with nodes {tetrahedra[bad[0]].tolist()} is "
+            f"degenerate: its volume is {volumes[bad[0]]:.3g} m³; expected more than "
+            f"{DEGENERATE_RATIO * cubes[bad[0]]:.3g} m³, which is {DEGENERATE_RATIO:g} times the "
+            f"cube of its mean edge length (number of such elements: {len(bad)}): remove it, or "
+            "mesh the body again"
         )
 
 

@@ -691,7 +691,7 @@ def _poses_through_frames(
     if not moving:
         raise InputError(
             f"{child} does not move relative to {parent} in this log; expected two frames that "
-            "move relative to each other. If the grasp stands still, omit the poses"
+            "move relative to each other. If the grasp, obstacle or camera is at rest, omit its poses"
         )
     first = max(t[0] for t in moving)
     last = min(t[-1] for t in moving)
