@@ -118,7 +118,7 @@ def test_starts_need_something_to_spread_about(folder):
     outcome = run_command(*command, "--starts", 2, "--dry-run")
     assert outcome.code == 2
     assert (
-        "parameters.lambda_pa: has neither a guess nor a true value"
+        "parameters.lambda_pa: this parameter has neither a guess nor a true value"
         in outcome.err
     )
     alone = run_command(*command, "--dry-run")
@@ -208,7 +208,7 @@ def test_nuisance_parameters_are_taken_over(folder):
     [
         (None, "is not the folder of an earlier run: it has no result.json"),
         ("{", "is damaged"),
-        ("other-parameters", "found x_pa, "),
+        ("other-parameters", "found the parameters x_pa, "),
     ],
     ids=["no-run", "damaged", "other-parameters"],
 )
