@@ -32,10 +32,6 @@ MARCHED = NewtonOptions(tolerance=1e-6)
 # Of equilibria near known ones. Those that are not found at once are too far for it.
 # Their stability is decided by the sweep along them, which factorises the same matrices.
 SETTLED = NewtonOptions(tolerance=1e-9, max_halvings=0, checks_stability=False)
-# Tolerance of these equilibria over the relative change of positions by the step, between that of
-# `SETTLED` and `LOOSEST`: the sweep takes Newton's next step, whose error is far smaller.
-SETTLED_SHARE = 1e-4
-LOOSEST = 1e-6
 
 
 @dataclass(frozen=True)

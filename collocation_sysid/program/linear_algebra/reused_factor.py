@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from .factorisation import ACCURACY, CONTRACTION, Factor, Factoriser
@@ -107,9 +108,7 @@ def best_rotation(before_m: Array, after_m: Array) -> Array:
     """
     before = before_m - before_m.mean(axis=0)
     after = after_m - after_m.mean(axis=0)
-    left, _, right = np.linalg.svd(after.T @ before)
-    left[:, -1] *= np.sign(np.linalg.det(left @ right))
-    return left @ right
+    return Rotation.align_vectors(after, before)[0].as_matrix()
 
 
 @dataclass(eq=False)
@@ -231,7 +230,7 @@ class _Columns:
         self.is_definite = True
         self._directions: list[tuple[Array, Array, Array]] = []
         if guess is not None:
-            self._descend(guess[:, self.active])
+            self.correct(guess[:, self.active])
             self.forget_directions()
         self.keep(self.residual_size() > 0)
 
@@ -243,7 +242,19 @@ class _Columns:
         """Add the multiple of a direction (k, active), made conjugate to earlier ones, that makes the
         residuals smallest.
         """
-        self._descend(direction)
+        image = self.product(direction)
+        for previous, previous_image, size in self._directions:
+            share = self._inner(image, previous_image) / size
+            direction = direction - share * previous
+            image = image - share * previous_image
+        curvature = np.einsum("ij,ij->j", direction, image)
+        self.is_definite &= bool((curvature >= 0).all())
+        size = self._inner(image, image)
+        size[size == 0] = 1.0
+        length = self._inner(self.residual, image) / size
+        self.solution[:, self.active] += length * direction
+        self.residual = self.residual - length * image
+        self._directions.append((direction, image, size))
 
     def keep(self, is_active: NDArray[np.bool_]) -> None:
         """Continue with those of the active columns for which `is_active` (active,) is true."""
@@ -259,21 +270,6 @@ class _Columns:
     def forget_directions(self) -> None:
         """Delete all directions: continue from the present solution with another preconditioner."""
         self._directions = []
-
-    def _descend(self, direction: Array) -> None:
-        image = self.product(direction)
-        for previous, previous_image, size in self._directions:
-            share = self._inner(image, previous_image) / size
-            direction = direction - share * previous
-            image = image - share * previous_image
-        curvature = np.einsum("ij,ij->j", direction, image)
-        self.is_definite &= bool((curvature >= 0).all())
-        size = self._inner(image, image)
-        size[size == 0] = 1.0
-        length = self._inner(self.residual, image) / size
-        self.solution[:, self.active] += length * direction
-        self.residual = self.residual - length * image
-        self._directions.append((direction, image, size))
 
     def _inner(self, first: Array, second: Array) -> Array:
         """Return the weighted products (c,) of the columns."""
