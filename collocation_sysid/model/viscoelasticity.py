@@ -19,9 +19,9 @@ and backward in time, with weights λ_k of the forces and μ_k of m_k,
 `MemoryHistory` holds all evaluations; `MemoryForwardColumns` propagates columns forward,
 `MemoryAdjoint` propagates weights backward; `MemoryState` is the state at one time, for time
 marching. The recursion is one of `recursion`; since it is linear in m and S, all points of a branch
-share its coefficients. A law that is generated for each point, with the deformation gradient as its
-signal and 6 internal variables of each branch, took 4 to 5 times as long for the columns of the
-memory (576 points, 1 and 2 branches), which makes a sweep 1.7 to 2 times as long.
+share its coefficients. The memory is not a force with internal variables at the quadrature points
+(`force_internal_variables`), because a sweep would take 1.9 to 3 times as long, see "Memory in
+reduced space" in `docs/theory.md`.
 """
 
 from __future__ import annotations
