@@ -286,7 +286,7 @@ def run(
                 answer, causes=find_misspecifications(answer.solution)
             )
         if problem.uncertainty.numerical and answer.uncertainty is not None:
-            answer = refine(answer, report_progress=say)
+            answer = refine(answer, report_progress=say, watch=watch)
         return timed(answer)
     except KeyboardInterrupt:
         unsimulated = dict.fromkeys(

@@ -66,13 +66,17 @@ def benchmark(options: BenchmarkCommand) -> None:
     The exit code is 0, and 2 if the folder is no benchmark or a prediction is missing or invalid.
     """
     from ..extras.benchmark import score_benchmark
+    from ..result.solve_progress import SolveProgress
 
     if options.folder is None:
         _list_bodies(options)
     elif options.write:
         _write_bodies(options, options.folder)
     else:
-        scores = score_benchmark(options.folder, options.body)
+        with SolveProgress(
+            error_console, quiet=options.quiet, activity="computing the scores"
+        ):
+            scores = score_benchmark(options.folder, options.body)
         if options.as_json:
             typer.echo(as_json([asdict(each) for each in scores]))
         else:
@@ -131,23 +135,15 @@ def _write_bodies(options: BenchmarkCommand, folder: Path) -> None:
     the option --json, path and names of the bodies written and left out are printed as JSON
     instead.
     """
-    from rich.progress import Progress
-
     from ..extras.benchmark import BODIES, write_benchmark
     from ..extras.benchmark.benchmark_bodies import chosen_bodies
+    from ..result.solve_progress import SolveProgress
 
     chosen = chosen_bodies(options.body)
-    with Progress(
-        console=error_console,
-        transient=True,
-        disable=options.quiet or not error_console.is_terminal,
-    ) as bar:
-        task = bar.add_task("simulating", total=1.0)
-        write_benchmark(
-            chosen,
-            folder,
-            progress=lambda share: bar.update(task, completed=share),
-        )
+    with SolveProgress(
+        error_console, quiet=options.quiet, activity="simulating the bodies"
+    ) as progress:
+        write_benchmark(chosen, folder, progress=progress.share)
     left_out = [
         body
         for body in BODIES.values()

@@ -29,7 +29,6 @@ from typing import (
 )
 
 import typer
-from rich.text import Text
 from typer.models import OptionInfo, ParameterInfo
 
 from ..common.declarations import attributes
@@ -265,7 +264,7 @@ class ProblemOptions:
     def read_problem(self, simulation: bool = False) -> Problem:
         """Read the problem file with the changes of the command line, and return the problem.
 
-        Notes are printed on stderr unless the command has an option `quiet` that is set.
+        Progress and notes are shown on stderr unless the command has an option `quiet` that is set.
 
         Parameters
         ----------
@@ -277,22 +276,20 @@ class ProblemOptions:
         InputError
             If a file or a key is not usable.
         """
-        with error_console.status(f"reading {self.problem}"):
-            from ..problem import Problem
+        from ..problem import Problem
+        from ..result.solve_progress import SolveProgress
 
-            def say(sentence: str) -> None:
-                """Print a note on stderr unless the command is quiet."""
-                if not getattr(self, "quiet", False):
-                    error_console.print(
-                        Text(sentence, style="dim"), soft_wrap=True
-                    )
-
+        with SolveProgress(
+            error_console,
+            quiet=getattr(self, "quiet", False),
+            activity=f"reading {self.problem}",
+        ) as progress:
             return Problem.read(
                 self.problem,
                 self.set_ or (),
                 allow_code=self.allow_code,
                 simulation=simulation,
-                say=say,
+                say=progress.line,
             )
 
 

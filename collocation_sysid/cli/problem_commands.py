@@ -301,21 +301,32 @@ def check(options: CheckCommand) -> None:
 
     problem = options.read_problem()
     if not options.as_json:
-        print_result(quick_check_tables(quick_check(problem)))
+        with SolveProgress(
+            error_console,
+            quiet=options.quiet,
+            activity="checking bodies, recordings and grasps",
+        ):
+            findings_at_once = quick_check(problem)
+        print_result(quick_check_tables(findings_at_once))
         _write_camera_overlays(
             problem,
             options.out or Path("runs") / f"{run_name(options.problem)}_check",
+            quiet=options.quiet,
         )
-    with SolveProgress(error_console, quiet=options.quiet) as progress:
+    with SolveProgress(
+        error_console,
+        quiet=options.quiet,
+        activity="preparing the complete program",
+    ) as progress:
         findings = check_problem(problem, progress.say, full=options.full)
     options.print_result(findings.as_dict(), full_check_tables(findings))
     good = findings.derivatives_agree and not findings.causes
     raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)
 
 
-def _write_camera_overlays(problem: Problem, folder: Path) -> None:
+def _write_camera_overlays(problem: Problem, folder: Path, quiet: bool) -> None:
     """Write a picture of each camera's first image with the undeformed body into the folder, and
-    print the names of the files.
+    print the names of the files. Progress is shown unless `quiet`.
 
     The folder is made if necessary. Nothing is written or printed without cameras.
 
@@ -327,8 +338,13 @@ def _write_camera_overlays(problem: Problem, folder: Path) -> None:
     if not any(each.camera_names for each in problem.experiments):
         return
     from ..result.camera_overlays import OVERLAY_TEXT, save_overlays
+    from ..result.solve_progress import SolveProgress
 
     require_possible(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    for file in save_overlays(problem.experiments, folder):
+    with SolveProgress(
+        error_console, quiet=quiet, activity="drawing the views of the cameras"
+    ):
+        files = save_overlays(problem.experiments, folder)
+    for file in files:
         typer.echo(f"{OVERLAY_TEXT}: {file}")

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.text import Text
 
 from ..common.files import require_possible, write_text_file
 from ..common.serialisation import as_json, content
@@ -58,19 +56,21 @@ def refine(options: RefineCommand) -> None:
     """
     from ..result.run_refinement import refine_run
     from ..result.run_sections import refinement_table, verdict_section
-
-    def say(what: str) -> None:
-        """Print what is being done on stderr unless the command is quiet."""
-        if not options.quiet:
-            error_console.print(Text(what, style="dim"), soft_wrap=True)
+    from ..result.solve_progress import SolveProgress
 
     try:
-        refinement, result = refine_run(
-            options.run_folder,
-            options.levels,
-            allow_code=options.allow_code,
-            say=say,
-        )
+        with SolveProgress(
+            error_console,
+            quiet=options.quiet,
+            activity=f"reading {options.run_folder}",
+        ) as progress:
+            refinement, result = refine_run(
+                options.run_folder,
+                options.levels,
+                allow_code=options.allow_code,
+                say=progress.announce,
+                watch=progress.iteration,
+            )
     except KeyboardInterrupt:
         raise interruption_exit(
             f"the solves that were completed are kept in {options.run_folder}"
@@ -102,6 +102,7 @@ class ExportCommand(RunFolderOptions):
     verify: bool = False
     allow_code: AllowCode = False
     as_json: AsJson = False
+    quiet: Quiet = False
 
 
 @command(
@@ -152,19 +153,29 @@ def _export_body(
         verify_export,
         write_export,
     )
+    from ..result.solve_progress import SolveProgress
 
     name = destination.format_name
     target = TARGETS[name]
     destination.require_possible()
-    body = IdentifiedBody.read(
-        options.run_folder, options.experiment, allow_code=options.allow_code
-    )
-    with destination.export_folder() as folder:
-        exported = write_export(body, name, folder=folder)
-        destination.place_files(folder, target.main_file)
-        compared = (
-            verify_export(body, name, folder=folder) if options.verify else []
+    compared = []
+    with SolveProgress(
+        error_console,
+        quiet=options.quiet,
+        activity=f"reading {options.run_folder}",
+    ) as progress:
+        body = IdentifiedBody.read(
+            options.run_folder,
+            options.experiment,
+            allow_code=options.allow_code,
         )
+        progress.say(f"writing the body for {target.name}")
+        with destination.export_folder() as folder:
+            exported = write_export(body, name, folder=folder)
+            destination.place_files(folder, target.main_file)
+            if options.verify:
+                progress.say(f"comparing with predictions of {target.name}")
+                compared = verify_export(body, name, folder=folder)
     if options.as_json:
         report = {
             "folder": str(destination.folder),
@@ -199,6 +210,7 @@ def _export_recording(
         With the option --verify, because a recording predicts nothing, and as `write_rerun`.
     """
     from ..extras.export.rerun_recording import RECORDING_FILE, write_rerun
+    from ..result.solve_progress import SolveProgress
 
     if options.verify:
         raise InputError(
@@ -207,7 +219,14 @@ def _export_recording(
             where="--verify",
         )
     destination.require_possible()
-    with destination.export_folder() as folder:
+    with (
+        SolveProgress(
+            error_console,
+            quiet=options.quiet,
+            activity="writing the recording",
+        ),
+        destination.export_folder() as folder,
+    ):
         missing = write_rerun(
             options.run_folder, folder, experiment=options.experiment
         )
@@ -264,6 +283,7 @@ class ReportCommand:
 
     folder: Annotated[Path, typer.Argument()]
     to: Path | None = None
+    quiet: Quiet = False
 
 
 @command(
@@ -276,13 +296,17 @@ def report(options: ReportCommand) -> None:
     """
     from ..result.report import comparison_report, report_text
     from ..result.run_sections import run_report
+    from ..result.solve_progress import SolveProgress
 
     folder = options.folder
     file = options.to or options.folder / "report.html"
     study = (folder / "summary.json").is_file()
-    page = comparison_report(folder) if study else run_report(folder)
-    require_possible(file.parent)
-    write_text_file(file, report_text(page, file))
+    with SolveProgress(
+        error_console, quiet=options.quiet, activity="writing the report"
+    ):
+        page = comparison_report(folder) if study else run_report(folder)
+        require_possible(file.parent)
+        write_text_file(file, report_text(page, file))
     typer.echo(file)
 
 
@@ -312,19 +336,14 @@ class AnimateCommand(RunFolderOptions):
 )
 def animate(options: AnimateCommand) -> None:
     """Make a film of a run: the fitted body beside its forward simulation."""
-    from rich.progress import Progress
-
     from ..result.animation import animate as film
+    from ..result.solve_progress import SolveProgress
 
     require_possible(
         options.run_folder if options.to is None else options.to.parent
     )
-    bar = Progress(console=error_console, transient=True)
-    task = bar.add_task("filming", total=1.0)
-    with (
-        bar
-        if error_console.is_terminal and not options.quiet
-        else nullcontext()
+    with SolveProgress(
+        error_console, quiet=options.quiet, activity="making the film"
     ):
         file = film(
             options.run_folder,
@@ -332,7 +351,6 @@ def animate(options: AnimateCommand) -> None:
             fps=options.fps,
             slowdown=options.slow,
             experiment=options.experiment,
-            progress=lambda share: bar.update(task, completed=share),
         )
     typer.echo(file)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import typer
 
 from ..common.files import require_possible, run_name
+from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..common.validated_types import Positive
 from ..errors import InputError
 from ..extras.studies import (
@@ -176,6 +177,8 @@ def compare_models(options: CompareModelsCommand) -> None:
         raise InputError(
             "no models to compare; expected --materials, --damping, --prony or --with"
         )
+    from ..result.solve_progress import SolveProgress
+
     method = _single_method(options.method)
     problem = options.read_problem()
     others = [
@@ -196,10 +199,17 @@ def compare_models(options: CompareModelsCommand) -> None:
         if options.damping is not None
         else (),
     )
-    for variant in variants:  # an impossible model would fail every run
-        Problem.read(
-            variant.path, variant.overrides, allow_code=options.allow_code
-        )
+    with (
+        SolveProgress(
+            error_console, quiet=options.quiet, activity="reading the models"
+        ),
+        counted_phase(StepUnit.PROBLEM, len(variants)),
+    ):
+        for variant in variants:  # an impossible model would fail every run
+            Problem.read(
+                variant.path, variant.overrides, allow_code=options.allow_code
+            )
+            complete_steps(StepUnit.PROBLEM)
     planned = plan_models(
         problem, variants, method=method, allow_code=options.allow_code
     )
@@ -232,6 +242,8 @@ def sweep(options: SweepCommand) -> None:
 
     Finished runs are kept in the output folder: the same command resumes an interrupted study.
     """
+    from ..result.solve_progress import SolveProgress
+
     method = _single_method(options.method)
     over = parse_varied_keys(options.over)
     overrides = options.set_ or ()
@@ -243,9 +255,16 @@ def sweep(options: SweepCommand) -> None:
         allow_code=options.allow_code,
     )
     # A missing file would fail every run.
-    Problem.read(
-        options.problem, planned[0].overrides, allow_code=options.allow_code
-    )
+    with SolveProgress(
+        error_console,
+        quiet=options.quiet,
+        activity=f"reading {options.problem}",
+    ):
+        Problem.read(
+            options.problem,
+            planned[0].overrides,
+            allow_code=options.allow_code,
+        )
     _run_study(SWEEP_STUDY, options, planned=planned)
 
 

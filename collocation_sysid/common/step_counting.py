@@ -20,7 +20,7 @@ ShareListener = Callable[[float | None], None]
 ActivityListener = Callable[[str], None]
 # Name of a search that is no part of another activity.
 SEARCH = "solving"
-# Called with a function that describes the state of an iteration in words.
+# Called with a function that describes the state of an iteration in words, "" for none.
 StateListener = Callable[[Callable[[], str]], None]
 
 
@@ -31,6 +31,10 @@ class StepUnit(StrEnum):
     STIFFNESS = auto()
     SIMULATION = auto()
     PICTURE = auto()
+    RECORDING = auto()
+    PROBLEM = auto()
+    ASSUMPTION = auto()
+    FRAME = auto()
 
 
 @dataclass
@@ -125,7 +129,9 @@ def _report_activity() -> None:
 
 
 def report_state(describe: Callable[[], str]) -> None:
-    """Report the state of an iteration; `describe` is called only if the state is displayed."""
+    """Report the state of an iteration; `describe` is called only if the state is displayed, and
+    returns "" if there is nothing to display any more.
+    """
     listener = _state_listener.get()
     if listener is not None:
         listener(describe)

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from ..common.declarations import keys_of
 from ..common.schema_tables import Section, declared_in
+from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..fem.laws.constants import (
@@ -117,35 +118,36 @@ def problem_arguments(
     experiments = []
     notes = []
     specimens: dict[str, Specimen] = {}
-    for section in file.experiment:
-        if isinstance(section, SpecimenSection):
-            specimen_reader = SpecimenReader(
-                section,
-                folder,
-                body=cells.body_for(section.test),
-                simulation=simulation,
-            )
-            with _locate_in_table(path, f"experiment '{section.name}'"):
-                specimens[section.name], experiment = specimen_reader.read()
+    with counted_phase(StepUnit.RECORDING, len(file.experiment)):
+        for section in file.experiment:
+            where = f"experiment '{section.name}'"
+            if isinstance(section, SpecimenSection):
+                specimen_reader = SpecimenReader(
+                    section,
+                    folder,
+                    body=cells.body_for(section.test),
+                    simulation=simulation,
+                )
+                with _locate_in_table(path, where):
+                    specimens[section.name], experiment = specimen_reader.read()
+                notes += specimen_reader.notes
+            else:
+                reader = RecordingReader(
+                    section,
+                    folder,
+                    body=body,
+                    parameters=parameters,
+                    simulation=simulation,
+                    code=code,
+                    air_density_kg_m3=file.environment.air_density_kg_m3,
+                    size=size,
+                    say=say,
+                )
+                with _locate_in_table(path, where, odd=mesh_warnings):
+                    experiment = reader.read()
+                notes += reader.notes
             experiments.append(experiment)
-            notes += specimen_reader.notes
-            continue
-        reader = RecordingReader(
-            section,
-            folder,
-            body=body,
-            parameters=parameters,
-            simulation=simulation,
-            code=code,
-            air_density_kg_m3=file.environment.air_density_kg_m3,
-            size=size,
-            say=say,
-        )
-        with _locate_in_table(
-            path, f"experiment '{section.name}'", odd=mesh_warnings
-        ):
-            experiments.append(reader.read())
-        notes += reader.notes
+            complete_steps(StepUnit.RECORDING)
     with located(path):
         require_equal_units(specimens)
     return {

@@ -7,7 +7,7 @@ Beside the body a panel shows the distance of the markers from their measurement
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from ..common.array_types import Array
 from ..common.files import replaced_file, safe_name
+from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, require_among
 from .figure_style import (
     BLACK,
@@ -75,8 +76,6 @@ STATIC_SAMPLES_PER_SECOND = 8
 # Default labels of the fitted and the simulated trajectory.
 TRAJECTORY_NAMES = ("fitted", "simulated")
 
-ProgressCallback = Callable[[float], None]
-
 
 def animate(
     run: str | Path,
@@ -84,9 +83,10 @@ def animate(
     fps: float = 25.0,
     slowdown: float = 1.0,
     experiment: str | None = None,
-    progress: ProgressCallback | None = None,
 ) -> Path:
     """Film an experiment of a run folder, and return the film's file.
+
+    The frames are reported to the counters of `counted_phase`.
 
     Parameters
     ----------
@@ -101,8 +101,6 @@ def animate(
         How many times slower than the recording the film is.
     experiment : str, optional
         Name of the experiment; the first with a trajectory by default.
-    progress : callable, optional
-        Called with the share of frames written, from 0 to 1.
 
     Raises
     ------
@@ -136,7 +134,6 @@ def animate(
         file,
         fps=fps,
         slowdown=slowdown,
-        progress=progress,
         headline=text,
     )
 
@@ -146,11 +143,12 @@ def film(
     file: Path,
     fps: float = 25.0,
     slowdown: float = 1.0,
-    progress: ProgressCallback | None = None,
     names: tuple[str, str] = TRAJECTORY_NAMES,
     headline: str = "",
 ) -> Path:
     """Film one experiment and return the file; an existing file is replaced at the end.
+
+    The frames are reported to the counters of `counted_phase`.
 
     Parameters
     ----------
@@ -161,8 +159,6 @@ def film(
     fps, slowdown : float
         See `animate`; above zero, which is not checked. A static experiment is shown with
         `STATIC_SAMPLES_PER_SECOND` samples per second.
-    progress : callable, optional
-        Called with the share of frames written, from 0 to 1.
     names : (str, str)
         Labels of the fitted and of the simulated trajectory.
     headline : str
@@ -186,12 +182,12 @@ def film(
         with (
             replaced_file(file) as draft,
             writer.saving(picture.figure, str(draft), dpi),
+            counted_phase(StepUnit.FRAME, len(shown)),
         ):
-            for number, t in enumerate(shown):
+            for t in shown:
                 picture.show_sample(int(t))
                 writer.grab_frame()
-                if progress is not None:
-                    progress((number + 1) / len(shown))
+                complete_steps(StepUnit.FRAME)
     return file
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from ..common.files import RESULT_FILE, replaced_file, require_own
 from ..common.serialisation import as_json, read
 from ..errors import InputError
+from ..methods.solution import Watch
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..runs.numerical_error import solve_refined
@@ -41,6 +42,7 @@ def refine_run(
     levels: int = 2,
     allow_code: bool = False,
     say: Callable[[str], None] | None = None,
+    watch: Watch | None = None,
 ) -> tuple[Refinement, Result]:
     """Solve the problem of a run folder again at finer discretisations, and update the folder.
 
@@ -60,6 +62,8 @@ def refine_run(
         Whether Python files that the problem names may run.
     say : callable, optional
         Called with a sentence about what is being done.
+    watch : callable, optional
+        Called with each iteration of the solves.
 
     Returns
     -------
@@ -114,6 +118,7 @@ def refine_run(
         report_progress=say,
         solved_levels=known,
         save_progress=keep,
+        watch=watch,
     )
     return refinement, keep(refinement)
 

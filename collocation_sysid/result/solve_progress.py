@@ -128,6 +128,7 @@ class SolveProgress(Watched):
         self._lines: list[Iteration] = []
         self._doing = activity
         self._search = SEARCH
+        self._said = ""
         self._remaining = ""
         self._state: Callable[[], str] | None = None
         self._activity_began_s = time.monotonic()
@@ -151,6 +152,7 @@ class SolveProgress(Watched):
         self._contexts.enter_context(listen_to_activities(self.activity))
         self._activity_began_s = time.monotonic()
         self._phase_began_s = self._activity_began_s
+        self._redraw()
         if self._heartbeat is not None:
             self._heartbeat.start()
         return self
@@ -175,14 +177,23 @@ class SolveProgress(Watched):
 
     def activity(self, name: str) -> None:
         """Show the name of the search that begins or resumes, such as that of a coarse start; its
-        iterations are shown under this name.
+        iterations are shown under this name. After a search that is a part of something else, that
+        is shown again, see `say`.
         """
         self._search = name
-        self._update_activity(name, name)
+        shown = self._said if name == SEARCH and self._said else name
+        self._update_activity(shown, shown)
 
     def say(self, what: str) -> None:
         """Show what is being done now, as a sentence."""
+        self._said = what
         self._update_activity(what, what)
+
+    def announce(self, what: str) -> None:
+        """Show what is being done now, like `say`; without a live display, print it as a line."""
+        self.say(what)
+        if self._live is None and not self.verbose:
+            self.line(what)
 
     def share(self, done: float | None) -> None:
         """Show the completed share of the current phase, with the remaining time, at most every
@@ -192,8 +203,8 @@ class SolveProgress(Watched):
         Parameters
         ----------
         done : float or None
-            Share from 0 to 1; a smaller one than before begins a phase, and None ends it, after
-            which the elapsed time is shown instead.
+            Share from 0 to 1; a smaller one than before begins a phase, and None ends it. The
+            elapsed time is shown instead after the end, and as long as nothing is completed.
         """
         now_s = time.monotonic()
         if done is None:
@@ -208,8 +219,9 @@ class SolveProgress(Watched):
         if now_s - self._share_shown_s < SHARE_INTERVAL_S:
             return
         self._share_shown_s = now_s
+        elapsed_s = now_s - self._phase_began_s
         self._remaining = (
-            f": {done:.0%}{_remaining_time(now_s - self._phase_began_s, done)}"
+            f": {done:.0%}{_remaining_time(elapsed_s, done)}" if done else ""
         )
         self._redraw()
 
@@ -219,7 +231,7 @@ class SolveProgress(Watched):
         Parameters
         ----------
         describe : callable
-            Returns the state in words.
+            Returns the state in words, "" for none.
         """
         self._state = describe
 
@@ -259,7 +271,8 @@ class SolveProgress(Watched):
 
     def _state_in_words(self) -> str:
         """Return the state of the current iteration after a comma; "" if there is none."""
-        return f", {self._state()}" if self._state is not None else ""
+        state = "" if self._state is None else self._state()
+        return f", {state}" if state else ""
 
 
 @dataclass(frozen=True)

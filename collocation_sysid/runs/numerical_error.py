@@ -6,10 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
+from ..common.step_counting import search_activity
 from ..errors import InputError
 from ..fem.meshes.refinement import refine_body
 from ..methods.reduced_space import ReducedSpace
-from ..methods.solution import Solution
+from ..methods.solution import Solution, Watch
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..recording import experiment_refinement
@@ -68,6 +69,7 @@ def refine(
     run: A,
     levels: int = 2,
     report_progress: Callable[[str], None] | None = None,
+    watch: Watch | None = None,
 ) -> A:
     """Return a copy of a converged run with its numerical error; nothing else of the run is changed
     or computed again.
@@ -80,6 +82,8 @@ def refine(
         Number of discretisations of each kind, see `solve_refined`.
     report_progress : callable, optional
         Called with a progress message before each solve.
+    watch : callable, optional
+        Called with each iteration of the solves.
 
     Raises
     ------
@@ -97,6 +101,7 @@ def refine(
             estimates=estimates,
             levels=levels,
             report_progress=report_progress,
+            watch=watch,
         ),
     )
 
@@ -109,6 +114,7 @@ def solve_refined(
     report_progress: Callable[[str], None] | None = None,
     solved_levels: Sequence[RefinementLevel] = (),
     save_progress: Callable[[Refinement], object] | None = None,
+    watch: Watch | None = None,
 ) -> Refinement:
     """Solve again at finer discretisations, each from the previous solution, and return the
     numerical errors of the estimates with the solved levels.
@@ -136,6 +142,8 @@ def solve_refined(
     save_progress : callable, optional
         Called with the refinement so far after each level that is solved, but not after those of
         `solved_levels`.
+    watch : callable, optional
+        Called with each iteration of the solves.
 
     Raises
     ------
@@ -179,11 +187,14 @@ def solve_refined(
                     solution, values={**solution.values, **reached[-1].values}
                 )
                 continue
+            what = f"{kind} halved {level}×"
+            activity = f"solving again: {what}"
             if report_progress is not None:
-                report_progress(f"solving again: {kind} halved {level}×")
-            refined = _solve_refined_problem(
-                at, start, what=f"{kind} halved {level}×"
-            )
+                report_progress(activity)
+            with search_activity(activity):
+                refined = _solve_refined_problem(
+                    at, start, what=what, watch=watch
+                )
             start = WarmStart.of(refined)
             reached.append(_level_summary(kind, level, solution=refined))
             if save_progress is not None:
@@ -226,10 +237,10 @@ def _errors_from_levels(
 
 
 def _solve_refined_problem(
-    problem: Problem, start: WarmStart, what: str
+    problem: Problem, start: WarmStart, what: str, watch: Watch | None
 ) -> Solution:
     """Return the converged solution of a finer problem in reduced space, starting from the answer
-    `start` on a coarser one.
+    `start` on a coarser one; `watch` is called with each iteration.
 
     Raises
     ------
@@ -239,9 +250,8 @@ def _solve_refined_problem(
     KeyboardInterrupt
         If the solve is interrupted.
     """
-    solution = solve(
-        problem, ReducedSpace(ladder=(1.0,), tolerance=TOLERANCE), start=start
-    )
+    method = ReducedSpace(ladder=(1.0,), tolerance=TOLERANCE)
+    solution = solve(problem, method, watch=watch, start=start)
     if not solution.unless_interrupted().status.converged:
         raise InputError(
             f"the refinement with the {what} was not solved ({solution.status.value}: "

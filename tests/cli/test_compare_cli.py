@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -268,6 +269,16 @@ def test_progress_is_one_line_on_a_terminal(tiny, stand_in, monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
     assert compare().code == 0
     assert "0/1 runs" in shown.getvalue()
+
+
+def test_a_long_run_shows_its_elapsed_time(monkeypatch):
+    now_s = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    waiting = [SimpleNamespace(key="1", method="shooting")]
+    console = Console(file=io.StringIO())
+    with display.StudyProgress(console, waiting, total=3, quiet=True) as shown:
+        now_s = 160.0
+        assert shown._activity_with_time() == "2/3 runs (60 s so far)"
 
 
 # Plans only ---------------------------------------------------------------------------------------

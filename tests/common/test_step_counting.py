@@ -17,9 +17,11 @@ from collocation_sysid.common.step_counting import (
     StepUnit,
     complete_steps,
     counted_phase,
+    listen_to_activities,
     listen_to_shares,
     listen_to_states,
     report_state,
+    search_activity,
 )
 from collocation_sysid.fem.kernels import map_experiments
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
@@ -211,9 +213,13 @@ def test_an_equilibrium_reports_its_load_steps_and_residuals():
     number = r"(\S+)"
     form = rf"equilibrium at {number}% of the load, residual {number} N"
     loads, residuals = zip(
-        *(map(float, re.fullmatch(form, state).groups()) for state in states),
+        *(
+            map(float, re.fullmatch(form, state).groups())
+            for state in states[:-1]
+        ),
         strict=True,
     )
+    assert states[-1] == ""  # the search has ended
     assert loads[-1] == 100.0
     assert residuals[-1] < 1e-6 * max(residuals)
 
@@ -227,6 +233,68 @@ def test_a_live_display_is_refreshed_without_a_new_message(monkeypatch):
         progress._activity_began_s -= 7
         progress._live.refresh()
     assert "looking for causes of the misfit (7 s so far)" in screen.getvalue()
+
+
+def test_the_first_activity_is_shown_at_once():
+    screen = io.StringIO()
+    console = Console(file=screen, force_terminal=True, width=100)
+    with solve_progress.SolveProgress(console, activity="simulating") as shown:
+        shown._live.refresh()
+    assert "simulating" in screen.getvalue()
+
+
+def test_after_a_part_the_whole_is_shown_again():
+    with solve_progress.SolveProgress(
+        Console(file=io.StringIO()), quiet=True
+    ) as progress:
+        with search_activity("coarse start"):
+            assert progress._activity_with_time() == "coarse start"
+        assert progress._activity_with_time() == "solving"
+        progress.say("testing the description")
+        with search_activity("testing hypothesis 1"):
+            assert progress._activity_with_time() == "testing hypothesis 1"
+        assert progress._activity_with_time() == "testing the description"
+
+
+def test_reading_a_problem_counts_its_recordings(tmp_path):
+    file = write_problem(tmp_path, {"swing": 8, "nod": 12})
+    shares = []
+    with listen_to_shares(shares.append):
+        cs.Problem.read(file)
+    assert shares == [0.0, 0.5, 1.0, None]
+
+
+@pytest.mark.long
+def test_all_phases_of_a_run_are_announced_and_those_of_known_length_counted(
+    tmp_path,
+):
+    file = write_problem(tmp_path, {"swing": 8})
+    changes = [
+        'solver.method="reduced-space"',
+        'uncertainty.profile=["mu_pa"]',
+        "uncertainty.numerical=true",
+    ]
+    problem = cs.Problem.read(file, changes)
+    phases: dict[str, list[float | None]] = {"": []}
+
+    def begin(name: str) -> None:
+        phases.setdefault(name, [])
+
+    def count(share: float | None) -> None:
+        list(phases.values())[-1].append(share)
+
+    with listen_to_shares(count), listen_to_activities(begin):
+        cs.run(problem, log=begin)
+    for name in (
+        "checking the result by a forward simulation",
+        "computing the error bars",
+        "computing the effects of assumptions",
+    ):
+        assert phases[name][0] == 0.0
+        assert 1.0 in phases[name]
+    assert "profile likelihood of mu_pa, value 2" in phases
+    assert "testing possible causes of the misfit" in phases
+    assert "solving again: mesh halved 1×" in phases
 
 
 def test_the_share_of_a_long_phase_is_reported_often_enough():

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +20,7 @@ from kit.problems import (
     hung_cube,
 )
 from kit.wrenches import wristed_cube
+from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
@@ -787,6 +790,20 @@ def test_a_design_knows_where_the_files_of_the_problem_are(tiny, tmp_path):
     write_design(designed, tmp_path / "out", with_film=False)
     again = Problem.read(tmp_path / "out" / PROBLEM_FILE, allow_code=True)
     assert [force.name for force in again.bodies[0].forces] == ["drag"]
+
+
+def test_the_search_shows_its_remaining_time(monkeypatch):
+    now_s = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    with DesignProgress(Console(file=io.StringIO()), 40, quiet=True) as shown:
+        shown.show_activity("searching for a motion")
+        shown.show_best(1, np.log(0.5))
+        now_s = 110.0
+        shown.show_best(11, np.log(0.25))
+        assert shown._activity_with_time() == (
+            "searching for a motion (Ctrl-C stops and keeps the best): 28%, about 26 s left, "
+            "11 of 40 motions evaluated, smallest error bar: 25 %"
+        )
 
 
 def test_an_interrupted_design_is_written_and_told(tiny, tmp_path, monkeypatch):

@@ -16,6 +16,7 @@ import scipy.special
 from kit.checks import relative_error
 from kit.materials import ELASTIC
 
+from collocation_sysid.common.step_counting import listen_to_states
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem import kernels as batched
 from collocation_sysid.fem.body import Body
@@ -524,6 +525,15 @@ def compiled(monkeypatch) -> list[str]:
 
 def evaluate(mesh) -> float:
     return new_body(mesh, evaluator="simd").energy(squeezed(mesh), **ELASTIC)
+
+
+def test_compiling_is_reported_as_a_state(small_mesh, cache):
+    states = []
+    with listen_to_states(lambda describe: states.append(describe())):
+        evaluate(small_mesh)
+        assert states == ["compiling native code", ""]
+        evaluate(small_mesh)  # from the cache
+    assert len(states) == 2
 
 
 def test_compiled_code_is_kept_and_used_again(small_mesh, cache, compiled):

@@ -21,6 +21,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.common.display import escape
+from collocation_sysid.common.step_counting import listen_to_shares
 from collocation_sysid.errors import InputError
 from collocation_sysid.result import animation, interactive_view
 from collocation_sysid.result.animation import (
@@ -104,9 +105,12 @@ def test_a_run_stores_what_is_needed_to_look_at_it(run):
 
 
 def test_a_film_has_its_length_and_moves(run, tmp_path):
-    file = animate(run, tmp_path / "deep" / "film.gif", fps=20, slowdown=2)
+    shares = []
+    with listen_to_shares(shares.append):
+        file = animate(run, tmp_path / "deep" / "film.gif", fps=20, slowdown=2)
     frames = frames_in(file)
     assert len(frames) == 4  # 0.08 s, twice as long, 20 a second
+    assert shares == [0.0, 0.25, 0.5, 0.75, 1.0, None]
     assert np.abs(frames[-1] - frames[0]).max() > 100
     with Image.open(file) as film:
         assert film.info["duration"] == 50

@@ -12,8 +12,9 @@ from kit.problem_files import run_command, settings, write_problem
 from kit.problems import GUESS, TRUTH, hung_cube, measured
 
 from collocation_sysid.common.display import plain_text
+from collocation_sysid.common.step_counting import listen_to_activities
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.solution import Status
+from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.pipeline import Run, run
 from collocation_sysid.problem import (
@@ -146,8 +147,29 @@ def answer() -> Run:
 
 
 @pytest.fixture(scope="module")
-def refined(answer) -> Run:
-    return refine(answer, levels=3)
+def progress() -> list[str]:
+    """Activities and numbers of iterations that `refined` reports."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def refined(answer, progress) -> Run:
+    def watch(iteration: Iteration) -> None:
+        progress.append(str(iteration.number))
+
+    with listen_to_activities(progress.append):
+        return refine(answer, levels=3, watch=watch)
+
+
+def test_each_solve_reports_its_name_and_iterations(refined, progress):
+    names = [each for each in progress if "halved" in each]
+    assert names == [
+        f"solving again: {kind} halved {level}×"
+        for kind in ("step", "mesh")
+        for level in (1, 2)
+    ]
+    first, second = (progress.index(name) for name in names[:2])
+    assert "1" in progress[first:second]
 
 
 @pytest.mark.long

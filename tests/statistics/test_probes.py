@@ -25,6 +25,7 @@ from collocation_sysid import (
     with_markers,
 )
 from collocation_sysid.common.display import plain_text
+from collocation_sysid.common.step_counting import listen_to_shares
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.runs.result_content import Result
@@ -93,6 +94,23 @@ def told(solved: Run) -> list[str]:
     """Freed assumptions that are told, the best first."""
     freed = [p for p in solved.probes if p.kind == "assumption" and p.sentences]
     return [p.name for p in sorted(freed, key=lambda p: -p.chi_squared)]
+
+
+@pytest.mark.long
+def test_refits_report_the_share_of_significant_assumptions():
+    name, off = "stiffness_drift", -0.05
+    events: list[str | float | None] = []
+    with listen_to_shares(events.append):
+        solved = run(
+            swung(name, off), log=events.append, seek_causes=False, probe=True
+        )
+    refits = [text for text in events if "refitting" in str(text)]
+    after = events[events.index(refits[0]) + 1 :]
+    tested = after[: after.index(None) + 1]
+    assert tested[0] == 0.0
+    assert tested[-2:] == [1.0, None]
+    assert np.diff(tested[:-1]) == pytest.approx(1 / (len(tested) - 2))
+    assert name in told(solved)
 
 
 @pytest.mark.long

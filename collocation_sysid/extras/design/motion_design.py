@@ -272,6 +272,7 @@ class MotionObjective:
             return SearchResult()
         middle = self.draws[0]
         count = TO_FIRST_ORDER * options.evaluations
+        say("computing the effect of the motion to first order")
         try:
             linear = LinearRecording.from_simulations(self.recording, middle)
         except SimulationError:

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Self
 
 import numpy as np
 from rich.console import Console
-from rich.text import Text
 
-from ...common.console import Watched
 from ...common.display import duration
+from ...result.solve_progress import SolveProgress
 from ..design.motion_design import FORBIDDEN
 from .run_execution import Record
 from .study_planning import PlannedRun
 
 # Number of motions between two lines of a search whose output is no terminal.
 EVERY = 20
+# Hint beside each stage of a design.
+STOPPING = "Ctrl-C stops and keeps the best"
 
 
-class StudyProgress(Watched):
-    """Progress of a study: one updated line on a terminal, else a line per run.
+class StudyProgress(SolveProgress):
+    """Progress of a study: one updated line on a terminal, else a line per run and from time to
+    time.
 
     Parameters
     ----------
@@ -40,17 +44,21 @@ class StudyProgress(Watched):
         total: int,
         quiet: bool = False,
     ) -> None:
-        super().__init__(console, quiet)
         self.total = total
+        self._skipped = total - len(remaining)
         self._waiting = {run.key: run for run in remaining}
         self._walls: dict[str, list[float]] = {}
+        super().__init__(
+            console, quiet=quiet, activity=f"{self._skipped}/{total} runs"
+        )
 
-    def __enter__(self) -> StudyProgress:
-        skipped = self.total - len(self._waiting)
-        if skipped:
-            self.line(f"{skipped} of {self.total} runs are finished already")
+    def __enter__(self) -> Self:
+        if self._skipped:
+            self.line(
+                f"{self._skipped} of {self.total} runs are finished already"
+            )
         super().__enter__()
-        self.update(Text(f"{skipped}/{self.total} runs", style="dim"))
+        self.say(f"{self._skipped}/{self.total} runs")
         if self._live is not None:
             self._live.refresh()  # the first run may take less time than a frame
         return self
@@ -79,8 +87,9 @@ class StudyProgress(Watched):
         )
         count = f"{self.total - len(self._waiting)}/{self.total} runs"
         wall = record.get("wall_s") or 0.0
-        line = f"{count}: {run.make_label()} {status} in {wall:.1f} s{self._remaining_text(worker_count)}"
-        self.update(Text(line, style="dim"), line)
+        self.announce(
+            f"{count}: {run.make_label()} {status} in {wall:.1f} s{self._remaining_text(worker_count)}"
+        )
 
     def _remaining_text(self, worker_count: int) -> str:
         """Return "; about … left" with a duration, from the times of finished runs and the number
@@ -98,9 +107,9 @@ class StudyProgress(Watched):
         )
 
 
-class DesignProgress(Watched):
+class DesignProgress(SolveProgress):
     """Progress of the search for a motion: one updated line on a terminal, else a line every
-    `EVERY` motions.
+    `EVERY` motions and from time to time.
 
     Parameters
     ----------
@@ -115,11 +124,14 @@ class DesignProgress(Watched):
     def __init__(
         self, console: Console, evaluations: int, quiet: bool = False
     ) -> None:
-        super().__init__(console, quiet)
+        super().__init__(
+            console, quiet=quiet, activity=f"preparing the design ({STOPPING})"
+        )
         self.evaluations = evaluations
 
     def show_best(self, number: int, log_size: float) -> None:
-        """Show the number of evaluated motions and the smallest error bar so far.
+        """Show the number of evaluated motions, the remaining time and the smallest error bar so
+        far.
 
         Parameters
         ----------
@@ -135,19 +147,19 @@ class DesignProgress(Watched):
             else f"{100 * np.exp(log_size):.3g} %"
         )
         line = f"{number} of {self.evaluations} motions evaluated, smallest error bar: {best}"
-        seldom = number % EVERY == 0 or number == self.evaluations
-        self.update(
-            Text(f"{line} (Ctrl-C stops and keeps the best)", style="dim"),
-            line if seldom else "",
-        )
+        share = number / self.evaluations
+        self.share(share if share < 1 else None)
+        self.state(partial(str, line))
+        if self._live is None and (
+            number % EVERY == 0 or number == self.evaluations
+        ):
+            self.line(line)
 
     def show_activity(self, what: str) -> None:
         """Show what is being computed, such as a stage of the design, with a hint at Ctrl-C; `what`
         is a text.
         """
-        self.update(
-            Text(f"{what} (Ctrl-C stops and keeps the best)", style="dim"), what
-        )
+        self.announce(f"{what} ({STOPPING})")
 
 
 def remaining_time_s(

@@ -27,6 +27,8 @@ from llvmlite import ir
 from numpy.typing import NDArray
 from platformdirs import user_cache_path
 
+from ...common.step_counting import report_state
+
 DOUBLE = ir.DoubleType()
 I32 = ir.IntType(32)
 I64 = ir.IntType(64)
@@ -203,10 +205,12 @@ def _object_code(code: NativeCode, machine: llvm.TargetMachine) -> bytes:
     )
     code_bytes = load_object(cache_key)
     if code_bytes is None:
+        report_state(lambda: "compiling native code")
         code_bytes = compile_module(
             code.build(), machine, quickly=code.is_unoptimised
         )
         store_object(cache_key, code_bytes)
+        report_state(str)
     return code_bytes
 
 

@@ -143,6 +143,7 @@ def _solve_equilibrium(
                 static=True,
             ) from failure
         path.accept(solution)
+    report_state(str)  # nothing to display any more
     return path.x
 
 

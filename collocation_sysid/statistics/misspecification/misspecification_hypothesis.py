@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from ...common.step_counting import search_activity
 from ..concerns import Concern, Grade
 
 
@@ -112,8 +113,10 @@ class HypothesisTest:
         hypothesis whose misfit cannot be computed (None) is omitted. The misfits are computed one
         after the other, as the iterator advances.
         """
-        for each in hypotheses:
-            if (misfit := self.misfit_of(each.corrected)) is None:
+        for number, each in enumerate(hypotheses, start=1):
+            with search_activity(f"testing hypothesis {number}"):
+                misfit = self.misfit_of(each.corrected)
+            if misfit is None:
                 continue
             strength = (
                 self.misfit / max(self.smallest_misfit, misfit) / each.handicap

@@ -16,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...common.array_types import Array
+from ...common.step_counting import StepUnit, complete_steps, counted_phase
 from ...methods.initial_trajectories import simulate_trajectories
 from ..budget.systematic_effects import CORRELATION_KEY
 from ..distributions import normal_isf
@@ -85,21 +86,26 @@ def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
 
     The level of significance is `CHANCE` over the number of tests (Bonferroni). Routine assumptions
     have the same prior and level of significance as in `routine_probes`. Significant assumptions
-    are iterated, with simulations.
+    are iterated, with simulations, which are reported to the counters of `counted_phase`.
     """
     parts = [*_window_probes(solved_fit), *_recording_probes(solved_fit)]
     relaxed = [*_relaxed_probes(solved_fit)]
     tests = sum(len(probe.moves) for probe in parts) + len(relaxed)
     limit = float(normal_isf(CHANCE / 2 / max(1, tests)))
-    limits = dict.fromkeys(ROUTINE, significance_limit(solved_fit.changes))
+    limits = dict.fromkeys(
+        (probe.name for probe in relaxed), limit
+    ) | dict.fromkeys(ROUTINE, significance_limit(solved_fit.changes))
+    significant = [p for p in relaxed if p.is_beyond(limits[p.name])]
+    with counted_phase(StepUnit.ASSUMPTION, len(significant)):
+        iterated = {}
+        for probe in significant:
+            iterated[probe.name] = _iterate_probe(
+                solved_fit, probe, limit=limits[probe.name]
+            )
+            complete_steps(StepUnit.ASSUMPTION)
     return (
         *(_with_significant_moves(each, limit) for each in parts),
-        *(
-            _iterate_probe(
-                solved_fit, probe, limit=limits.get(probe.name, limit)
-            )
-            for probe in relaxed
-        ),
+        *(iterated.get(probe.name, probe) for probe in relaxed),
     )
 
 
@@ -228,13 +234,10 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
     at : SolvedFit
         The fit.
     probe : Probe
-        Probe of an assumption after one linear step; it is returned unchanged if it is not
-        significant.
+        Significant probe of an assumption after one linear step.
     limit : float
         Least significant size, in its standard errors.
     """
-    if not probe.is_beyond(limit):
-        return probe
     first = len(at.fit.names)
     collocation = at.collocation
     accepted_names = assumption_name(probe.name), CORRELATION_KEY

@@ -7,6 +7,7 @@ loss; where the loss never rises so far, the interval is open.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -14,6 +15,7 @@ import numpy as np
 from scipy.optimize import root_scalar
 
 from ...common.array_types import Array
+from ...common.step_counting import search_activity
 from ...errors import InputError, SimulationError
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
@@ -270,9 +272,13 @@ def profile_of_solution(
     variance = float(uncertainty.covariance[k, k])
     item = parameters.free[k]
 
+    numbers = itertools.count(1)
+
     def solve_fixed(_: str, value: float) -> float:
         """Return the loss with the parameter fixed at a value; the name is not used."""
-        return _loss_with_fixed(solution, item, value=value)
+        activity = f"profile likelihood of {name}, value {next(numbers)}"
+        with search_activity(activity):
+            return _loss_with_fixed(solution, item, value=value)
 
     return compute_profile(
         solve_fixed,
