@@ -7,6 +7,9 @@ the start, and there R must depend on s_k and c alone.
 
 Times and instances are the last axes of all arrays: states are (n, N, I), signals (i, N, I) and
 data (d, N, I) for N times and I instances.
+
+The low-pass of a sensor and the branches of a viscoelastic material relax exponentially; both take
+the coefficients of a time step from `relaxation_coefficients`.
 """
 
 from __future__ import annotations
@@ -241,3 +244,22 @@ class RecursionTrajectory:
             "abkp,akp->bkp", by_last[:, :, 1:], total[:, 1:]
         )
         return by_signal, np.einsum("abkp,akp->b", by_constants, total)
+
+
+def relaxation_coefficients(tau: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return the coefficients e and c of Q_k = e Q_{k−1} + c (s_k − s_{k−1}), the exact solution of
+    dQ/dt + Q/τ = ds/dt over an interval h in which the signal s changes linearly.
+
+    The coefficients are e = exp(−h/τ) and c = (τ/h) (1 − e).
+
+    Parameters
+    ----------
+    tau : SX
+        Time constant in units of the interval, τ/h; for 0 both coefficients are zero.
+    """
+    ratio = 1 / ca.fmax(tau, SMALLEST_TIME_CONSTANT)
+    return ca.exp(-ratio), -tau * ca.expm1(-ratio)
+
+
+# Time constant, in units of the interval, below which the state has relaxed: exp(−1e6) is 0 in doubles.
+SMALLEST_TIME_CONSTANT = 1e-6

@@ -19,9 +19,9 @@ and backward in time, with weights λ_k of the forces and μ_k of m_k,
 `MemoryHistory` holds all evaluations; `MemoryForwardColumns` propagates columns forward,
 `MemoryAdjoint` propagates weights backward; `MemoryState` is the state at one time, for time
 marching. The recursion is one of `recursion`; since it is linear in m and S, all points of a branch
-share its coefficients. A law that is generated for each point, with the deformation gradient as its
-signal and 6 internal variables of each branch, took 4 to 5 times as long for the columns of the
-memory (576 points, 1 and 2 branches), which makes a sweep 1.7 to 2 times as long.
+share its coefficients. The memory is not a force with internal variables at the quadrature points
+(`force_internal_variables`), because a sweep would take 1.9 to 3 times as long, see "Memory in
+reduced space" in `docs/theory.md`.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ import numpy as np
 
 from ..common.array_types import Array, Index
 from ..fem.body import Body, SecondDerivatives
-from ..fem.laws.memory import MemoryInput, fading_coefficients
+from ..fem.laws.memory import MemoryInput
 from .forces import Forces
 from .generated_functions import GeneratedFunction
-from .recursion import HistoryGradient, Recursion
+from .recursion import HistoryGradient, Recursion, relaxation_coefficients
 
 # Number of evaluations whose stress derivatives are kept at a time; limits memory.
 EVALUATIONS_PER_CHUNK = 16
@@ -45,8 +45,8 @@ EVALUATIONS_PER_CHUNK = 16
 RELAXED_TIMES = 1e3
 
 
-def _stiffening_of_interval(u: ca.SX, spacing_s: ca.SX) -> ca.SX:
-    """Return c of an interval in which S changes linearly.
+def _interval_coefficients(u: ca.SX, spacing_s: ca.SX) -> ca.SX:
+    """Return e and c (2,) of an interval in which S changes linearly.
 
     Parameters
     ----------
@@ -55,9 +55,8 @@ def _stiffening_of_interval(u: ca.SX, spacing_s: ca.SX) -> ca.SX:
     spacing_s : SX
         Length of the interval.
     """
-    share = u[0]
-    tau_s = u[1]
-    return -share * ca.expm1(-spacing_s / tau_s) * tau_s / spacing_s
+    e, c = relaxation_coefficients(u[1] / spacing_s)
+    return ca.vertcat(e, u[0] * c)
 
 
 def _stiffening(u: ca.SX, data: ca.SX) -> ca.SX:
@@ -67,9 +66,8 @@ def _stiffening(u: ca.SX, data: ca.SX) -> ca.SX:
     since_s = data[0]
     began = data[1]
     at_once = u[0] * ca.exp(-since_s / u[1])
-    return began * at_once + (1 - began) * _stiffening_of_interval(
-        u, since_s + began
-    )
+    over_interval = _interval_coefficients(u, since_s + began)[1]
+    return began * at_once + (1 - began) * over_interval
 
 
 def _overstress(
@@ -80,11 +78,8 @@ def _overstress(
     Data are the time since the previous evaluation, or at the start since the load was applied; 1
     at the start, else 0; and the time to the next evaluation.
     """
-    e = ca.exp(-data[2] / u[1])
-    return (
-        e * before
-        + (e * _stiffening(u, data) - _stiffening_of_interval(u, data[2])) * now
-    )
+    e, c = ca.vertsplit(_interval_coefficients(u, data[2]))
+    return e * before + (e * _stiffening(u, data) - c) * now
 
 
 OVERSTRESS = Recursion(
@@ -110,6 +105,8 @@ def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
 
 COEFFICIENTS = GeneratedFunction(_coefficients, 2, data_size=3)
 STIFFENING = GeneratedFunction(_stiffening, 2, data_size=3)
+# Coefficients e and c (2,) of an interval by (g, τ); the datum is the length of the interval.
+INTERVAL = GeneratedFunction(_interval_coefficients, 2, data_size=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -556,8 +553,8 @@ class MemoryState:
         coefficients c (B,), for an interval [s].
         """
         memory = self.body.memory
-        share, tau_s = self.theta[[(b.share, b.tau) for b in memory.branches]].T
-        e, c = fading_coefficients(share, tau_s, spacing_s=interval_s)
+        u = self.theta[[(b.share, b.tau) for b in memory.branches]].T
+        e, c = INTERVAL.evaluate(u, np.full((1, u.shape[1]), interval_s))
         borne = memory.to_branches(self.stress)
         return memory.repeat_over_points(
             e

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.laws.materials import Prony
-from collocation_sysid.fem.laws.memory import fading_coefficients
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.model.forces import Forces
@@ -328,7 +327,7 @@ def test_how_fast_a_branch_fades_is_exact_and_differentiated():
     here = FadingCoefficients.from_body(body, theta, until_next_s, loaded_s)
     np.testing.assert_allclose(here.d[0], np.exp(-until_next_s / tau_s))
     np.testing.assert_allclose(here.c[0, 0], share * np.exp(-loaded_s / tau_s))
-    _, c = fading_coefficients(share, tau_s, until_next_s[1])
+    c = share * tau_s / until_next_s[1] * -np.expm1(-until_next_s[1] / tau_s)
     np.testing.assert_allclose(here.c[0, 2], c)
     np.testing.assert_allclose(here.a[0, 1], here.d[0, 1] * here.c[0, 1] - c)
     for k, place in enumerate((branch.share, branch.tau)):

@@ -228,19 +228,3 @@ class MemoryLayout:
         count = self.constant_count
         sizes = (self.width,), (len(self.parts),), (count,), (count, count)
         return MemoryInput(*(np.zeros((states, *size)) for size in sizes))
-
-
-def fading_coefficients(
-    share: Array, tau_s: Array, spacing_s: float
-) -> tuple[Array, Array]:
-    """Return e and c of branches over an interval [s] in which S changes linearly.
-
-    Parameters
-    ----------
-    share, tau_s : array
-        Share g and relaxation time τ of the branches.
-    spacing_s : float
-        Length of the interval.
-    """
-    ratio = spacing_s / tau_s
-    return np.exp(-ratio), -share * np.expm1(-ratio) / ratio

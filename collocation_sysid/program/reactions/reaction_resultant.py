@@ -26,7 +26,11 @@ from ...fem.pattern import dofs_of
 from ...model.dynamics import Dynamics
 from ...model.generated_functions import GeneratedFunction
 from ...model.nuisance_map import NuisanceMap
-from ...model.recursion import Recursion, RecursionTrajectory
+from ...model.recursion import (
+    Recursion,
+    RecursionTrajectory,
+    relaxation_coefficients,
+)
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.nuisance import (
@@ -678,7 +682,7 @@ def _low_pass_step(
     before: ca.SX, now: ca.SX, last: ca.SX, lag: ca.SX, data: ca.SX
 ) -> ca.SX:
     """Return Y after one step of Y' = (W − Y) / T, with W linear between grid times and Y = W at
-    the first.
+    the first. The difference W − Y relaxes with the time constant T.
 
     Parameters
     ----------
@@ -692,12 +696,9 @@ def _low_pass_step(
         One at the first time, else zero; and that unit in time steps.
     """
     began = data[0]
-    share = lag * data[1]
-    e = ca.exp(-1 / ca.fmax(share, 1e-6))
-    a = share * (1 - e) - e
-    return began * now + (1 - began) * (
-        e * before + a * last + (1 - e - a) * now
-    )
+    e, c = relaxation_coefficients(lag * data[1])
+    difference = e * (last - before) + c * (now - last)
+    return now - (1 - began) * difference
 
 
 # Force and torque (6,) of one node, by x_g and R_g; data are Q, o and one for each prescribed dof.
