@@ -7,7 +7,6 @@ converter is checked against that form.
 
 from __future__ import annotations
 
-import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields
@@ -170,36 +169,3 @@ def keys_of(kind: type) -> Iterator[tuple[str, Key]]:
             yield each.name, form
         elif form is not None:
             yield each.name, Key(each.name, form, read=each.metadata["read"])
-
-
-def attributes(kind: type) -> dict[str, tuple[str, str]]:
-    """Return type and description of each documented field or parameter of a class, by name.
-
-    They are read from the "Attributes" or "Parameters" section of its docstring and of those of its
-    bases; the class itself prevails. Both are single lines of text.
-    """
-    descriptions: dict[str, tuple[str, str]] = {}
-    for base in reversed(kind.__mro__):
-        text = inspect.cleandoc(base.__doc__ or "")
-        section = re.split(
-            "^(?:Attributes|Parameters)\n-+\n", text, maxsplit=1, flags=re.M
-        )[-1]
-        for names, form, text in re.findall(
-            r"^(\w[\w, ]*) : (.*)\n((?: +.*(?:\n|$))+)", section, re.M
-        ):
-            descriptions |= dict.fromkeys(
-                names.split(", "), (form, " ".join(text.split()))
-            )
-    return descriptions
-
-
-def documented(kind: type) -> dict[str, str]:
-    """Return the descriptions of the fields of a dataclass, by name in their order; fields without
-    a description are left out.
-    """
-    descriptions = attributes(kind)
-    return {
-        each.name: descriptions[each.name][1]
-        for each in fields(kind)
-        if each.name in descriptions
-    }
