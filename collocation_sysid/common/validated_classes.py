@@ -24,7 +24,13 @@ from .validated_types import expected, faulty_entry
 
 T = TypeVar("T")
 
-_CONFIGURATION = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
+# Function that returns the error for invalid arguments of a constructor: of the instance with these
+# arguments, and of the first entry of pydantic's `ValidationError.errors()`. Its location begins
+# with the name of a field; it is empty for an error of `__post_init__`, which the entry contains.
+Refusal = Callable[[Any, Mapping[str, Any]], Exception]
+_CONFIGURATION = ConfigDict(
+    extra="forbid", arbitrary_types_allowed=True, validate_default=True
+)
 
 
 @overload
@@ -38,11 +44,11 @@ def validated(
     """Return the class as a frozen dataclass with validated fields, or without a class the
     decorator that does so.
 
-    On construction, in Python or from a table of a file, every stated value is validated against
-    the annotation of its field, and replaced by the validated value; default values are not
-    validated. Then the class's own ``__post_init__`` is called, which raises an `InputError` for
-    values that exclude each other. Unknown names are refused. The section "Attributes" of the
-    docstring describes the fields in the JSON schema.
+    On construction, in Python or from a table of a file, every value is validated against the
+    annotation of its field, and replaced by the validated value. Then the class's own
+    ``__post_init__`` is called, which raises an `InputError` for values that exclude each other.
+    Unknown names are refused. The section "Attributes" of the docstring describes the fields in the
+    JSON schema.
 
     Parameters
     ----------
@@ -61,9 +67,8 @@ def validated(
     def declared(kind: type[T]) -> type[T]:
         """Return the class as a frozen dataclass with validated fields."""
         made: Any = dataclass(frozen=True, kw_only=kw_only)(kind)
-        made.__pydantic_config__ = _CONFIGURATION
         _describe_fields(made)
-        _validate_arguments(made)
+        validate_arguments(made, _key_refusal)
         return made
 
     return declared if kind is None else declared(kind)
@@ -82,8 +87,19 @@ def _describe_fields(kind: Any) -> None:
             )
 
 
-def _validate_arguments(kind: Any) -> None:
-    """Replace the constructor of a dataclass, in place, by one that validates the arguments."""
+def validate_arguments(kind: Any, refusal: Refusal) -> None:
+    """Replace the constructor of a dataclass, in place, by one that validates the arguments.
+
+    Each argument is validated against the `type` of its field, then ``__post_init__`` is called.
+
+    Parameters
+    ----------
+    kind : type
+        Dataclass.
+    refusal : callable
+        Function that returns the error for an invalid argument or an error of ``__post_init__``,
+        see `Refusal`.
+    """
     assign = kind.__init__
 
     @wraps(assign)
@@ -98,9 +114,14 @@ def _validate_arguments(kind: Any) -> None:
             fault = error.errors(include_url=False)[0]
         # Outside of the handler, so that the error is shown alone. Other arguments than those of
         # the constructor are a TypeError.
-        bound = inspect.signature(kind).bind(*arguments, **by_name)
-        raise _refusal(fault, bound.arguments)
+        bound = inspect.signature(kind).bind(*arguments, **by_name).arguments
+        vars(self).update(bound | vars(self))
+        if fault["loc"] and isinstance(fault["loc"][0], int):
+            names = [*bound][fault["loc"][0]], *fault["loc"][1:]
+            fault["loc"] = names
+        raise refusal(self, fault)
 
+    kind.__pydantic_config__ = _CONFIGURATION
     kind.__init__ = construct
 
 
@@ -110,34 +131,20 @@ def _validator(kind: type) -> Any:
     return TypeAdapter(kind).validator
 
 
-def _refusal(
-    fault: Mapping[str, Any], arguments: Mapping[str, Any]
-) -> Exception:
-    """Return the error for an invalid argument of a constructor.
-
-    It is the error that ``__post_init__`` has raised; or an `InputError` whose location is the name
-    of the field, and of the entry if the value is a table.
-
-    Parameters
-    ----------
-    fault : mapping
-        One entry of pydantic's `ValidationError.errors()`.
-    arguments : mapping of str to object
-        Arguments of the constructor by name.
+def _key_refusal(instance: Any, fault: Mapping[str, Any]) -> Exception:
+    """Return the error of ``__post_init__``; or an `InputError` whose location is the name of the
+    invalid field, and of the entry if the value is a table. See `Refusal` for the arguments.
     """
     if not fault["loc"]:
         return fault["ctx"]["error"]
-    first, *rest = fault["loc"]
-    name = [*arguments][first] if isinstance(first, int) else first
-    entry: Mapping[str, Any] = {**fault, "loc": rest}
-    name, value = faulty_entry(name, arguments[name], fault=entry)
+    where, value = faulty_entry(instance, fault)
     if fault["type"] == "value_error":
-        return InputError(str(fault["ctx"]["error"]), None, where=name)
+        return InputError(str(fault["ctx"]["error"]), None, where=where)
     choices = re.findall(
         "'(.*?)'",
         fault["ctx"]["expected"] if "literal" in fault["type"] else "",
     )
     hint = hint_at(str(value), choices)
     return InputError(
-        f"found {value!r}; expected {expected(fault)}{hint}", None, where=name
+        f"found {value!r}; expected {expected(fault)}{hint}", None, where=where
     )

@@ -86,22 +86,21 @@ def expected(fault: Mapping[str, Any]) -> str:
     return message.replace("False", "false").replace("True", "true")
 
 
-def faulty_entry(
-    name: str, value: Any, fault: Mapping[str, Any]
-) -> tuple[str, Any]:
-    """Return the name and the value of the entry of a table that is at fault, or those of the value
-    itself if it is no table.
+def faulty_entry(instance: Any, fault: Mapping[str, Any]) -> tuple[str, Any]:
+    """Return the name and the value of the field that is at fault, or of its entry if the value is
+    a table.
 
     Parameters
     ----------
-    name : str
-        Name of the value; names of entries follow it after dots.
-    value : object
-        Value that was validated.
+    instance : object
+        Instance with the values that were validated as attributes.
     fault : mapping
-        One entry of pydantic's `ValidationError.errors()`.
+        One entry of pydantic's `ValidationError.errors()`, whose location begins with the name of a
+        field; names of entries follow it after dots.
     """
-    for part in fault["loc"]:
+    name, *entries = fault["loc"]
+    value = getattr(instance, name)
+    for part in entries:
         if isinstance(value, Mapping) and part in value:
             name = f"{name}.{part}"
             value = value[part]
