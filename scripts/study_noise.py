@@ -165,23 +165,36 @@ def table(
     spreads = [cell for each in expected for cell in ("0", f"{100 * each:.3g}")]
     lines = [("predicted", "–", "–", *spreads, "–")]
     for name, each in outcomes.items():
-        errors = 100 * np.array(
-            [outcome.errors for outcome in each if outcome.converged]
-        )
-        cells = []
-        for bias, spread in zip(
-            errors.mean(axis=0), errors.std(axis=0, ddof=1), strict=True
-        ):
-            standard_error_bias = spread / np.sqrt(len(errors))
-            cells += [
-                f"{bias:+.2g} ± {standard_error_bias:.1g}",
-                f"{spread:.3g}",
-            ]
+        converged = [outcome.errors for outcome in each if outcome.converged]
         time_s = float(np.median([outcome.time_s for outcome in each]))
         lines.append(
-            (name, str(len(each)), str(len(errors)), *cells, f"{time_s:.2g}")
+            (
+                name,
+                str(len(each)),
+                str(len(converged)),
+                *bias_and_spread(converged),
+                f"{time_s:.2g}",
+            )
         )
     return markdown(heads, lines)
+
+
+def bias_and_spread(errors: Sequence[Array]) -> list[str]:
+    """Return bias and standard deviation of each of the four parameters in per cent, as text.
+
+    The errors (4,) of the logarithms are those of the twins that converged; without two of them
+    there are dashes.
+    """
+    if len(errors) < 2:
+        return ["–"] * (2 * len(PARAMETER_SYMBOLS))
+    percent = 100 * np.array(errors)
+    cells = []
+    for bias, spread in zip(
+        percent.mean(axis=0), percent.std(axis=0, ddof=1), strict=True
+    ):
+        standard_error_bias = spread / np.sqrt(len(percent))
+        cells += [f"{bias:+.2g} ± {standard_error_bias:.1g}", f"{spread:.3g}"]
+    return cells
 
 
 if __name__ == "__main__":

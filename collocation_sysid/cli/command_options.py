@@ -31,11 +31,11 @@ from typing import (
 import typer
 from typer.models import OptionInfo, ParameterInfo
 
-from ..common.declarations import attributes
 from ..common.display import Shown
+from ..common.field_descriptions import attributes
 from ..common.files import require_run_folder
 from ..common.serialisation import as_json
-from ..common.validated_types import Options
+from ..common.validated_classes import validated
 from ..errors import InputError
 from .common import error_console, print_result
 
@@ -312,8 +312,8 @@ class RunFolderOptions:
         require_run_folder(self.run_folder)
 
 
-@dataclass(frozen=True, kw_only=True)
-class OutputOptions(Options):
+@validated(kw_only=True)
+class OutputOptions:
     """Options for the form of the result and of the progress."""
 
     as_json: AsJson = False

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
 import typer
 
 from ..common.files import require_possible, run_name
+from ..common.validated_classes import validated
 from ..errors import InputError
 from ..extras.design import DesignCriterion, DesignOptions, Limits
 from ..extras.design import design_motion as designed
@@ -26,7 +26,7 @@ from .common import EXIT_INTERRUPTED, error_console
 commands = typer.Typer()
 
 
-@dataclass(frozen=True, kw_only=True)
+@validated(kw_only=True)
 class DesignCommand(ProblemOptions, OutputOptions):
     """Options of `design_motion`.
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from ..common.display import Line, Shown, Table, labelled, number
+from ..common.validated_classes import validated
 from ..installation_check import (
     Dependency,
     InstallationReport,
@@ -20,7 +21,7 @@ from .common import EXIT_BAD_INPUT, error_console
 commands = typer.Typer()
 
 
-@dataclass(frozen=True, kw_only=True)
+@validated(kw_only=True)
 class DoctorCommand(OutputOptions):
     """Options of `doctor`, all of which are shared."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +14,7 @@ from rich.text import Text
 from ..common.files import replaced_file, require_possible, run_name
 from ..common.serialisation import as_json
 from ..common.signal_handling import INTERRUPTS
+from ..common.validated_classes import validated
 from ..errors import SimulationError
 from ..methods import require_method
 from ..methods.solution import Status
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 commands = typer.Typer()
 
 
-@dataclass(frozen=True, kw_only=True)
+@validated(kw_only=True)
 class SolveCommand(ProblemOptions, OutputOptions):
     """Options of `solve`.
 
@@ -187,7 +187,7 @@ def _draw_pictures(
         return finished.result
 
 
-@dataclass(frozen=True, kw_only=True)
+@validated(kw_only=True)
 class SimulateCommand(ProblemOptions, OutputOptions):
     """Options of `simulate`.
 
@@ -260,7 +260,7 @@ def _draw_instability(error: SimulationError, folder: Path) -> None:
     error_console.print(f"the mode is drawn in {file}")
 
 
-@dataclass(frozen=True, kw_only=True)
+@validated(kw_only=True)
 class CheckCommand(ProblemOptions, OutputOptions):
     """Options of `check`.
 

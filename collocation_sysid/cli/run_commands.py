@@ -10,6 +10,7 @@ import typer
 
 from ..common.files import require_possible, write_text_file
 from ..common.serialisation import as_json, content
+from ..common.validated_classes import validated
 from ..errors import InputError
 from .command_options import (
     AllowCode,
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 commands = typer.Typer()
 
 
-@dataclass(frozen=True, kw_only=True)
+@validated(kw_only=True)
 class RefineCommand(RunFolderOptions, OutputOptions):
     """Options of `refine`.
 

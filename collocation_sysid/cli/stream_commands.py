@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +12,8 @@ import typer
 from rich.text import Text
 
 from ..common.files import require_possible
-from ..common.validated_types import NotNegative, Options, Positive
+from ..common.validated_classes import validated
+from ..common.validated_types import NotNegative, Positive
 from ..errors import InputError
 from ..extras.live import LiveEstimator, LiveOptions, LiveUpdate
 from ..extras.live.sources import read_problem
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 commands = typer.Typer()
 
 
-@dataclass(frozen=True, kw_only=True)
-class LiveEstimationOptions(Options):
+@validated(kw_only=True)
+class LiveEstimationOptions:
     """Options of commands that estimate from frames as they come.
 
     Attributes
@@ -110,7 +110,7 @@ def settled_update(
     return settled
 
 
-@dataclass(frozen=True, kw_only=True)
+@validated(kw_only=True)
 class LiveCommand(LiveEstimationOptions):
     """Options of `live`.
 
@@ -189,7 +189,7 @@ def live(options: LiveCommand) -> None:
         raise typer.Exit(EXIT_BAD_INPUT)
 
 
-@dataclass(frozen=True, kw_only=True)
+@validated(kw_only=True)
 class ReplayCommand(LiveEstimationOptions, OutputOptions):
     """Options of `replay`.
 

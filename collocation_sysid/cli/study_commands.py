@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import typer
 
 from ..common.files import require_possible, run_name
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
+from ..common.validated_classes import validated
 from ..common.validated_types import Positive
 from ..errors import InputError
 from ..extras.studies import (
@@ -53,7 +54,7 @@ from .common import error_console, interruption_exit, print_result
 commands = typer.Typer()
 
 
-@dataclass(frozen=True, kw_only=True)
+@validated(kw_only=True)
 class StudyOptions(ProblemOptions, OutputOptions):
     """Options of commands with many runs.
 
@@ -68,7 +69,7 @@ class StudyOptions(ProblemOptions, OutputOptions):
     dry_run: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
+@validated(kw_only=True)
 class CompareMethodsCommand(StudyOptions):
     """Options of `compare-methods`.
 
@@ -123,7 +124,7 @@ def compare_methods(options: CompareMethodsCommand) -> None:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@validated(kw_only=True)
 class CompareModelsCommand(StudyOptions):
     """Options of `compare-models`.
 
@@ -216,7 +217,7 @@ def compare_models(options: CompareModelsCommand) -> None:
     _run_study(MODEL_STUDY, options, planned=planned)
 
 
-@dataclass(frozen=True, kw_only=True)
+@validated(kw_only=True)
 class SweepCommand(StudyOptions):
     """Options of `sweep`.
 

@@ -1,7 +1,7 @@
 """General modules without mathematics, which all packages use and which import no package.
 
-- `declarations`, `schema_tables`, `validated_types`: classes that users state in Python or in a
-  problem file, and their checks.
+- `validated_classes`, `declarations`, `schema_tables`, `validated_types`, `field_descriptions`:
+  classes that users state in Python or in a problem file, their checks and descriptions.
 - `time_dependence`: fields that depend on time, their selection and interpolation.
 - `files`, `array_files`, `written_files`: reading and writing of files, completely or not at all.
 - `serialisation`: results as JSON; `display`: output as text, HTML and Markdown; `console`:

@@ -7,16 +7,15 @@ converter is checked against that form.
 
 from __future__ import annotations
 
-import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields
-from functools import cache, partial
-from typing import Any, TypeVar, dataclass_transform, get_args
+from typing import Annotated, Any, TypeVar, dataclass_transform, get_args
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import PlainValidator, ValidatorFunctionWrapHandler, WrapValidator
 
-from ..errors import InputError, located
+from ..errors import InputError
+from .validated_classes import validate_arguments
 from .validated_types import expected, faulty_entry
 
 T = TypeVar("T")
@@ -69,8 +68,8 @@ def key(
     form : type or Key, optional
         Form in the file; a `Key` if its name differs from the field's. None: not a key of the file.
     converter : callable, optional
-        Applied on construction to values other than None. None: the value is checked against `form`
-        if there is one, and otherwise kept as it is.
+        Applied on construction to values other than None. None: the value is validated against
+        `form` if there is one, and otherwise kept as it is.
     read : callable, optional
         Conversion from the value in the file to the field; a `Key` as `form` has its own instead.
     metadata : mapping, optional
@@ -86,78 +85,88 @@ def key(
     frozen_default=True, eq_default=False, field_specifiers=(key, field)
 )
 def declaration(kind: type[T]) -> type[T]:
-    """Return the class as a frozen dataclass, compared by identity, that converts its fields before
-    ``__post_init__``.
+    """Return the class as a frozen dataclass, compared by identity, whose fields are converted and
+    validated before ``__post_init__``.
 
-    On construction, each field other than None is replaced by its converted value (see `key`), then
-    the class's own ``__post_init__`` is called. The location of `InputError`s is the `description`
-    of the instance if it has one; otherwise messages name its `description_name` or, by default,
-    the class.
+    On construction, each field other than None is replaced by its converted or validated value (see
+    `key`), then the class's own ``__post_init__`` is called. The location of `InputError`s is the
+    `description` of the instance if it has one; otherwise messages name its `description_name` or,
+    by default, the class.
 
     Raises
     ------
     InputError
         On construction of an instance, if a value does not have the form of its field.
     """
-    check = getattr(kind, "__post_init__", lambda self: None)
-
-    def convert(self: T) -> None:
-        with located(where=getattr(self, "description", None)):
-            for name, converted in conversions.items():
-                if (value := getattr(self, name)) is not None:
-                    object.__setattr__(self, name, converted(self, value))
-            check(self)
-
-    setattr(kind, "__post_init__", convert)  # noqa: B010 (of a type of the user's)
     made: Any = dataclass(frozen=True, eq=False)(kind)
-    conversions = {
-        each.name: partial(_converted, each)
-        for each in fields(made)
-        if each.metadata.get("converter") or each.metadata.get("form")
-    }
+    for each in fields(made):
+        each.type = _accepted_type(each)
+    validate_arguments(made, _refusal)
     return made
 
 
-def _converted(field: Field[Any], instance: Any, value: Any) -> Any:
-    """Return the value of a field by its converter; without one, the value if it equals the default
-    or, validated, if it has the field's form.
+def _accepted_type(field: Field[Any]) -> Any:
+    """Return the annotation from which pydantic makes the validator of a field, see `key`.
 
-    Raises
-    ------
-    InputError
-        If it does not have the form; converters raise their own errors.
+    None and the default value are accepted, although a problem file cannot state them.
     """
-    if (converter := field.metadata["converter"]) is not None:
-        return converter(value)
-    if value == field.default:
-        return value
-    try:
-        return _adapter(field.metadata["form"]).validate_python(value)
-    except ValidationError as error:
-        fault = error.errors(include_url=False)[0]
-        called = re.sub("(?<!^)(?=[A-Z])", " ", type(instance).__name__).lower()
-        word = getattr(instance, "description_name", called)
-        what, value = faulty_entry(field.name, value, fault=fault)
-        whose = (
-            f"the {word} {instance.name!r}"
-            if hasattr(instance, "name")
-            else f"a {word}"
-        )
-        of = what if hasattr(instance, "description") else f"{what} of {whose}"
-        shown = f"{value:g}" if isinstance(value, float) else repr(value)
-        choices = fault["type"] == "literal_error" and get_args(
-            field.metadata["form"]
-        )
-        expectation = (
-            f"one of {', '.join(choices)}" if choices else expected(fault)
-        )
-        raise InputError(f"{of} is {shown}; expected {expectation}") from error
+    if (converter := field.metadata.get("converter")) is not None:
+        return Annotated[
+            Any,
+            PlainValidator(
+                lambda value: value if value is None else converter(value)
+            ),
+        ]
+    form = field.metadata.get("form")
+    if form is None:
+        return Any
+
+    def unless_default(
+        value: Any, validated: ValidatorFunctionWrapHandler
+    ) -> Any:
+        """Return None and the default value unchanged, other values validated."""
+        is_default = isinstance(value, type(field.default))
+        if value is None or (is_default and value == field.default):
+            return value
+        return validated(value)
+
+    return Annotated[form, WrapValidator(unless_default)]
 
 
-@cache
-def _adapter(form: Any) -> TypeAdapter[Any]:
-    """Return the validator of a form, cached."""
-    return TypeAdapter(form)
+def _refusal(instance: Any, fault: Mapping[str, Any]) -> Exception:
+    """Return the error of a converter or of ``__post_init__``; or an `InputError` that names the
+    object and the invalid field. See `validated_classes.Refusal` for the arguments.
+    """
+    field = (
+        fault["loc"] and type(instance).__dataclass_fields__[fault["loc"][0]]
+    )
+    if not field or field.metadata.get("converter") is not None:
+        error = fault["ctx"]["error"]
+    else:
+        error = _form_refusal(instance, fault, form=field.metadata["form"])
+    where = getattr(instance, "description", None)
+    if where is None or not isinstance(error, InputError):
+        return error
+    return error.located(where=where).with_traceback(error.__traceback__)
+
+
+def _form_refusal(
+    instance: Any, fault: Mapping[str, Any], form: Any
+) -> InputError:
+    """Return the error for a value that does not have the form of its field."""
+    called = re.sub("(?<!^)(?=[A-Z])", " ", type(instance).__name__).lower()
+    word = getattr(instance, "description_name", called)
+    what, value = faulty_entry(instance, fault)
+    whose = (
+        f"the {word} {instance.name!r}"
+        if hasattr(instance, "name")
+        else f"a {word}"
+    )
+    of = what if hasattr(instance, "description") else f"{what} of {whose}"
+    shown = f"{value:g}" if isinstance(value, float) else repr(value)
+    choices = fault["type"] == "literal_error" and get_args(form)
+    expectation = f"one of {', '.join(choices)}" if choices else expected(fault)
+    return InputError(f"{of} is {shown}; expected {expectation}")
 
 
 def keys_of(kind: type) -> Iterator[tuple[str, Key]]:
@@ -170,36 +179,3 @@ def keys_of(kind: type) -> Iterator[tuple[str, Key]]:
             yield each.name, form
         elif form is not None:
             yield each.name, Key(each.name, form, read=each.metadata["read"])
-
-
-def attributes(kind: type) -> dict[str, tuple[str, str]]:
-    """Return type and description of each documented field or parameter of a class, by name.
-
-    They are read from the "Attributes" or "Parameters" section of its docstring and of those of its
-    bases; the class itself prevails. Both are single lines of text.
-    """
-    descriptions: dict[str, tuple[str, str]] = {}
-    for base in reversed(kind.__mro__):
-        text = inspect.cleandoc(base.__doc__ or "")
-        section = re.split(
-            "^(?:Attributes|Parameters)\n-+\n", text, maxsplit=1, flags=re.M
-        )[-1]
-        for names, form, text in re.findall(
-            r"^(\w[\w, ]*) : (.*)\n((?: +.*(?:\n|$))+)", section, re.M
-        ):
-            descriptions |= dict.fromkeys(
-                names.split(", "), (form, " ".join(text.split()))
-            )
-    return descriptions
-
-
-def documented(kind: type) -> dict[str, str]:
-    """Return the descriptions of the fields of a dataclass, by name in their order; fields without
-    a description are left out.
-    """
-    descriptions = attributes(kind)
-    return {
-        each.name: descriptions[each.name][1]
-        for each in fields(kind)
-        if each.name in descriptions
-    }

@@ -15,7 +15,8 @@ from pydantic import (
 )
 
 from ..errors import located
-from .declarations import attributes, keys_of
+from .declarations import keys_of
+from .field_descriptions import attributes
 from .validated_types import Boundless, Finite
 
 Vector = tuple[Finite, Finite, Finite]

@@ -1,4 +1,4 @@
-"""Types with ranges for user input, and the base class of method options.
+"""Types with ranges for user input.
 
 Values are checked by pydantic without conversion: TOML distinguishes text, numbers and truth
 values, so that "30" or true in place of a number is a mistake.
@@ -6,15 +6,10 @@ values, so that "30" or true in place of a number is a mistake.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from functools import cache
-from typing import Annotated, Any, ClassVar, get_type_hints
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
-
-from ..errors import InputError, hint_at
+from pydantic import AfterValidator, Field
 
 # Smallest magnitude of meaningful input; its square is still a nonzero floating-point number.
 SMALLEST = 1e-100
@@ -91,95 +86,22 @@ def expected(fault: Mapping[str, Any]) -> str:
     return message.replace("False", "false").replace("True", "true")
 
 
-def faulty_entry(
-    name: str, value: Any, fault: Mapping[str, Any]
-) -> tuple[str, Any]:
-    """Return the name and the value of the entry of a table that is at fault, or those of the value
-    itself if it is no table.
+def faulty_entry(instance: Any, fault: Mapping[str, Any]) -> tuple[str, Any]:
+    """Return the name and the value of the field that is at fault, or of its entry if the value is
+    a table.
 
     Parameters
     ----------
-    name : str
-        Name of the value; names of entries follow it after dots.
-    value : object
-        Value that was validated.
+    instance : object
+        Instance with the values that were validated as attributes.
     fault : mapping
-        One entry of pydantic's `ValidationError.errors()`.
+        One entry of pydantic's `ValidationError.errors()`, whose location begins with the name of a
+        field; names of entries follow it after dots.
     """
-    for part in fault["loc"]:
+    name, *entries = fault["loc"]
+    value = getattr(instance, name)
+    for part in entries:
         if isinstance(value, Mapping) and part in value:
             name = f"{name}.{part}"
             value = value[part]
     return name, value
-
-
-@dataclass(frozen=True)
-class Options:
-    """Base class of methods and option groups: frozen dataclasses that check the types of their
-    fields.
-
-    On construction each field is validated against its annotation without conversion of types, and
-    replaced by the validated value. Subclasses must be decorated with ``@dataclass(frozen=True)``.
-
-    Attributes
-    ----------
-    name : str
-        Name of the method, set by the subclass.
-    needs_complete_start : bool
-        Whether a method can only start from parameters with which everything can be simulated.
-
-    Raises
-    ------
-    InputError
-        On construction, if a value does not have the type of its field; its location is the name of
-        the field.
-    """
-
-    name: ClassVar[str]
-    # Whether a method can only start from parameters with which everything can be simulated.
-    needs_complete_start: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        for name, adapter in _adapters(type(self)).items():
-            value = getattr(self, name)
-            try:
-                object.__setattr__(self, name, adapter.validate_python(value))
-            except ValidationError as error:
-                raise _refusal(
-                    name, value, fault=error.errors(include_url=False)[0]
-                ) from error
-
-
-@cache
-def _adapters(kind: type[Options]) -> dict[str, TypeAdapter[Any]]:
-    """Return the validator of each field by name, cached."""
-    types = get_type_hints(kind, include_extras=True)
-    return {
-        field.name: TypeAdapter(types[field.name]) for field in fields(kind)
-    }
-
-
-def _refusal(name: str, value: Any, fault: Mapping[str, Any]) -> InputError:
-    """Return the error for an invalid value of the field `name`, whose location it is; it names the
-    entry if the value is a table.
-
-    Parameters
-    ----------
-    name : str
-        Name of the field.
-    value : object
-        Its value.
-    fault : mapping
-        One entry of pydantic's `ValidationError.errors()`.
-    """
-    name, value = faulty_entry(name, value, fault=fault)
-    if fault["type"] == "value_error":
-        return InputError(str(fault["ctx"]["error"]), None, where=name)
-    choices = re.findall(
-        "'(.*?)'",
-        fault["ctx"]["expected"] if "literal" in fault["type"] else "",
-    )
-    hint = hint_at(str(value), choices)
-    return InputError(
-        f"found {value!r}; expected {expected(fault)}{hint}", None, where=name
-    )

@@ -27,7 +27,6 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from ..common.declarations import documented
 from ..errors import InputError, require_among
 from .comparison.casadi_nlp import refusal_reason
 from .continuation import STAGES, Continuation
@@ -72,14 +71,10 @@ def method_options_schema(method: str) -> dict[str, Any]:
     """
     kind = METHODS[method]
     defaults = kind()
-    descriptions = documented(kind)
     options = TypeAdapter(kind).json_schema()["properties"]
     for name, option in options.items():
         del option["title"]
-        option |= {
-            "default": getattr(defaults, name),
-            "description": descriptions[name],
-        }
+        option["default"] = getattr(defaults, name)
     return {
         "type": "object",
         "description": method_summary(method),

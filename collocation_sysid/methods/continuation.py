@@ -9,12 +9,12 @@ and its positions continued by a simulation.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
 from ..common.array_types import Array
-from ..common.validated_types import Options
+from ..common.validated_classes import validated
 from ..errors import InputError, hint_at
 from ..program.collocation import Collocation
 from ..recording.experiment import Experiment
@@ -27,6 +27,7 @@ from .initial_trajectories import complete_variables, simulate_trajectories
 from .interior_point import InteriorPoint
 from .method_options import (
     SHARES,
+    MethodOptions,
     Shares,
     method_from_options,
     samples_in_share,
@@ -48,8 +49,8 @@ _ONE_HORIZON = (
 STAGES: dict[str, type] = {kind.name: kind for kind in _ONE_HORIZON}
 
 
-@dataclass(frozen=True)
-class Continuation(Options):
+@validated
+class Continuation(MethodOptions):
     """Continuation over the horizon: another method on growing parts of every recording.
 
     Attributes
@@ -68,7 +69,6 @@ class Continuation(Options):
 
     def __post_init__(self) -> None:
         """Raise an `InputError` for invalid shares or a stage that is no method, see `method`."""
-        super().__post_init__()
         self.method  # noqa: B018 - refuses a stage that makes no sense
 
     @cached_property

@@ -8,18 +8,18 @@ complementarity.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import BeforeValidator
 
 from ..common.array_types import Array
+from ..common.validated_classes import validated
 from ..common.validated_types import (
     Count,
     Finite,
     NotNegative,
-    Options,
     Positive,
     StrictInteger,
     Text,
@@ -40,6 +40,7 @@ from .initial_point import (
     adjoint_multipliers,
     compute_initial_point,
 )
+from .method_options import MethodOptions
 from .solution import Solution, Status, Watch
 from .solve_recorder import Recorder
 
@@ -112,8 +113,8 @@ DAMPING_CHANGE = (0.1, 10.0)
 NO_DAMPING = 1e-2
 
 
-@dataclass(frozen=True)
-class InteriorPoint(Options):
+@validated
+class InteriorPoint(MethodOptions):
     """Interior-point method (IPOPT) for parameters and trajectories together.
 
     Attributes

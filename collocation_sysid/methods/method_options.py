@@ -9,14 +9,34 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from itertools import pairwise
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import AfterValidator
 
-from ..common.validated_types import Options, Positive
+from ..common.validated_classes import validated
+from ..common.validated_types import Positive
 from ..errors import InputError, hint_at
 
-T = TypeVar("T", bound="Options")
+
+@validated
+class MethodOptions:
+    """Base class of methods, which are called with a `Collocation`; fields are options.
+
+    Decorate subclasses with `validated`, too.
+
+    Attributes
+    ----------
+    name : str
+        Name of the method, set by the subclass.
+    needs_complete_start : bool
+        Whether the method can only start from parameters with which everything can be simulated.
+    """
+
+    name: ClassVar[str]
+    needs_complete_start: ClassVar[bool] = False
+
+
+T = TypeVar("T", bound=MethodOptions)
 
 
 def method_from_options(

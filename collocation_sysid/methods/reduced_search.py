@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ..common.array_types import Array
-from ..common.validated_types import Count, Options, Positive
+from ..common.validated_classes import validated
+from ..common.validated_types import Count, Positive
 from ..errors import SimulationError
 from ..program.linear_algebra.factorisation import (
     ACCURACY,
@@ -23,7 +24,13 @@ from ..program.linear_algebra.factorisation import (
 )
 from .horizon import Horizon, Iterate
 from .loss_curvature import exact_curvature, secant_update, with_curvature
-from .method_options import FEWEST, SHARES, Shares, samples_in_share
+from .method_options import (
+    FEWEST,
+    SHARES,
+    MethodOptions,
+    Shares,
+    samples_in_share,
+)
 from .solution import Iteration, Status
 from .solve_recorder import Recorder
 from .trajectory_sweeps import FitSummary
@@ -82,8 +89,8 @@ FINAL_ACCURACY_SHARE = 0.1
 REREADINGS = 40
 
 
-@dataclass(frozen=True)
-class SearchOptions(Options):
+@validated
+class SearchOptions(MethodOptions):
     """Options of the search for parameters.
 
     Attributes

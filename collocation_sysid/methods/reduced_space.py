@@ -24,12 +24,12 @@ Use it by default: it needs the least memory and time. Its search is in `reduced
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.validated_classes import validated
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from ..fem.kernels import concurrent_count
@@ -49,7 +49,7 @@ from .trajectory_sweeps import trajectory_positions
 MISFIT = 3.0
 
 
-@dataclass(frozen=True)
+@validated
 class ReducedSpace(SearchOptions):
     """Gauss–Newton method for the parameters; the equations of motion give the trajectories.
 

@@ -441,15 +441,13 @@ def _residuals(iterate: ExperimentIterate) -> Array:
     """
     residuals = []
     slopes = []
-    predictions = iterate.linearise_fixed_motion()
-    for reading, (residual, slope) in zip(
-        iterate.segment.residuals, predictions, strict=True
-    ):
+    for reading in iterate.segment.residuals:
         rough = reading.rough_residuals(iterate.x, iterate.phi)
         if rough is not None:
             residuals.append(rough)
-            slopes.append(np.zeros((len(rough), slope.shape[-1])))
+            slopes.append(np.zeros((len(rough), len(iterate.phi))))
             continue
+        residual, slope = iterate.linearise_at_fixed_motion(reading)
         is_compared = reading.compared_with(
             len(iterate.observables[len(residuals)])
         )[: len(residual)]

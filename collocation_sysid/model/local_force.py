@@ -72,23 +72,23 @@ class CandidatePoints:
             skew_factors=np.sign(row - column) / 2,
         )
 
-    def positions(self, x: Array) -> Array:
-        """Return the positions (i, 3) [m] of the candidates, or their velocities, from those of all
-        nodes x (n, 3).
-        """
-        nodes, weights = self._interpolation
-        return weights @ x[nodes]
+    @cached_property
+    def all_nodes(self) -> Index:
+        """Nodes (m,) of the faces of all candidates, in ascending order."""
+        return np.unique(self.nodes)
+
+    def interpolate(self, at_nodes: Array) -> Array:
+        """Return the values (d, i) at the candidates of quantities (m, d) at `all_nodes`."""
+        return at_nodes.T @ self._interpolation
 
     @cached_property
-    def _interpolation(self) -> tuple[Index, Array]:
-        """Nodes (m,) of the faces of all candidates, and their weights (i, m) at the candidates."""
-        nodes, places = np.unique(self.nodes, return_inverse=True)
-        weights = np.zeros((len(self.nodes), len(nodes)))
-        rows = np.arange(len(self.nodes))[:, None]
-        np.add.at(
-            weights, (rows, places.reshape(self.nodes.shape)), self.weights
-        )
-        return nodes, weights
+    def _interpolation(self) -> Array:
+        """Weights (m, i) of `all_nodes` at the candidates."""
+        weights = np.zeros((len(self.all_nodes), len(self.nodes)))
+        places = np.searchsorted(self.all_nodes, self.nodes)
+        columns = np.arange(len(self.nodes))[:, None]
+        np.add.at(weights, (places, columns), self.weights)
+        return weights
 
     def assemble(self, push: Array, size: int) -> Array:
         """Return forces (size,) [N] on the dofs of a body from forces `push` (3, i) [N] on the i
@@ -154,6 +154,12 @@ class ActivePoints:
             self.source,
             self.candidates.point_indices[self.indices].tobytes(),
         )
+
+    def assemble(self, size: int) -> Array:
+        """Return the forces (size,) [N] on the dofs of a body."""
+        push = np.zeros((3, len(self.candidates.point_indices)))
+        push[:, self.indices] = self.force
+        return self.candidates.assemble(push, size)
 
     @cached_property
     def slope(self) -> Array:
@@ -245,9 +251,7 @@ class LocalForces:
         for points in self.active_points(xi, nu, rates):
             candidates = points.candidates
             indices = points.indices
-            on_points = np.zeros((3, len(candidates.point_indices)))
-            on_points[:, indices] = points.force
-            force += candidates.assemble(on_points, xi.size)
+            force += points.assemble(xi.size)
             weights = candidates.weights[indices]
             entries = candidates.entries[indices]
             blocks = np.einsum(

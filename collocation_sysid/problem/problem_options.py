@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from ..common.validated_types import Options, Positive, Text
+from ..common.validated_classes import validated
+from ..common.validated_types import Positive, Text
 from ..statistics.budget.shape_error import CORRELATION
 from ..statistics.budget.systematic_effects import (
     CORRELATION_KEY,
@@ -18,8 +19,8 @@ from ..statistics.budget.systematic_effects import (
 from ..statistics.uncertainty import ErrorModel
 
 
-@dataclass(frozen=True)
-class RolloutOptions(Options):
+@validated
+class RolloutOptions:
     """The forward simulation that checks the answer.
 
     Attributes
@@ -34,7 +35,7 @@ class RolloutOptions(Options):
     timestep_s: Positive | None = None
 
 
-@dataclass(frozen=True)
+@validated
 class UncertaintyOptions(ErrorModel):
     """Intervals of the estimates.
 

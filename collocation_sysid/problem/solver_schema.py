@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core.core_schema import no_info_plain_validator_function
 
 from ..common.schema_tables import Among, Section
-from ..common.validated_types import Options, Positive
+from ..common.validated_types import Positive
 from ..errors import InputError
 from ..methods import METHODS, method_options_schema
 from ..methods.comparison.casadi_nlp import Sleqp, SqpMethod, refusal_reason
@@ -21,7 +21,7 @@ from ..methods.comparison.penalty import AugmentedLagrangian, Penalty
 from ..methods.comparison.shooting import Shooting
 from ..methods.continuation import Continuation
 from ..methods.interior_point import InteriorPoint
-from ..methods.method_options import method_from_options
+from ..methods.method_options import MethodOptions, method_from_options
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Method
 
@@ -57,7 +57,7 @@ class OptionTable:
         Class of the method.
     """
 
-    kind: type[Options]
+    kind: type[MethodOptions]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Return the schema by which pydantic converts the table of options to the method, see
@@ -76,7 +76,7 @@ class OptionTable:
         return method_options_schema(self.kind.name)
 
 
-def _method_key(kind: type[Options]) -> Any:
+def _method_key(kind: type[MethodOptions]) -> Any:
     """Return the pydantic field of a method's table: its name in the file as alias, and the method
     with default options as default.
     """

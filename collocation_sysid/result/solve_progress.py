@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import Self
 
 from rich.console import Console, Group
 from rich.text import Text
@@ -143,7 +144,7 @@ class SolveProgress(Watched):
             else None
         )
 
-    def __enter__(self) -> SolveProgress:
+    def __enter__(self) -> Self:
         for note in self._notes:
             self.line(f"note: {note}")
         super().__enter__()

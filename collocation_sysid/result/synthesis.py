@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..common.files import replaced_file
-from ..common.validated_types import Count, NotNegative, Options, Positive
+from ..common.validated_classes import validated
+from ..common.validated_types import Count, NotNegative, Positive
 from ..common.written_files import (
     LIST_FILE,
     hashes_of,
@@ -60,8 +60,8 @@ _MARKERS_KEY = "markers"
 _SPECIMEN_KEY = "specimen"
 
 
-@dataclass(frozen=True)
-class Recipe(Options):
+@validated
+class Recipe:
     """Options of a simulation that makes synthetic data.
 
     Attributes
@@ -101,7 +101,6 @@ class Recipe(Options):
     frames: bool = False
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         require_among(self.integrator, (NEWMARK, *SCHEMES), where="integrator")
 
 

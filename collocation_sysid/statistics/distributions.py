@@ -1,4 +1,4 @@
-"""Quantiles and tail probabilities of the normal, χ², Student's and Beta distributions.
+"""Quantiles and tail probabilities of the normal, χ², Student's, Beta and F distributions.
 
 `scipy.stats` has them too, but takes as long to import as all other parts of SciPy together.
 Arguments may be arrays.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from numpy.typing import ArrayLike
-from scipy.special import betaincc, chdtr, chdtrc, chdtri, ndtri, stdtrit
+from scipy.special import betaincc, chdtr, chdtrc, chdtri, fdtrc, ndtri, stdtrit
 
 
 def normal_isf(tail: ArrayLike) -> Any:
@@ -46,3 +46,12 @@ def student_ppf(share: ArrayLike, freedom: ArrayLike) -> Any:
 def beta_sf(value: ArrayLike, a: ArrayLike, b: ArrayLike) -> Any:
     """Return the probability of a Beta variable with parameters a, b beyond `value`."""
     return betaincc(a, b, value)
+
+
+def f_sf(
+    value: ArrayLike, numerator_freedom: ArrayLike, freedom: ArrayLike
+) -> Any:
+    """Return the probability that an F variable exceeds `value`, with `numerator_freedom` and
+    `freedom` degrees of freedom of numerator and denominator.
+    """
+    return fdtrc(numerator_freedom, freedom, value)

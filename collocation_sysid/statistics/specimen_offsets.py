@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from ..common.array_types import Array
 from ..common.display import short
 from ..errors import listed
 from ..recording.experiment import Experiment
 from ..recording.specimen import STRESS_NAME
+from .distributions import f_sf
 from .linearised import LinearisedFit
 
 # Residuals this many times sigma, below which there is nothing to explain.
@@ -72,7 +72,7 @@ def stress_offset_notes(
     before = _remaining_squares(slopes, residual)
     after = _remaining_squares(complete, residual)
     statistic = (before - after) / count / max(after / free, 1e-300)
-    if f_distribution.sf(statistic, count, free) > FALSE_ALARMS:
+    if f_sf(statistic, count, freedom=free) > FALSE_ALARMS:
         return []
     estimates, errors = _offsets(complete, residual, count=count)
     errors = errors * np.sqrt(after / free)

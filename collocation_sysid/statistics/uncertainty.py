@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array
-from ..common.validated_types import Options
+from ..common.validated_classes import validated
 from ..errors import InputError
 from ..fem.laws.constants import constant_named, is_damping
 from ..model.parameters import Parameters
@@ -86,8 +86,8 @@ CONSEQUENCE = 1.05
 REPLICAS = 39
 
 
-@dataclass(frozen=True)
-class ErrorModel(Options):
+@validated
+class ErrorModel:
     """Options: assumptions about the errors of the measurements.
 
     Attributes

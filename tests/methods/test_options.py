@@ -8,7 +8,7 @@ import pytest
 from kit.problems import GUESS, hung_cube, measured
 from pydantic import TypeAdapter
 
-from collocation_sysid.common.declarations import documented
+from collocation_sysid.common.field_descriptions import documented
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.comparison.penalty import Penalty

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
 from benchmark_orderings import SETTINGS, Factorisations, run_in_own_process
 
 SIZE = 12
@@ -55,6 +56,7 @@ def test_output_without_a_factorisation_gives_none() -> None:
     assert Factorisations.from_output("") is None
 
 
+@pytest.mark.long
 def test_a_setting_is_measured_in_a_process_of_its_own() -> None:
     assert SETTINGS["amd"].ipopt == {"mumps_pivot_order": 0}
     times, factors = run_in_own_process("foam_cylinder", "amd", iterations=1)
@@ -67,6 +69,7 @@ def test_a_setting_is_measured_in_a_process_of_its_own() -> None:
     assert factors.fill > 1
 
 
+@pytest.mark.long
 def test_a_failed_process_gives_none() -> None:
     assert run_in_own_process("no_such_problem", "amd", iterations=1) == (
         None,

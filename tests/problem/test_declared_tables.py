@@ -11,7 +11,7 @@ import pytest
 from pydantic_core import PydanticUndefined
 
 from collocation_sysid import Nuisance
-from collocation_sysid.common.declarations import documented
+from collocation_sysid.common.field_descriptions import documented
 from collocation_sysid.problem.nuisance_schema import KEYS, NuisanceSection
 from collocation_sysid.problem.validation_messages import table_models
 from collocation_sysid.recording.nuisance import KINDS, NuisanceRow

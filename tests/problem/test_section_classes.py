@@ -9,7 +9,8 @@ import pytest
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from collocation_sysid.common.declarations import documented, keys_of
+from collocation_sysid.common.declarations import keys_of
+from collocation_sysid.common.field_descriptions import documented
 from collocation_sysid.common.schema_tables import Section
 from collocation_sysid.fem.spatial_field import Field
 from collocation_sysid.model.parameters import PARAMETER_KEYS, Unknown

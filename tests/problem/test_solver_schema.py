@@ -9,7 +9,7 @@ from dataclasses import fields
 import pytest
 from kit.problem_files import EXPERIMENT, PROBLEM, run_command
 
-from collocation_sysid.common.declarations import documented
+from collocation_sysid.common.field_descriptions import documented
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.problem.problem_reading import read_problem_file

@@ -156,7 +156,9 @@ def test_stored_columns_of_the_compliance_are_limited(monkeypatch):
     size = 6
     factor = Mock()
     factor.solve = lambda right: 2.0 * right
-    compliance = condensed_steps.Compliance(factor, size)
+    compliance = condensed_steps.Compliance(
+        factor, np.arange(size), dof_count=size
+    )
     monkeypatch.setattr(condensed_steps, "MAX_COLUMN_ENTRIES", 3 * size)
     for dofs in ([0, 1], [1, 2], [3, 4, 5], [0, 5], [0, 4, 5]):
         np.testing.assert_array_equal(

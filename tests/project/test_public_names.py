@@ -53,6 +53,12 @@ def test_the_package_is_imported_without_the_modules_of_its_names():
     assert run_python(code) == "set()"
 
 
+def test_solving_does_not_import_scipys_statistics():
+    """They would double the time that SciPy takes to import."""
+    code = "import sys, collocation_sysid.pipeline; print('scipy.stats' in sys.modules)"
+    assert run_python(code) == "False"
+
+
 @pytest.mark.long
 def test_pyright_knows_the_types_of_public_names_and_reports_misspelt_ones(
     tmp_path,

@@ -21,7 +21,7 @@ from collocation_sysid.fem.kernels import choose_evaluator, run_in_slices, simd
 
 PACKAGE = str(Path(cs.__file__).parent)
 # Largest number of frames.
-LIMIT = 22
+LIMIT = 21
 
 
 def package_frames(frame: FrameType | None) -> list[str]:

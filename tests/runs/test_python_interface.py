@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 from typing import ClassVar
@@ -26,8 +26,9 @@ from kit.problems import (
 from matplotlib.collections import PolyCollection
 
 import collocation_sysid as cs
-from collocation_sysid.common.validated_types import Options
+from collocation_sysid.common.validated_classes import validated
 from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.methods.method_options import MethodOptions
 from collocation_sysid.result.element_fields import ElementFields
 from collocation_sysid.runs.check import check_problem
 
@@ -427,8 +428,8 @@ def test_a_function_is_a_method():
 
 
 def test_options_of_ones_own_are_a_method():
-    @dataclass(frozen=True)
-    class Polished(Options):
+    @validated
+    class Polished(MethodOptions):
         name: ClassVar[str] = "polished"
         tolerance: float = 1e-3
 

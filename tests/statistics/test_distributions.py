@@ -34,6 +34,10 @@ VALUES = np.array([0.0, 1e-3, 2.0, 40.0, 1e3])
             stats.t.ppf(0.975, FREEDOM),
         ),
         (distributions.student_ppf(0.975, np.inf), stats.norm.ppf(0.975)),
+        (
+            distributions.f_sf(VALUES, 3, freedom=FREEDOM),
+            stats.f.sf(VALUES, 3, FREEDOM),
+        ),
         (distributions.chi2_sf(np.nan, 3), np.nan),
     ],
 )

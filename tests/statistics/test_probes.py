@@ -108,8 +108,8 @@ def test_refits_report_the_share_of_significant_assumptions():
     after = events[events.index(refits[0]) + 1 :]
     tested = after[: after.index(None) + 1]
     assert tested[0] == 0.0
-    assert tested[-2:] == [1.0, None]
-    assert np.diff(tested[:-1]) == pytest.approx(1 / (len(tested) - 2))
+    assert tested[-2] == pytest.approx(1.0)
+    assert (np.diff(tested[:-1]) >= 0).all()
     assert name in told(solved)
 
 

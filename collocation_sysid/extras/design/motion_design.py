@@ -12,7 +12,8 @@ from functools import cached_property
 import numpy as np
 
 from ...common.array_types import Array
-from ...common.validated_types import AboveOne, AtLeastOne, Count, Options
+from ...common.validated_classes import validated
+from ...common.validated_types import AboveOne, AtLeastOne, Count
 from ...errors import InputError, SimulationError, require_among
 from ...model.parameters import ThetaMap
 from ...problem import Problem
@@ -47,8 +48,8 @@ NEWS = 500
 MOST_GIGABYTES = 1.0
 
 
-@dataclass(frozen=True)
-class DesignOptions(Options):
+@validated
+class DesignOptions:
     """Options of the search for a motion.
 
     Attributes

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...common.array_types import Array
-from ...common.validated_types import AtLeastOne, Options, Positive
+from ...common.validated_classes import validated
+from ...common.validated_types import AtLeastOne, Positive
 from ...errors import InputError, SimulationError
 from ...pipeline import Run
 from ...problem import Problem
@@ -101,8 +102,8 @@ REACH_BODY_SIZES = 5.0
 SCATTER_INTERVAL_FRAMES = 5
 
 
-@dataclass(frozen=True)
-class LiveOptions(Options):
+@validated
+class LiveOptions:
     """Options of live estimation.
 
     Attributes
@@ -122,6 +123,10 @@ class LiveOptions(Options):
     budget_s: Positive | None = None
     window_s: Positive = 3.0
     rows: AtLeastOne | None = None
+
+
+# Default options.
+USUAL_OPTIONS = LiveOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +227,7 @@ class LiveEstimator:
     def __init__(
         self,
         problem: Problem,
-        options: LiveOptions = LiveOptions(),
+        options: LiveOptions = USUAL_OPTIONS,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.problem = problem

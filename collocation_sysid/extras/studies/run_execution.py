@@ -28,7 +28,8 @@ from ...common.cluster import connected, distributed
 from ...common.files import write_text_file
 from ...common.isolated_process import killed_by
 from ...common.serialisation import as_json
-from ...common.validated_types import AtLeastOne, Options, Positive
+from ...common.validated_classes import validated
+from ...common.validated_types import AtLeastOne, Positive
 from ...errors import InputError
 from ...fem.kernels import available_threads
 from .study_planning import PlannedRun
@@ -305,8 +306,8 @@ class RunStore:
         return self.folder / f"{key}.json"
 
 
-@dataclass(frozen=True)
-class RunOptions(Options):
+@validated
+class RunOptions:
     """Execution of the runs of a study.
 
     Attributes
@@ -325,7 +326,6 @@ class RunOptions(Options):
     time_limit_s: Positive | None = None
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if self.workers is not None and self.scheduler is not None:
             raise InputError(
                 "the scheduler has workers of its own; state either a scheduler or a number of "

@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from ...common.validated_types import AtLeastOne, Count, OneOrMore, Options
+from ...common.validated_classes import validated
+from ...common.validated_types import AtLeastOne, Count, OneOrMore
 from ...errors import InputError
 from ...problem import Problem
 from ...problem.problem_reading import read_problem_file
@@ -111,8 +112,8 @@ def shortened_keys(
         yield key, next(unique_ends, key)
 
 
-@dataclass(frozen=True)
-class Starts(Options):
+@validated
+class Starts:
     """Starts of the runs: the first at the file's guess, the others around the truth, or the guess
     without one.
 
@@ -134,7 +135,6 @@ class Starts(Options):
     seed: Count = 0
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         require_few(self.starts, "starts", noun="starts")
 
     def overrides(

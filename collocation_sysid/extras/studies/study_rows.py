@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from ...common.serialisation import read
-from ...common.validated_types import Options, Positive
+from ...common.validated_classes import validated
+from ...common.validated_types import Positive
 from ...runs.result_content import Result
 from .run_execution import TIMEOUT, Record
 from .study_planning import PlannedRun
@@ -130,8 +131,8 @@ COLUMNS = {
 NORMAL_975 = 1.959963984540054
 
 
-@dataclass(frozen=True)
-class SuccessCriterion(Options):
+@validated
+class SuccessCriterion:
     """Criterion of success.
 
     Attributes

@@ -20,18 +20,20 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from ...common.array_types import Array
-from ...common.validated_types import Count, Options, Positive
+from ...common.validated_classes import validated
+from ...common.validated_types import Count, Positive
 from ...program.collocation import Collocation
 from ...program.lifted.lifted_collocation import with_lifted_variables
 from .. import nlpsol
 from ..callbacks import HessianValues, NlpFunctions
+from ..method_options import MethodOptions
 from ..solution import Solution, Status, Watch
 from ..solve_recorder import Recorder
 
@@ -44,8 +46,8 @@ FEASIBLE = 1e-6
 ACCEPTABLE = 1e-5
 
 
-@dataclass(frozen=True)
-class CasadiSolver(Options):
+@validated
+class CasadiSolver(MethodOptions):
     """Base class of CasADi's solvers; subclasses define the functions and statuses of their plugin.
 
     Attributes
@@ -131,7 +133,7 @@ class CasadiSolver(Options):
         raise NotImplementedError
 
 
-@dataclass(frozen=True)
+@validated
 class SqpMethod(CasadiSolver):
     """Sequential quadratic programming (SQP) with convex quadratic programs."""
 
@@ -165,7 +167,7 @@ class SqpMethod(CasadiSolver):
         }
 
 
-@dataclass(frozen=True)
+@validated
 class Sleqp(CasadiSolver):
     """SLP-EQP in a trust region: steps of QPs with the active constraints of linear programs."""
 

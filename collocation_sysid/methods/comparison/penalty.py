@@ -25,15 +25,11 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ...common.array_types import Array
-from ...common.validated_types import (
-    AboveOne,
-    AtLeastOne,
-    Count,
-    Options,
-    Positive,
-)
+from ...common.validated_classes import validated
+from ...common.validated_types import AboveOne, AtLeastOne, Count, Positive
 from ...errors import InputError
 from ...program.collocation import Collocation
+from ..method_options import MethodOptions
 from ..solution import Solution, Status, Watch
 from ..solve_recorder import SEARCH_ENDS, Recorder, SearchEnded, status_of_end
 from .inner import FIRST_ORDER, Inner, minimise_merit
@@ -103,8 +99,8 @@ class Stage:
     violation: ConstraintViolation = ConstraintViolation()
 
 
-@dataclass(frozen=True)
-class PenaltyOptions(Options):
+@validated
+class PenaltyOptions(MethodOptions):
     """Base class of both methods: the increase of ρ, and limits.
 
     Attributes
@@ -146,7 +142,6 @@ class PenaltyOptions(Options):
 
     def __post_init__(self) -> None:
         """Raise an `InputError` if an option is invalid, or the last ρ is below the first."""
-        super().__post_init__()
         if self.last_rho < self.rho:
             raise InputError(
                 f"found {self.rho_max:g}, which is less than rho = {self.rho:g}; expected rho or "
@@ -218,7 +213,7 @@ class PenaltyOptions(Options):
         raise NotImplementedError
 
 
-@dataclass(frozen=True)
+@validated
 class Penalty(PenaltyOptions):
     """Penalty method: violations of the equations of motion are penalised, as in the paper.
 
@@ -280,7 +275,7 @@ class Penalty(PenaltyOptions):
         return Stage(replace(stage.merit, rho=rho), self.tolerance)
 
 
-@dataclass(frozen=True)
+@validated
 class AugmentedLagrangian(PenaltyOptions):
     """Augmented Lagrangian: a penalty with multipliers, so that ρ need not become large."""
 

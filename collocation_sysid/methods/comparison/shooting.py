@@ -24,12 +24,14 @@ import numpy as np
 from scipy.optimize import least_squares, minimize
 
 from ...common.array_types import Array
-from ...common.validated_types import Count, Options, Positive
+from ...common.validated_classes import validated
+from ...common.validated_types import Count, Positive
 from ...errors import SimulationError
 from ...program.collocation import Collocation
 from ...program.stopwatch import Stopwatch
 from ..horizon import Horizon
 from ..initial_trajectories import complete_variables, simulate_trajectories
+from ..method_options import MethodOptions
 from ..solution import Solution, Status, Watch, constraint_multipliers
 from ..solve_recorder import SEARCH_ENDS, Recorder, SearchEnded, status_of_end
 
@@ -41,8 +43,8 @@ LEAST_GRADIENT_TOLERANCE = 1e-5
 MEMORY = 20
 
 
-@dataclass(frozen=True)
-class Shooting(Options):
+@validated
+class Shooting(MethodOptions):
     """Single shooting: simulate with trial parameters, and improve them.
 
     Attributes

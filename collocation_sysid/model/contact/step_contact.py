@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...common.array_types import Array
+from ...common.array_types import Array, Index
 from ...fem.contact_surface import VECTORS_PER_POINT
 from ...fem.pattern import SymmetricPattern
 from ..local_force import ActivePoints, CandidatePoints, LocalForce
@@ -57,8 +57,10 @@ class ContactCandidates:
     points: CandidatePoints
 
     @cached_property
-    def _last_data(self) -> dict[tuple[float, bytes], Array]:
-        """Data of the law at the last evaluation, by the length of the step and the frame."""
+    def _last_data(self) -> dict[tuple[float, bytes, bytes], Array]:
+        """Data of the law at the last evaluation, by the length of the step, the constants and the
+        frame of the obstacle.
+        """
         return {}
 
     @staticmethod
@@ -91,7 +93,7 @@ class ContactCandidates:
         )
 
     def inputs(
-        self, xi: Array, nu: Array, theta: Array, step_s: float
+        self, xi: Array, nu: Array, constants: Array, step_s: float
     ) -> LawInputs:
         """Return the inputs of the law at the candidates.
 
@@ -99,46 +101,74 @@ class ContactCandidates:
         ----------
         xi, nu : (3n,) arrays
             State [m] and velocity [m/s].
-        theta : (k,) array
-            Constants of the body.
+        constants : (c,) array
+            Constants of the law.
         step_s : float
             Length of the time step over which the pressure is averaged [s]; 0 if it is not.
         """
-        frame = self.law.obstacle.nodes
-        moving = [
-            each.reshape(-1, 3)
-            for each in (xi, nu)[: 1 + self.law.depends_on_velocity]
-        ]
-        own = [(self.points.positions(x) - x[frame[0]]).T for x in moving]
-        ends = [(x[frame[1:]] - x[frame[0]]).ravel() for x in moving]
-        same = np.concatenate([*ends, theta[self.law.constant_columns]])
+        moving = (xi, nu) if self.law.depends_on_velocity else (xi,)
+        nodes = np.concatenate(
+            [each.reshape(-1, 3).take(self._nodes, axis=0) for each in moving],
+            axis=1,
+        )
+        frame = nodes[-VECTORS_PER_POINT:]
         return LawInputs(
-            own[0] if len(own) == 1 else np.concatenate(own),
-            self._data_with(same, step_s),
+            self.points.interpolate(nodes[:-VECTORS_PER_POINT] - frame[0]),
+            self._data_with(frame, constants, step_s=step_s),
         )
 
-    def _data_with(self, same: Array, step_s: float) -> Array:
-        """Return the data (d, i) of the law from those that are the same at all points (s,), and
-        the length of the step [s].
+    @cached_property
+    def _nodes(self) -> Index:
+        """Nodes (m + 4,) of the faces of all candidates, then those of the obstacle's frame."""
+        return np.concatenate([self.points.all_nodes, self.law.obstacle.nodes])
+
+    def _data_with(
+        self, frame: Array, constants: Array, step_s: float
+    ) -> Array:
+        """Return the data (d, i) of the law.
 
         The last data are stored, because the frame of the obstacle does not move within a step.
+
+        Parameters
+        ----------
+        frame : (4, 3) or (4, 6) array
+            Positions [m] and, if needed, velocities [m/s] of the nodes of the obstacle's frame.
+        constants : (c,) array
+            Constants of the law.
+        step_s : float
+            Length of the step [s].
         """
-        key = step_s, same.tobytes()
-        if key not in self._last_data:
+        key = step_s, constants.tobytes(), frame.tobytes()
+        data = self._last_data.get(key)
+        if data is None:
+            ends = (frame[1:] - frame[0]).reshape(3, -1, 3)
+            same = np.concatenate([ends.swapaxes(0, 1).ravel(), constants])
             indices = self.points.point_indices
-            data = np.broadcast_to(same[:, None], (len(same), len(indices)))
-            self._last_data.clear()
-            self._last_data[key] = np.concatenate(
-                [data, self.law.data_of(indices, step_s)]
+            data = np.concatenate(
+                [
+                    np.broadcast_to(same[:, None], (len(same), len(indices))),
+                    self.law.data_of(indices, step_s),
+                ]
             )
-        return self._last_data[key]
+            self._last_data.clear()
+            self._last_data[key] = data
+        return data
+
+
+class _Evaluation(NamedTuple):
+    """Active points in a state ξ (1, 3n) [m] and ν (1, 3n) [m/s]."""
+
+    xi: Array
+    nu: Array
+    points: ActivePoints
 
 
 class StepContact(LocalForce):
     """Contact with one obstacle in one time step of a body with constants θ (k,).
 
     The obstacle is treated as fixed in the derivatives, and the reaction on it is left out. The
-    candidates are stored, and searched again when the state has changed too much.
+    candidates are stored, and searched again when the state has changed too much. The last active
+    points are stored, too: the force at the end of a step is that of the last iteration.
 
     Parameters
     ----------
@@ -161,17 +191,25 @@ class StepContact(LocalForce):
     ) -> None:
         self.depends_on_velocity = law.depends_on_velocity
         self._law = law
-        self._theta = theta
+        self._constants = theta[law.constant_columns]
         self._pattern = pattern
         self._step_s = step_s
         self._from = np.full((1, 1), np.nan)
         self._last_candidates: ContactCandidates | None = None
+        self._last_evaluation: _Evaluation | None = None
         self._margin_m = MARGIN * law.surface.edge_m
 
     def force(self, xi: Array, nu: Array) -> Array:
         """Return the contact forces (3n,) [N] at ξ [m] and ν [m/s], each (1, 3n); zero without
         contact.
         """
+        last = self._last_evaluation
+        if (
+            last is not None
+            and np.array_equal(last.xi, xi)
+            and np.array_equal(last.nu, nu)
+        ):
+            return last.points.assemble(xi.size)
         candidates = self._candidates(xi[0], nu[0])
         if candidates is None:
             return np.zeros(xi.size)
@@ -191,7 +229,7 @@ class StepContact(LocalForce):
             inputs.u, inputs.data
         )
         (touching,) = np.nonzero(force.any(axis=0))
-        return ActivePoints(
+        points = ActivePoints(
             self._law,
             candidates.points,
             indices=touching,
@@ -199,13 +237,15 @@ class StepContact(LocalForce):
             slopes=slopes,
             rates=rates,
         )
+        self._last_evaluation = _Evaluation(xi, nu, points)
+        return points
 
     def _inputs(
         self, candidates: ContactCandidates, xi: Array, nu: Array
     ) -> LawInputs:
         """Return the inputs of the law at candidates in the state ξ and ν, (1, 3n) each."""
         return candidates.inputs(
-            xi[0], nu[0], theta=self._theta, step_s=self._step_s
+            xi[0], nu[0], constants=self._constants, step_s=self._step_s
         )
 
     def _candidates(self, xi: Array, nu: Array) -> ContactCandidates | None:

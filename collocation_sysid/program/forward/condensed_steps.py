@@ -18,6 +18,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
@@ -41,6 +42,8 @@ ROUND_OFF = 1e-13
 MAX_COLUMN_ENTRIES = 30_000_000
 # Number of columns for which memory is allocated at a time.
 COLUMN_BATCH = 64
+# Number of sets of active points whose dofs are cached with a factor.
+MAX_CACHED_POINT_SETS = 16
 
 _getrf, _getrs = get_lapack_funcs(("getrf", "getrs"), dtype=np.float64)
 
@@ -129,22 +132,76 @@ class StepEquations(ABC):
         return self.local.active_points(*self.states(x), self.rates)
 
 
+class ActiveCompliance(NamedTuple):
+    """Compliance of a body at active dofs.
+
+    Attributes
+    ----------
+    dofs : (s,) array
+        Sorted indices of the dofs among the free ones.
+    columns : (s, k) array
+        Columns of the inverse of the matrix of the body at these dofs, transposed.
+    matrix : (s, s) array
+        C, the entries of these columns at the dofs [m/N].
+    """
+
+    dofs: Index
+    columns: Array
+    matrix: Array
+
+
 class Compliance:
     """Columns of the inverse of a factorised matrix on the free dofs, computed on demand.
+
+    Attributes
+    ----------
+    factor : Factor
+        Factor of the matrix of the body without local forces.
 
     Parameters
     ----------
     factor : Factor
-        Factor of the matrix of the body without local forces.
-    size : int
-        Number k of free dofs.
+        See the attributes.
+    free : (k,) array
+        Indices of the free dofs.
+    dof_count : int
+        Number 3n of all dofs.
     """
 
-    def __init__(self, factor: Factor, size: int) -> None:
+    def __init__(self, factor: Factor, free: Index, dof_count: int) -> None:
         self.factor = factor
-        self._column_of_dof = np.full(size, -1)
+        self._number = np.full(dof_count, -1)
+        self._number[free] = np.arange(len(free))
+        self._column_of_dof = np.full(len(free), -1)
         self._count = 0
-        self._columns = np.zeros((0, size))
+        self._columns = np.zeros((0, len(free)))
+        self._last: ActiveCompliance | None = None
+        self._active_dofs: dict[tuple[Hashable, ...], ActiveDofs] = {}
+
+    def active_dofs(self, points: Sequence[ActivePoints]) -> ActiveDofs:
+        """Return the free dofs on which active points act; those of the same points are cached."""
+        key = tuple(each.key for each in points)
+        active = self._active_dofs.get(key)
+        if active is None:
+            if len(self._active_dofs) >= MAX_CACHED_POINT_SETS:
+                self._active_dofs.clear()
+            active = ActiveDofs.from_points(points, self._number)
+            self._active_dofs[key] = active
+        return active
+
+    def at_dofs(self, dofs: Index) -> ActiveCompliance:
+        """Return the compliance at sorted free dofs, given as indices (s,); the last one is cached.
+
+        Raises
+        ------
+        CondensationError
+            If the columns at these dofs need too much memory.
+        """
+        if self._last is None or not np.array_equal(self._last.dofs, dofs):
+            columns = self.columns_at(dofs)
+            matrix = np.asfortranarray(columns[:, dofs].T)
+            self._last = ActiveCompliance(dofs, columns, matrix=matrix)
+        return self._last
 
     def columns_at(self, dofs: Index) -> Array:
         """Return the rows (s, k) of the transposed inverse at free dofs, given as indices (s,).
@@ -189,6 +246,54 @@ class Compliance:
 
 
 @dataclass(frozen=True, eq=False)
+class _PointAssembly:
+    """Assembly of the forces on t active points of one local force.
+
+    Attributes
+    ----------
+    places : (t · 3v,) array
+        Index among the active dofs of each dof of each point, point by point; s for dofs that are
+        prescribed.
+    pair_places : (t · 9v²,) array
+        Index among the pairs of active dofs, of which there are (s + 1)², of each pair of dofs of
+        each point.
+    weights : (t, v) array
+        Shape functions of the nodes of each point.
+    pair_weights : (t, v, 1, v, 1) array
+        Products of two of these weights.
+    """
+
+    places: Index
+    pair_places: Index
+    weights: Array
+    pair_weights: Array
+
+    @classmethod
+    def from_places(
+        cls, places: Index, weights: Array, size: int
+    ) -> _PointAssembly:
+        """Return the assembly of points onto `size` dofs.
+
+        Parameters
+        ----------
+        places : (t, 3v) array
+            See the attributes.
+        weights : (t, v) array
+            See the attributes.
+        size : int
+            Number s of active dofs.
+        """
+        pair_places = places[:, :, None] * (size + 1) + places[:, None]
+        return cls(
+            places.ravel(),
+            pair_places.ravel(),
+            weights=weights,
+            pair_weights=weights[:, :, None, None, None]
+            * weights[:, None, None, :, None],
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class ActiveDofs:
     """Free dofs of the nodes of active points, and the assembly of forces on them.
 
@@ -196,13 +301,12 @@ class ActiveDofs:
     ----------
     dofs : (s,) array
         Sorted indices among the free dofs.
-    places : sequence of (t, 3v) arrays
-        For each local force the index in `dofs` of the dofs of each active point; s for dofs that
-        are prescribed.
+    parts : sequence of _PointAssembly
+        Assembly of the points of each local force.
     """
 
     dofs: Index
-    places: Sequence[Index]
+    parts: Sequence[_PointAssembly]
 
     @classmethod
     def from_points(
@@ -227,17 +331,24 @@ class ActiveDofs:
         (dofs,) = is_active.nonzero()
         place_of_dof = np.full(len(is_active), len(dofs))
         place_of_dof[dofs] = np.arange(len(dofs))
-        return cls(dofs, [place_of_dof[each] for each in numbers])
+        parts = [
+            _PointAssembly.from_places(
+                place_of_dof[numbers_of_points],
+                each.candidates.weights[each.indices],
+                size=len(dofs),
+            )
+            for each, numbers_of_points in zip(points, numbers, strict=True)
+        ]
+        return cls(dofs, parts)
 
     def assemble_force(self, points: Sequence[ActivePoints]) -> Array:
         """Return the forces (s,) [N] on the dofs."""
         count = len(self.dofs) + 1
         total = np.zeros(count)
-        for each, places in zip(points, self.places, strict=True):
-            weights = each.candidates.weights[each.indices]
-            on_nodes = weights[:, :, None] * each.force.T[:, None]
+        for each, part in zip(points, self.parts, strict=True):
+            on_nodes = part.weights[:, :, None] * each.force.T[:, None]
             total += np.bincount(
-                places.ravel(), weights=on_nodes.ravel(), minlength=count
+                part.places, weights=on_nodes.ravel(), minlength=count
             )
         return total[:-1]
 
@@ -247,12 +358,11 @@ class ActiveDofs:
         """
         count = len(self.dofs) + 1
         total = np.zeros(count * count)
-        for each, places in zip(points, self.places, strict=True):
-            weights = each.candidates.weights[each.indices]
-            blocks = np.einsum("pa,ijp,pb->paibj", weights, each.slope, weights)
+        for each, part in zip(points, self.parts, strict=True):
+            slope = each.slope.transpose(2, 0, 1)[:, None, :, None, :]
             total -= np.bincount(
-                (places[:, :, None] * count + places[:, None]).ravel(),
-                weights=blocks.ravel(),
+                part.pair_places,
+                weights=(part.pair_weights * slope).ravel(),
                 minlength=count * count,
             )
         return total.reshape(count, count)[:-1, :-1]
@@ -292,61 +402,40 @@ class CondensedStiffness:
 
     Attributes
     ----------
-    dofs : (s,) array
-        Sorted indices of the dofs among the free ones.
-    columns : (s, k) array
-        Columns of the inverse of the matrix of the body at these dofs.
-    compliance : (s, s) array
-        C, the entries of these columns at the dofs [m/N].
+    compliance : ActiveCompliance
+        Compliance of the body.
     stiffness : (s, s) array
         K, the negative derivative of the local forces [N/m].
     factor : tuple
         LU factorisation of 1 + C K.
     """
 
-    dofs: Index
-    columns: Array
-    compliance: Array
+    compliance: ActiveCompliance
     stiffness: Array
     factor: tuple[Array, Index]
 
     @classmethod
-    def at_dofs(
-        cls,
-        dofs: Index,
-        compliance: Compliance,
-        stiffness: Array,
-        previous: CondensedStiffness | None = None,
+    def from_matrices(
+        cls, compliance: ActiveCompliance, stiffness: Array
     ) -> CondensedStiffness:
-        """Return the matrices at sorted free dofs (s,) with a stiffness (s, s) of
-        local forces.
-
-        The compliance is that of `previous` matrices with the same body if these have the same
-        dofs (the same object).
+        """Return the condensed matrices of a compliance and a stiffness (s, s) of local forces.
 
         Raises
         ------
         CondensationError
             If the matrix is singular.
         """
-        if previous is not None and previous.dofs is dofs:
-            columns = previous.columns
-            flexibility = previous.compliance
-        else:
-            columns = compliance.columns_at(dofs)
-            flexibility = np.asfortranarray(columns[:, dofs].T)
-        matrix = flexibility @ stiffness
-        matrix.flat[:: len(dofs) + 1] += 1.0
+        matrix = compliance.matrix @ stiffness
+        matrix.flat[:: len(matrix) + 1] += 1.0
         lu, pivots, info = _getrf(matrix)
         if info:
             raise CondensationError
-        return cls(
-            dofs,
-            columns,
-            compliance=flexibility,
-            stiffness=stiffness,
-            factor=(lu, pivots),
-        )
+        return cls(compliance, stiffness, factor=(lu, pivots))
+
+    @property
+    def dofs(self) -> Index:
+        """Sorted indices (s,) of the dofs among the free ones."""
+        return self.compliance.dofs
 
     def solve(self, right: Array) -> Array:
         """Return (1 + C K)⁻¹ b for b = `right` (s,)."""
@@ -379,11 +468,8 @@ class CondensedSteps:
         self._size_m = size_m
         self._compliance = compliance
         self._free = free
-        self._number = np.full(equations.local.dof_count, -1)
-        self._number[free] = np.arange(len(free))
         self._last: ForcesOnActiveDofs | None = None
         self._condensed: CondensedStiffness | None = None
-        self._known_dofs: dict[tuple[Hashable, ...], ActiveDofs] = {}
 
     def step_from(self, x: Array) -> Array:
         """Return the step (k,) [m] from positions x (3n,) [m].
@@ -421,10 +507,10 @@ class CondensedSteps:
             change = _spread(now, dofs) - _spread(start, dofs)
             known = change + condensed.stiffness @ step[dofs]
             step_of_dofs = condensed.solve(
-                without_change[dofs] + condensed.compliance @ known
+                without_change[dofs] + condensed.compliance.matrix @ known
             )
             forces = known - condensed.stiffness @ step_of_dofs
-            step = without_change + forces @ condensed.columns
+            step = without_change + forces @ condensed.compliance.columns
             now = self._forces_at(self._advanced(x, step))
             if self._is_converged(
                 step, start, now=now, forces=forces, condensed=condensed
@@ -463,7 +549,7 @@ class CondensedSteps:
         ):
             return False
         change = _spread(now, dofs) - _spread(start, dofs)
-        error_m = condensed.compliance @ (change - forces)
+        error_m = condensed.compliance.matrix @ (change - forces)
         limit_m = max(
             LOCAL_ACCURACY * float(np.abs(step).max()),
             ROUND_OFF * self._size_m,
@@ -483,7 +569,7 @@ class CondensedSteps:
         """
         dofs = (
             start.dofs
-            if now.active is start.active
+            if np.array_equal(now.dofs, start.dofs)
             else np.union1d(start.dofs, now.dofs)
         )
         if len(dofs) > MAX_ACTIVE_DOFS:
@@ -496,11 +582,8 @@ class CondensedSteps:
             stiffness = np.zeros((len(dofs), len(dofs)))
             places = np.searchsorted(dofs, now.dofs)
             stiffness[np.ix_(places, places)] = present
-        return CondensedStiffness.at_dofs(
-            dofs,
-            self._compliance,
-            stiffness=stiffness,
-            previous=self._condensed,
+        return CondensedStiffness.from_matrices(
+            self._compliance.at_dofs(dofs), stiffness
         )
 
     def _advanced(self, x: Array, step: Array) -> Array:
@@ -512,10 +595,7 @@ class CondensedSteps:
     def _forces_at(self, x: Array) -> ForcesOnActiveDofs:
         """Return the local forces on free dofs at positions x (3n,), which are not copied."""
         points = self._equations.active_points(x)
-        key = tuple(each.key for each in points)
-        if key not in self._known_dofs:
-            self._known_dofs[key] = ActiveDofs.from_points(points, self._number)
-        active = self._known_dofs[key]
+        active = self._compliance.active_dofs(points)
         return ForcesOnActiveDofs(
             x,
             points,

@@ -751,7 +751,9 @@ class _CondensedIteration:
             at = self._equations.linearise_without_local(x)
         symmetric = at._replace(skew=NO_SKEW_PART)
         factor = solver.factorise(symmetric, x, keep_definite=False)
-        solver.compliance = Compliance(factor, len(solver.free))
+        solver.compliance = Compliance(
+            factor, solver.free, dof_count=solver.pattern.size
+        )
         self._use_compliance()
 
     def step_from(self, x: Array) -> Array:

@@ -49,11 +49,8 @@ class LiftedForceHistory(LiftedVariables):
     force_index: int
     reactions: LiftedReactions | None = None
     kind = "force"
-
-    @property
-    def first_evaluation(self) -> int:
-        """Index of the evaluation that the first variables belong to, 1."""
-        return 1
+    # Index of the evaluation that the first variables belong to.
+    first_evaluation = 1
 
     @property
     def unit_m(self) -> float:

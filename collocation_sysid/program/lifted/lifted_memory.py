@@ -106,6 +106,8 @@ class LiftedMemory(LiftedVariables):
 
     reactions: LiftedReactions | None = None
     kind = "memory"
+    # The history of the body is the first in `ExperimentIterate.histories`.
+    history_index = 0  # type: ignore[override]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -165,13 +167,6 @@ class LiftedMemory(LiftedVariables):
         return (
             _body_history(iterate).compute_recursion_residuals() / self.unit_pa
         ).ravel()
-
-    @property
-    def history_index(self) -> int:
-        """Index of the history in `ExperimentIterate.histories`, 0:
-        that of the body is the first.
-        """
-        return 0
 
     def weighted_history(
         self, iterate: ExperimentIterate, multipliers: Array

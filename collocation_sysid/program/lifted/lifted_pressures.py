@@ -33,7 +33,7 @@ class LiftedPressure(LiftedForceHistory):
     lower_bound = 0.0  # type: ignore[override]
 
     @property
-    def first_evaluation(self) -> int:
+    def first_evaluation(self) -> int:  # type: ignore[override]
         """Index of the evaluation that the first variables belong to: the first with an equation of
         motion.
         """

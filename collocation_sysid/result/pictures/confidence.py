@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from scipy.stats import chi2, norm
 
 from ...common.array_types import Array
 from ...runs.result_content import Result
 from ...statistics.budget.uncertainty_budget import main_sources, source_label
+from ...statistics.distributions import chi2_isf, normal_isf
 from ...statistics.estimates import correlation_from_covariance
 from ..figure_style import (
     BLACK,
@@ -30,7 +30,7 @@ from ..figure_style import (
 from .scene import round_length
 
 # Radius of the joint 95 % region of two normal parameters over the half width of one interval.
-JOINT_RADIUS = float(np.sqrt(chi2.ppf(0.95, 2)) / norm.ppf(0.975))
+JOINT_RADIUS = float(np.sqrt(chi2_isf(0.05, 2)) / normal_isf(0.025))
 # Half width of the logarithm beyond which an interval is cut off at the edge of the panel.
 MAX_HALF_WIDTH = np.log(1e3)
 # Deviation of a logarithm beyond which axes show factors instead of percent.

@@ -22,7 +22,8 @@ from pydantic_core import CoreSchema, core_schema
 
 from ...common.array_types import Array, Index
 from ...common.schema_tables import ByForm, Section
-from ...common.validated_types import Options, Positive
+from ...common.validated_classes import validated
+from ...common.validated_types import Positive
 from ...fem.body import Body
 from ...fem.laws.constants import GAMMA_R, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
@@ -1039,8 +1040,8 @@ KnownDeviation = Annotated[KnownEffect | Deviation, ByForm((dict, KnownEffect))]
 OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Assumptions(Options):
+@validated(kw_only=True)
+class Assumptions:
     """Standard deviations of systematic effects; "none" for an effect that is exactly zero.
 
     An effect that is known to exist, such as the compliance of a machine, has a table of mean and

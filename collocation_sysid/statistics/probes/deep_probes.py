@@ -102,7 +102,6 @@ def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
             iterated[probe.name] = _iterate_probe(
                 solved_fit, probe, limit=limits[probe.name]
             )
-            complete_steps(StepUnit.ASSUMPTION)
     return (
         *(_with_significant_moves(each, limit) for each in parts),
         *(iterated.get(probe.name, probe) for probe in relaxed),
@@ -250,7 +249,8 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
     )
     p = at.read_parameters()
     _, positions = collocation.unpack(at.z)
-    for _ in range(STEPS):
+    steps = 0
+    while steps < STEPS:
         step = gauss_newton_step(wide)[:first]
         p = p + step
         positions, failure = simulate_trajectories(
@@ -267,8 +267,11 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
             there, changes, name=probe.name, widening=_widening(probe.name)
         )
         probe = relaxed_probe(at, probe.name, wide=wide, p=p)
+        steps += 1
+        complete_steps(StepUnit.ASSUMPTION, 1 / STEPS)
         if np.abs(step[: wide.shared_count]).max(initial=0.0) < SETTLED:
             break
+    complete_steps(StepUnit.ASSUMPTION, 1 - steps / STEPS)
     return replace(
         probe, sentences=(probe.name,) if probe.is_beyond(limit) else ()
     )
