@@ -56,7 +56,7 @@ def measure(path: Path, scheme: str, repeats: int) -> dict:
         f"simd_{threads}_ms": ("simd", threads),
     }
     evaluators["casadi_map_ms"] = ("casadi", 1)
-    collocations = {}
+    collocations: dict[str, Collocation] = {}
     for evaluator_name, (evaluator, thread_count) in evaluators.items():
         body = Body(
             problem.bodies[0].mesh,
@@ -73,11 +73,12 @@ def measure(path: Path, scheme: str, repeats: int) -> dict:
     first = collocations["simd_1_ms"]
     rng = np.random.default_rng(0)
     rest_positions_m = [
-        s.experiment.rigid_positions(s.dynamics.t_s) for s in first.segments
+        s.experiment.rigid_positions(s.dynamics.t_s)
+        for s in first.transcriptions
     ]
     z = first.pack(first.parameters.guess_q, rest_positions_m)
     z[first.nq :] += 1e-3 * rng.normal(size=len(z) - first.nq)
-    multipliers = rng.normal(size=first.constraints)
+    multipliers = rng.normal(size=first.constraint_count)
     jacobian = np.empty(len(first.jacobian_structure[1]))
     hessian = np.empty(len(first.hessian_structure[1]))
 
@@ -91,7 +92,7 @@ def measure(path: Path, scheme: str, repeats: int) -> dict:
         "problem": {
             "nodes": len(problem.bodies[0].nodes_m),
             "elements": len(problem.bodies[0].cells),
-            "steps": sum(s.grid_rows for s in first.segments),
+            "steps": sum(s.grid_times for s in first.transcriptions),
             "scheme": scheme,
         },
         "jacobian": _median_times_ms(

@@ -1,0 +1,59 @@
+"""Studies and benchmarks run to their end, with as few twins, repetitions or steps as they accept.
+
+The numbers are not compared: the scripts state them for the documentation. Scripts that need
+downloaded data, and those that take longer than a minute, are left out.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+# Command lines without the ending of the script's name.
+COMMANDS = (
+    "study_air --twins 2",
+    "study_coverage --twins 2 --workers 1",
+    "study_damping --speeds 1",
+    "study_design --twins 2 --evaluations 5",
+    "study_faults --twins 2 --only none",
+    "study_kawabata --laws neo-hookean",
+    "study_live --twins 2 --rows 3",
+    "study_memory --twins 2 --branches 1",
+    "study_methods --starts 1 --methods reduced-space --workers 1",
+    "study_mismatch --schemes midpoint --substeps 1",
+    "study_mistakes --groups tracks --only wxyz --seeds 1",
+    "study_refinement 1",
+    "study_specimen_coverage --twins 2 --case 0",
+    "study_starts --starts 1 --bodies cylinder",
+    "study_step 1",
+    "study_table1 --methods reduced-space",
+    "study_trust --twins 1 --faulty 1 --only none",
+    "study_wrench --twins 2",
+    "benchmark_contact",
+    "benchmark_damping --rounds 1",
+    "benchmark_distant_guesses --cases none --samples 10",
+    "benchmark_jacobian --repeats 1",
+    "benchmark_memory --repeats 1",
+    "benchmark_newcomer --repeats 1",
+    "benchmark_ogden --rounds 1",
+    "benchmark_shipped foam_cylinder --max-time-s 20",
+)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_study_or_benchmark_runs_to_its_end(command: str, tmp_path: Path):
+    name, *arguments = command.split()
+    finished = subprocess.run(
+        [sys.executable, str(SCRIPTS / f"{name}.py"), *arguments],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert finished.stdout.strip()
