@@ -174,9 +174,11 @@ class _RefinedFactor:
     accuracy : float
         Relative size of the last correction.
     last_rates : dict of int to float
-        Rate at which the corrections of the last matrix became smaller, with the key 0; shared by
-        the factors of one analysis, symmetric or not, and updated in place. Above `ACCURACY` it
-        replaces a first correction, whose only purpose would be to measure that rate.
+        Rate at which the corrections of the last matrix became smaller, with the key 0; updated in
+        place. Above `ACCURACY` it replaces a first correction, whose only purpose would be to
+        measure that rate. It is shared by the symmetric matrices of one analysis, whose rates are
+        those of rounding. The rate of a matrix with a skew part is that of this matrix alone: under
+        friction it is tiny in one time step, and large in the next one.
     divergence_flags : list of bool
         Not empty after the refinement has failed once.
     """
@@ -347,8 +349,8 @@ class Factoriser:
         self._entries = pattern.entry_count
         # Memory of factors of double and of single precision that is not in use.
         self._pools: dict[bool, list[Pardiso]] = {False: [], True: []}
-        # Of symmetric matrices and of those with a skew part, which need more corrections.
-        self._last_rates: dict[bool, dict[int, float]] = {False: {}, True: {}}
+        # Of symmetric matrices in single precision, see `_RefinedFactor`.
+        self._last_rates: dict[int, float] = {}
         if choice == "supernodal":
             self._pools[False].append(self._pardiso(is_single=False))
 
@@ -495,7 +497,7 @@ class Factoriser:
                         partial(self.factorise, values, skew)
                     ),
                     accuracy=accuracy,
-                    last_rates=self._last_rates[skew.size > 0],
+                    last_rates={} if skew.size else self._last_rates,
                 )
         definite = (
             self._factorise_in_skyline(values, NONE, buffer=buffer)
@@ -524,7 +526,7 @@ class Factoriser:
             self.complete_matrix(values, skew),
             factorise_complete=complete_factor,
             accuracy=accuracy,
-            last_rates=self._last_rates[skew.size > 0],
+            last_rates={},
         )
 
     def factorise_rounded(self, values: Array) -> Factor | None:
