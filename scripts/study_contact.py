@@ -1,6 +1,7 @@
 """Contact compared with Hertz: a sphere and a long cylinder press a block; twins of an indentation.
 
-    python scripts/study_contact.py [sphere] [cylinder] [poked]
+    python scripts/study_contact.py
+    python scripts/study_contact.py --parts poked --twins 20
 
 The meshes have more and more elements per half-width of the contact. The computed force is compared
 with the force that Hertz's theory gives for the computed width of the contact, from the second moment
@@ -11,7 +12,7 @@ elements and with Hertz's formula from the same forces.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -335,22 +336,44 @@ def print_coverage(count: int = 100) -> None:
     )
 
 
+def print_force_ratios(name: str) -> None:
+    """Print the ratio of the computed force to Hertz's on finer and finer meshes, and with other
+    contact stiffnesses and smoothing lengths for the cylinder.
+    """
+    law, resolutions = {
+        "sphere": (sphere, (1.5, 3.0, 4.2)),
+        "cylinder": (cylinder, (2.0, 4.0, 8.0)),
+    }[name]
+    for cells in resolutions:
+        print(name, cells, law(cells), flush=True)
+    if name == "cylinder":
+        for kappa, delta in (
+            (10, 0.02),
+            (30, 0.002),
+            (100, 0.02),
+            (300, 0.002),
+            (1000, 2e-4),
+        ):
+            print(name, 8.0, kappa, delta, law(8.0, kappa, delta), flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parts = ("sphere", "cylinder", "poked")
+    parser.add_argument(
+        "--parts", nargs="+", choices=parts, default=list(parts)
+    )
+    parser.add_argument("--twins", type=int, default=100, help="of `poked`")
+    arguments = parser.parse_args()
+    for part in arguments.parts:
+        if part == "poked":
+            print_coverage(arguments.twins)
+        else:
+            print_force_ratios(part)
+
+
 if __name__ == "__main__":
-    if "poked" in sys.argv:
-        print_coverage()
-        sys.argv.remove("poked")
-    for name in sys.argv[1:]:
-        law = {"sphere": sphere, "cylinder": cylinder}[name]
-        for cells in (1.5, 3.0, 4.2) if name == "sphere" else (2.0, 4.0, 8.0):
-            print(name, cells, law(cells), flush=True)
-        if name == "cylinder":
-            for kappa, delta in (
-                (10, 0.02),
-                (30, 0.002),
-                (100, 0.02),
-                (300, 0.002),
-                (1000, 2e-4),
-            ):
-                print(
-                    name, 8.0, kappa, delta, law(8.0, kappa, delta), flush=True
-                )
+    main()

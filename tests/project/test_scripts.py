@@ -16,6 +16,7 @@ SCRIPTS = Path(__file__).parents[2] / "scripts"
 # Command lines without the ending of the script's name.
 COMMANDS = (
     "study_air --twins 2",
+    "study_contact --parts poked --twins 2",
     "study_coverage --twins 2 --workers 1",
     "study_damping --speeds 1",
     "study_design --twins 2 --evaluations 5",
