@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
 from ..fem.pattern import SymmetricPattern, dofs_of
@@ -148,11 +149,25 @@ class ActivePoints:
     rates: tuple[float, float]
 
     @property
-    def key(self) -> tuple[Hashable, bytes]:
-        """Key that is equal for the same points of the same force."""
+    def key(self) -> tuple[Hashable, bytes, bytes]:
+        """Key that is equal for the same points and axes of the same force."""
         return (
             self.source,
             self.candidates.point_indices[self.indices].tobytes(),
+            self.find_axes().tobytes(),
+        )
+
+    def find_axes(self) -> NDArray[np.bool_]:
+        """Return a mask (3,) of the axes along which any force on the points acts, or by whose
+        coordinates it changes; one of them for a plane without friction that is perpendicular to an
+        axis.
+        """
+        acts = np.any(self.force, axis=1)
+        if np.all(acts):
+            return acts
+        changes = np.any(self.slopes, axis=2).reshape(3, -1, 3)
+        return (
+            acts | np.any(changes, axis=(0, 1)) | np.any(changes, axis=(1, 2))
         )
 
     def assemble(self, size: int) -> Array:

@@ -91,6 +91,26 @@ def test_condensed_steps_have_the_solution_of_the_complete_equations(
     assert np.abs(x[:, : alone.shape[1]] - alone).max() > 1e-4
 
 
+def test_dofs_along_axes_without_a_force_are_not_condensed(monkeypatch):
+    """A plate without friction presses along one axis, with friction along all three."""
+    factorise = condensed_steps.CondensedStiffness.from_matrices
+    sizes: list[int] = []
+
+    def counting(compliance, stiffness):
+        sizes.append(len(stiffness))
+        return factorise(compliance, stiffness)
+
+    monkeypatch.setattr(
+        condensed_steps.CondensedStiffness, "from_matrices", counting
+    )
+    largest = []
+    for friction in (0.0, 0.3):
+        simulated(pressed_cube(3, 2, friction))
+        largest.append(max(sizes))
+        sizes.clear()
+    assert 3 * largest[0] == largest[1]
+
+
 def test_steps_that_cannot_be_condensed_are_solved_completely(monkeypatch):
     """Here the dofs that touch are too many, or never converge."""
     experiment = pressed_cube(3, 4, 0.3)

@@ -253,7 +253,7 @@ class _PointAssembly:
     ----------
     places : (t · 3v,) array
         Index among the active dofs of each dof of each point, point by point; s for dofs that are
-        prescribed.
+        prescribed, or along axes without a force.
     pair_places : (t · 9v²,) array
         Index among the pairs of active dofs, of which there are (s + 1)², of each pair of dofs of
         each point.
@@ -295,7 +295,8 @@ class _PointAssembly:
 
 @dataclass(frozen=True, eq=False)
 class ActiveDofs:
-    """Free dofs of the nodes of active points, and the assembly of forces on them.
+    """Free dofs of the nodes of active points along the axes of their forces, and the assembly of
+    forces on them.
 
     Attributes
     ----------
@@ -322,7 +323,12 @@ class ActiveDofs:
             Index of each dof among the free ones; −1 for prescribed dofs.
         """
         numbers = [
-            number[each.candidates.dofs[each.indices]] for each in points
+            np.where(
+                np.tile(each.find_axes(), each.candidates.nodes.shape[1]),
+                number[each.candidates.dofs[each.indices]],
+                -1,
+            )
+            for each in points
         ]
         is_active = np.zeros(len(number) + 1, dtype=bool)
         for each in numbers:
@@ -432,11 +438,6 @@ class CondensedStiffness:
             raise CondensationError
         return cls(compliance, stiffness, factor=(lu, pivots))
 
-    @property
-    def dofs(self) -> Index:
-        """Sorted indices (s,) of the dofs among the free ones."""
-        return self.compliance.dofs
-
     def solve(self, right: Array) -> Array:
         """Return (1 + C K)⁻¹ b for b = `right` (s,)."""
         return _getrs(*self.factor, right)[0]
@@ -499,11 +500,11 @@ class CondensedSteps:
         if (
             condensed is None
             or now is not start
-            or not np.array_equal(condensed.dofs, start.dofs)
+            or not np.array_equal(condensed.compliance.dofs, start.dofs)
         ):
             condensed = self._condensed_at(start, now)
         for _ in range(MAX_LOCAL_ITERATIONS):
-            dofs = condensed.dofs
+            dofs = condensed.compliance.dofs
             change = _spread(now, dofs) - _spread(start, dofs)
             known = change + condensed.stiffness @ step[dofs]
             step_of_dofs = condensed.solve(
@@ -543,7 +544,7 @@ class CondensedSteps:
         condensed : CondensedStiffness
             Matrices with which the step was computed.
         """
-        dofs = condensed.dofs
+        dofs = condensed.compliance.dofs
         if now.active is not start.active and not (
             np.isin(now.dofs, dofs).all()
         ):
