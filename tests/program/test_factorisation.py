@@ -341,6 +341,29 @@ def test_factors_in_single_precision_solve_as_accurately(
 
 
 @pytest.mark.parametrize("choice", WIDE_CHOICES)
+@pytest.mark.parametrize("is_single", [False, True])
+def test_a_small_skew_part_tells_nothing_about_that_of_the_next_matrix(
+    choice, is_single: bool
+):
+    """As under friction, where points stick in one time step and slip in the next."""
+    free = without_first_nodes(WIDE)
+    values = random_values(WIDE, 100.0)
+    skew = 0.1 * random_values(WIDE, 0.0, seed=3)
+    skew[WIDE.diagonal] = 0
+    right = np.random.default_rng(1).normal(size=len(free))
+    factoriser = Factoriser(WIDE, free, choice)
+    accuracy = 1e-3
+    for size in (1e-12, 1.0):
+        factor = factoriser.factorise(
+            values, size * skew, is_single=is_single, accuracy=accuracy
+        )
+        matrix = full_matrix(WIDE, values, size * skew).toarray()
+        accurate = np.linalg.solve(matrix[np.ix_(free, free)], right)
+        error = np.abs(factor.solve(right) - accurate).max()
+        assert error < accuracy * np.abs(accurate).max()
+
+
+@pytest.mark.parametrize("choice", WIDE_CHOICES)
 @pytest.mark.parametrize("least", [1e-9, -1e-9])
 def test_matrices_beyond_single_precision_are_factorised_in_double(
     choice, least: float

@@ -59,6 +59,9 @@ GROWTH = 10.0
 ACCURACY = 1e-10
 # Factor by which each correction must be smaller; otherwise another factorisation is cheaper.
 CONTRACTION = 0.2
+# Number of analyses that are cached: a problem may have a dozen recordings with obstacles, each of
+# which has a pattern of its own, and an analysis costs as much as several factorisations.
+LARGEST_CACHED_ANALYSIS_COUNT = 16
 # Smallest size of a correction, against division by zero.
 TINY = 1e-300
 
@@ -174,9 +177,11 @@ class _RefinedFactor:
     accuracy : float
         Relative size of the last correction.
     last_rates : dict of int to float
-        Rate at which the corrections of the last matrix became smaller, with the key 0; shared by
-        the factors of one analysis, symmetric or not, and updated in place. Above `ACCURACY` it
-        replaces a first correction, whose only purpose would be to measure that rate.
+        Rate at which the corrections of the last matrix became smaller, with the key 0; updated in
+        place. Above `ACCURACY` it replaces a first correction, whose only purpose would be to
+        measure that rate. It is shared by the symmetric matrices of one analysis, whose rates are
+        those of rounding. The rate of a matrix with a skew part is that of this matrix alone: under
+        friction it is tiny in one time step, and large in the next one.
     divergence_flags : list of bool
         Not empty after the refinement has failed once.
     """
@@ -260,6 +265,34 @@ class _UpperTriangle(NamedTuple):
     lower_positions: Index
 
 
+class _OrderedColumns(NamedTuple):
+    """Structure of both triangles of a matrix in compressed columns, in the order in which SuperLU
+    fills in little.
+
+    Attributes
+    ----------
+    order : (k,) array
+        Free dof of each row and column.
+    rank : (k,) array
+        Row and column of each free dof.
+    column_starts : (k + 1,) array of int32
+        Index of the first entry of each column, and the number of entries.
+    rows : (e,) array of int32
+        Row of each entry, ascending in each column.
+    entries : (e,) array
+        Position of each entry among those of both triangles.
+    counts : (k,) array
+        Number of entries of each column of L without row exchanges.
+    """
+
+    order: Index
+    rank: Index
+    column_starts: NDArray[np.int32]
+    rows: NDArray[np.int32]
+    entries: Index
+    counts: Index
+
+
 @dataclass(frozen=True, eq=False)
 class _SparseFactor:
     """Complete LU factorisation of a sparse matrix by SuperLU.
@@ -267,19 +300,25 @@ class _SparseFactor:
     Attributes
     ----------
     lu : SuperLU
-        The factorisation.
+        The factorisation of the matrix in another order.
+    order, rank : (k,) arrays
+        Free dof of each row of that matrix, and row of each free dof.
     positive_definite : bool
         See `Factor.positive_definite`.
     """
 
     lu: SuperLU
+    order: Index
+    rank: Index
     positive_definite: bool
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, of the
         transposed matrix if `transposed`.
         """
-        return self.lu.solve(right, "T" if transposed else "N")
+        ordered = right.take(self.order, axis=0)
+        solved = self.lu.solve(ordered, "T" if transposed else "N")
+        return solved.take(self.rank, axis=0)
 
 
 class Factoriser:
@@ -347,8 +386,8 @@ class Factoriser:
         self._entries = pattern.entry_count
         # Memory of factors of double and of single precision that is not in use.
         self._pools: dict[bool, list[Pardiso]] = {False: [], True: []}
-        # Of symmetric matrices and of those with a skew part, which need more corrections.
-        self._last_rates: dict[bool, dict[int, float]] = {False: {}, True: {}}
+        # Of symmetric matrices in single precision, see `_RefinedFactor`.
+        self._last_rates: dict[int, float] = {}
         if choice == "supernodal":
             self._pools[False].append(self._pardiso(is_single=False))
 
@@ -356,8 +395,8 @@ class Factoriser:
     def cached(
         cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto"
     ) -> Factoriser:
-        """Return the analysis of a pattern; the last eight are cached. Arguments as in
-        `Factoriser`.
+        """Return the analysis of a pattern; the last `LARGEST_CACHED_ANALYSIS_COUNT` are cached.
+        Arguments as in `Factoriser`.
         """
         return _cached_analysis(pattern, free.tobytes(), choice=choice)
 
@@ -405,7 +444,7 @@ class Factoriser:
         if self.is_supernodal:
             return self._supernodal_size
         return 3 * int(
-            self._column_counts.sum()
+            self._ordered_columns.counts.sum()
         )  # L, U, and their row numbers at half the size
 
     def estimate_unsymmetric_factor_size(self) -> int:
@@ -432,17 +471,7 @@ class Factoriser:
 
     def _estimate_sparse_work(self) -> float:
         """Return the operations of a factorisation by SuperLU, up to a factor."""
-        return float(np.sum(self._column_counts.astype(float) ** 2))
-
-    @cached_property
-    def _column_counts(self) -> Index:
-        """Number of entries of each column of SuperLU's L, from a matrix that needs no pivoting."""
-        values = np.full(self._entries, -1.0)
-        degree = np.bincount(self._full_rows, minlength=self.size)
-        values[self._full_source[self._full_rows == self._full_columns]] = (
-            degree
-        )
-        return np.diff(self._superlu(values, pivot_below=0.0).L.indptr)
+        return float(np.sum(self._ordered_columns.counts.astype(float) ** 2))
 
     def factorise(
         self,
@@ -495,7 +524,7 @@ class Factoriser:
                         partial(self.factorise, values, skew)
                     ),
                     accuracy=accuracy,
-                    last_rates=self._last_rates[skew.size > 0],
+                    last_rates={} if skew.size else self._last_rates,
                 )
         definite = (
             self._factorise_in_skyline(values, NONE, buffer=buffer)
@@ -504,19 +533,20 @@ class Factoriser:
         ) or self._factorise_definite(values)
         if not skew.size:
             # Without pivoting the factor of an indefinite matrix can be arbitrarily wrong.
-            return definite or _SparseFactor(
-                self._superlu(values, pivot_below=0.1), False
+            return definite or self._sparse_factor(
+                self._superlu(values, pivot_below=0.1), is_definite=False
             )
         if not definite:
             # Under friction the symmetric part is never definite: the pivots of the complete matrix
             # decide.
             lu = self._superlu(values, pivot_below=0.1, skew=skew)
-            return _SparseFactor(lu, _has_positive_pivots(lu))
+            return self._sparse_factor(lu, is_definite=_has_positive_pivots(lu))
 
         @cache
         def complete_factor() -> Factor:
-            return _SparseFactor(
-                self._superlu(values, pivot_below=1.0, skew=skew), True
+            return self._sparse_factor(
+                self._superlu(values, pivot_below=1.0, skew=skew),
+                is_definite=True,
             )
 
         return _RefinedFactor(
@@ -524,7 +554,7 @@ class Factoriser:
             self.complete_matrix(values, skew),
             factorise_complete=complete_factor,
             accuracy=accuracy,
-            last_rates=self._last_rates[skew.size > 0],
+            last_rates={},
         )
 
     def factorise_rounded(self, values: Array) -> Factor | None:
@@ -563,7 +593,7 @@ class Factoriser:
         if not self.is_banded:
             lu = self._superlu(values, pivot_below=0.0)
             return (
-                _SparseFactor(lu, positive_definite=True)
+                self._sparse_factor(lu, is_definite=True)
                 if _has_positive_pivots(lu)
                 else None
             )
@@ -724,17 +754,57 @@ class Factoriser:
         run_in_slices(run, count, threads=threads)
         return [factors[k] for k in range(count)]
 
-    def _sparse_matrix(self, entries: Array) -> sp.csc_array:
-        """Return the sparse matrix (k, k) of entries in the order of both triangles: the lower one,
-        then the strict upper one.
+    @cached_property
+    def _ordered_columns(self) -> _OrderedColumns:
+        """Structure for SuperLU, whose ordering is computed once, because it takes a quarter of the
+        time of a factorisation.
         """
-        places = self._full_rows, self._full_columns
-        return sp.csc_array((entries, places), shape=(self.size, self.size))
+        # Entries of a matrix that needs no row exchanges.
+        values = np.full(self._entries, -1.0)
+        degree = np.bincount(self._full_rows, minlength=self.size)
+        values[self._full_source[self._full_rows == self._full_columns]] = (
+            degree
+        )
+        lu = splu(
+            sp.csc_array(
+                (
+                    values[self._full_source],
+                    (self._full_rows, self._full_columns),
+                ),
+                shape=(self.size, self.size),
+            ),
+            permc_spec="MMD_AT_PLUS_A",
+            options={"SymmetricMode": True},
+            diag_pivot_thresh=0.0,
+        )
+        rank = lu.perm_c.astype(np.int64)
+        rows = rank[self._full_rows]
+        columns = rank[self._full_columns]
+        entries = np.lexsort((rows, columns))
+        starts = np.searchsorted(columns[entries], np.arange(self.size + 1))
+        return _OrderedColumns(
+            np.argsort(rank),
+            rank,
+            column_starts=starts.astype(np.int32),
+            rows=rows[entries].astype(np.int32),
+            entries=entries,
+            counts=np.diff(lu.L.indptr),
+        )
+
+    def _sparse_factor(self, lu: SuperLU, is_definite: bool) -> _SparseFactor:
+        """Return the factor of a factorisation by `_superlu`."""
+        columns = self._ordered_columns
+        return _SparseFactor(
+            lu,
+            columns.order,
+            columns.rank,
+            positive_definite=is_definite,
+        )
 
     def _superlu(
         self, values: Array, pivot_below: float, skew: Array = NONE
     ) -> SuperLU:
-        """Return the factorisation by SuperLU.
+        """Return the factorisation by SuperLU of the matrix in the order of `_ordered_columns`.
 
         Parameters
         ----------
@@ -753,10 +823,15 @@ class Factoriser:
         entries = values[self._full_source]
         if skew.size:
             entries += self._signs * skew[self._full_source]
+        columns = self._ordered_columns
+        matrix = sp.csc_array(
+            (entries[columns.entries], columns.rows, columns.column_starts),
+            shape=(self.size, self.size),
+        )
         try:
             return splu(
-                self._sparse_matrix(entries),
-                permc_spec="MMD_AT_PLUS_A",
+                matrix,
+                permc_spec="NATURAL",
                 options={"SymmetricMode": True},
                 diag_pivot_thresh=pivot_below,
             )
@@ -769,11 +844,11 @@ def _has_positive_pivots(lu: SuperLU) -> bool:
     return bool((lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all())
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=LARGEST_CACHED_ANALYSIS_COUNT)
 def _cached_analysis(
     pattern: SymmetricPattern, free: bytes, choice: Choice
 ) -> Factoriser:
-    """Return the analysis of a pattern, of which the last eight are cached; `free` are the bytes of
+    """Return the analysis of a pattern, of which the last ones are cached; `free` are the bytes of
     an array of int64.
     """
     return Factoriser(
