@@ -382,6 +382,7 @@ def view(options: ViewCommand) -> None:
     """
     from ..result.interactive_view import DEFAULT_FIELD, export_page
     from ..result.interactive_view import view_run as opened
+    from ..result.solve_progress import SolveProgress
 
     run = options.run_folder
     html = options.html
@@ -390,6 +391,8 @@ def view(options: ViewCommand) -> None:
         opened(run, field or DEFAULT_FIELD, experiment=options.experiment)
         return
     require_possible(html.parent)
-    typer.echo(
-        export_page(run, html, experiment=options.experiment, field=field)
-    )
+    with SolveProgress(error_console, activity="writing the page"):
+        page = export_page(
+            run, html, experiment=options.experiment, field=field
+        )
+    typer.echo(page)

@@ -67,11 +67,19 @@ class LiveEstimationOptions:
             from ..extras.live.live_recording import require_recordable
 
             require_recordable(self.rerun)
+        from ..result.solve_progress import SolveProgress
+
         budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
-        problem = read_problem(
-            recording, self.set_ or (), allow_code=self.allow_code
-        )
-        return LiveEstimator(problem, LiveOptions(budget_s, self.window_s))
+        with SolveProgress(
+            error_console,
+            quiet=getattr(self, "quiet", False),
+            activity=f"reading {recording}",
+        ) as progress:
+            problem = read_problem(
+                recording, self.set_ or (), allow_code=self.allow_code
+            )
+            progress.say("preparing the estimator")
+            return LiveEstimator(problem, LiveOptions(budget_s, self.window_s))
 
     @contextmanager
     def open_recording(
@@ -226,6 +234,7 @@ def replay(options: ReplayCommand) -> None:
         without_garbage_of_startup,
     )
     from ..extras.live.sources import update_as_json as json_line
+    from ..result.solve_progress import SolveProgress
 
     rate = options.rate
     film = options.film
@@ -255,4 +264,8 @@ def replay(options: ReplayCommand) -> None:
     else:
         print_result(live_display.final_display(updates, settled))
     if film is not None:
-        typer.echo(live_display.write_film(updates, film))
+        with SolveProgress(
+            error_console, quiet=options.quiet, activity="making the film"
+        ):
+            live_display.write_film(updates, film)
+        typer.echo(film)

@@ -186,8 +186,12 @@ class LogCommand:
 def log(options: LogCommand) -> None:
     """List the topics in a robot's log, their uses, and how a problem file names them."""
     from ..recording.formats.topics import list_topics
+    from ..result.solve_progress import SolveProgress
 
-    with located(options.log):
+    with (
+        SolveProgress(error_console, activity=f"reading {options.log}"),
+        located(options.log),
+    ):
         listed = list_topics(options.log)
     if options.as_json:
         typer.echo(as_json(listed))

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from ...common.array_types import Array
 from ...common.display import Shown, Table, millimetres
 from ...common.files import replaced_file
+from ...common.step_counting import StepUnit, complete_steps, counted_phase
 from ...errors import InputError
 from ...fem.laws.constants import unit_of
 from ...result.figure_style import (
@@ -172,12 +173,18 @@ def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
         1, round(len(t_s) / max(1.0, (t_s[-1] - t_s[0]) * FRAMES_A_SECOND))
     )
     writer = PillowWriter(fps=FRAMES_A_SECOND)
-    with replaced_file(path) as draft, writer.saving(figure, str(draft), DPI):
-        for stop in [*range(1, len(t_s), step), len(t_s)]:
+    stops = [*range(1, len(t_s), step), len(t_s)]
+    with (
+        replaced_file(path) as draft,
+        writer.saving(figure, str(draft), DPI),
+        counted_phase(StepUnit.FRAME, len(stops)),
+    ):
+        for stop in stops:
             for line, values in lines:
                 for part, each in zip(line, values, strict=True):
                     part.set_data(t_s[:stop], each[:stop])
             writer.grab_frame()
+            complete_steps(StepUnit.FRAME)
     return path
 
 

@@ -157,8 +157,9 @@ class DesignProgress(SolveProgress):
 
     def show_activity(self, what: str) -> None:
         """Show what is being computed, such as a stage of the design, with a hint at Ctrl-C; `what`
-        is a text.
+        is a text. The share of the previous stage is no longer shown.
         """
+        self.share(None)
         self.announce(f"{what} ({STOPPING})")
 
 
