@@ -97,7 +97,7 @@ def with_focal_lengths_times(factor: float) -> ExperimentChange:
 
 def with_mirrored_principal_point(depth: Depth) -> Depth:
     """Return the camera with its principal point counted from the opposite corner of the image."""
-    rows, columns = np.shape(depth.images_m[0])
+    rows, columns = np.shape(depth.images_m[0])  # type: ignore[arg-type]
     matrix = np.array(depth.camera.matrix)
     matrix[:2, 2] = [columns - 1, rows - 1] - matrix[:2, 2]
     return described(depth, matrix=matrix)
@@ -105,7 +105,7 @@ def with_mirrored_principal_point(depth: Depth) -> Depth:
 
 def with_ray_lengths(depth: Depth) -> Depth:
     """Return the camera with distances along the rays in place of depths along the optical axis."""
-    rows, columns = np.shape(depth.images_m[0])
+    rows, columns = np.shape(depth.images_m[0])  # type: ignore[arg-type]
     v, u = np.mgrid[:rows, :columns]
     pixels = np.column_stack([u.ravel(), v.ravel()]).astype(float)
     rays = depth.camera.points_at_unit_depth(pixels)

@@ -7,10 +7,11 @@ converter is checked against that form.
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields
-from typing import Annotated, Any, TypeVar, dataclass_transform, get_args
+from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_args
 
 from pydantic import PlainValidator, ValidatorFunctionWrapHandler, WrapValidator
 
@@ -46,11 +47,18 @@ class Key:
     constant: str | None = None
 
 
-def identity(value: Any) -> Any:
+def identity(value: T) -> T:
     """Return the value unchanged; converter of fields that are converted later, with more
     information.
     """
     return value
+
+
+def identity_or_none(value: T | None) -> T:
+    """Return the value unchanged; converter of fields that may be None until they are set with more
+    information.
+    """
+    return cast(T, value)
 
 
 def key(
@@ -99,6 +107,13 @@ def declaration(kind: type[T]) -> type[T]:
         On construction of an instance, if a value does not have the form of its field.
     """
     made: Any = dataclass(frozen=True, eq=False)(kind)
+    # The fields of a base have their accepted type already; the signature shows the stated one.
+    made.__init__.__annotations__ |= {
+        name: stated
+        for base in reversed(made.__mro__)
+        for name, stated in inspect.get_annotations(base).items()
+        if name in made.__init__.__annotations__
+    }
     for each in fields(made):
         each.type = _accepted_type(each)
     validate_arguments(made, _refusal)

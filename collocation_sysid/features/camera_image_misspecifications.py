@@ -440,7 +440,7 @@ class _ImageComparison:
             yield self._hypothesis(
                 "camera-matrix/size", image.with_matrix(resized), factor=factor
             )
-        matrix = image.camera.matrix
+        matrix = image.camera.require_matrix()
         centres = {
             "counted from the opposite corner of the image": size
             - matrix[:2, 2],

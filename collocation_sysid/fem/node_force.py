@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import casadi as ca
 import numpy as np
@@ -26,7 +26,9 @@ from .laws.constants import Constant, constant_named
 from .meshes.mesh import ElementNodes
 from .meshes.selection import Indices, Selection
 
-Law = Callable[..., Any]
+# Force or internal variables as a law returns them: a column, or its components.
+Column = ca.SX | Sequence[ca.SX | float]
+Law = Callable[..., Column | tuple[Column, Column]]
 On = Literal["nodes", "faces"]
 # A derivative counts as symmetric if its skew part is at most this fraction of its largest entry.
 SYMMETRY_TOLERANCE = 1e-9
@@ -254,8 +256,11 @@ class NodeForce:
             Constants by name.
         """
         if not self.internal_variable_count:
-            return _as_column(self.law(x, v, at, **named)), ca.SX.zeros(0)
-        force, after = self.law(x, v, before, at, **named)
+            force = cast(Column, self.law(x, v, at, **named))
+            return _as_column(force), ca.SX.zeros(0)
+        force, after = cast(
+            tuple[Column, Column], self.law(x, v, before, at, **named)
+        )
         return _as_column(force), _as_column(after)
 
     def input_size(self, dofs: int) -> int:
@@ -466,11 +471,11 @@ class LocatedForce:
         )
 
 
-def _as_column(values: Any) -> ca.SX:
+def _as_column(values: Column) -> ca.SX:
     """Return a list or a single expression as a column vector."""
-    return ca.SX(
-        ca.vertcat(*values) if isinstance(values, (list, tuple)) else values
-    )
+    if isinstance(values, (list, tuple)):
+        return ca.SX(ca.vertcat(*values))
+    return ca.SX(cast(ca.SX, values))
 
 
 def face_middle(values: ca.SX) -> ca.SX:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from ..common.array_types import Array
 from ..common.validated_classes import validated
@@ -65,7 +65,9 @@ class Continuation(MethodOptions):
     name: ClassVar[str] = "continuation"
 
     shares: Shares = SHARES
-    stage: Mapping[str, Any] | Callable[..., Any] = field(default_factory=dict)
+    stage: Mapping[str, object] | Callable[..., Solution] = field(
+        default_factory=dict
+    )
 
     def __post_init__(self) -> None:
         """Raise an `InputError` for invalid shares or a stage that is no method, see `method`."""
@@ -89,7 +91,7 @@ class Continuation(MethodOptions):
             raise InputError(
                 f"found {name!r}; {known}", None, where="stage.method"
             )
-        return method_from_options(STAGES[name], options, key="stage")
+        return method_from_options(STAGES[str(name)], options, key="stage")
 
     def __call__(
         self,

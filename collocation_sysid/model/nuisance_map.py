@@ -51,6 +51,7 @@ from ..recording.nuisance import (
     ZERO,
     Component,
     NuisanceRow,
+    RecordingQuantities,
     cayley_rotation,
 )
 from ..recording.obstacle import Obstacle
@@ -139,7 +140,7 @@ class NuisanceEntry:
 
 
 @dataclass(frozen=True, eq=False)
-class NuisanceMap:
+class NuisanceMap(RecordingQuantities):
     """Nuisance parameters φ of one experiment, and the quantities that depend on them.
 
     All methods take φ in prior standard deviations, all k of them unless an argument is described
@@ -155,14 +156,6 @@ class NuisanceMap:
         Prior standard deviations, in the units of the names.
     step_limits : (k,)
         Largest change of φ in one step of the solver; infinite for parameters that enter linearly.
-    interval_s : float
-        Time between samples.
-    duration_s : float
-        Duration of the recording.
-    gravity_m_s2 : (3,)
-        Gravity as stated.
-    pivot_m : (3,)
-        Pivot c of the rigid motion in the frame of the markers.
     grasp_pivot_m : (3,)
         Pivot c_h of the motion of the body in its grasp.
     declared_calibration : (A, 3)
@@ -170,8 +163,6 @@ class NuisanceMap:
         as stated.
     timed_loads : tuple of TimedLoad
         Loads with an estimated time, in the order of their parameters.
-    recorded_s : (float, float)
-        First and last time of the recording.
     strain_shifts_m : (G, 3)
         Displacement of the node of each grasp per unit of strain [m]; empty unless the experiment
         is a specimen without a mesh.
@@ -181,14 +172,9 @@ class NuisanceMap:
     names: tuple[str, ...]
     scales: Array
     step_limits: Array
-    interval_s: float
-    duration_s: float
-    gravity_m_s2: Array
-    pivot_m: Array
     grasp_pivot_m: Array
     declared_calibration: Array
     timed_loads: tuple[TimedLoad, ...]
-    recorded_s: tuple[float, float]
     strain_shifts_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
@@ -231,8 +217,8 @@ class NuisanceMap:
         ]
         grasped_nodes = prescribed_nodes(experiment.body_grasps)
         nuisance_map = cls(
-            entries,
-            tuple(
+            entries=entries,
+            names=tuple(
                 f"{scope.get(e.row.name, experiment.name)}: {e.label}"
                 for e in entries
             ),

@@ -524,7 +524,7 @@ class ProblemFile(Section):
     parameters : Parameters
         Constants of the model by name: {} or a guess for a constant to estimate, a number for a
         known one, or a tie to another constant.
-    experiment_defaults : mapping of name to Any
+    experiment_defaults : mapping of name to object
         Default keys of every [[experiment]] table; specimens get only the keys that they have.
     experiment : list of ExperimentSection or SpecimenSection
         At least one [[experiment]] table, one for each recording or specimen.
@@ -533,7 +533,7 @@ class ProblemFile(Section):
     title: str = ""
     object: ObjectSection
     parameters: Parameters
-    experiment_defaults: dict[str, Any] = Field(default_factory=dict)
+    experiment_defaults: dict[str, object] = Field(default_factory=dict)
     experiment: list[AnyExperimentSection] = Field(min_length=1)
     environment: EnvironmentSection = Field(default_factory=EnvironmentSection)
     transcription: TranscriptionSection = TranscriptionSection()

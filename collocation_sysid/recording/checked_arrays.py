@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,9 +55,24 @@ def float_converter(
     """Return a function that copies values to a read-only array; shape, name and finite are
     arguments of `read_only_floats`, whose errors the returned function raises.
     """
-    return lambda values: read_only_floats(
-        values, shape, name=name, finite=finite
-    )
+
+    def converted(values: ArrayLike) -> Array:
+        """Return a read-only copy of the values."""
+        return read_only_floats(values, shape, name=name, finite=finite)
+
+    return converted
+
+
+def unconverted(values: ArrayLike) -> Array:
+    """Return the values unchanged; converter of array fields that ``__post_init__`` converts with
+    more information.
+    """
+    return cast(Array, values)
+
+
+def unconverted_or_none(values: ArrayLike | None) -> Array | None:
+    """Return the values unchanged, like `unconverted`; None where the field may be None."""
+    return cast("Array | None", values)
 
 
 def read_only_tracks(

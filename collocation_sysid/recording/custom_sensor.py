@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
 import casadi as ca
 import numpy as np
@@ -18,10 +18,15 @@ from ..common.files import reason
 from ..common.schema_tables import Vector
 from ..common.validated_types import AtLeastOne, Positive, Text
 from ..errors import InputError
-from .checked_arrays import read_only_floats
+from .checked_arrays import read_only_floats, unconverted, unconverted_or_none
 from .poses import Frame
 from .sample_times import first_unordered_time
 from .separate_sensor import SeparateSensor
+
+# Values of a custom sensor as its function returns them.
+SensorValues = ca.SX | ca.DM | float | Sequence[ca.SX | ca.DM | float]
+# Quantity that a sensor does not have: None, although functions of sensors need no check for it.
+_ABSENT = cast(ca.SX, None)
 
 
 @dataclass(frozen=True)
@@ -39,12 +44,18 @@ class Look:
         origin; None for a sensor on points.
     """
 
-    t_s: Any
-    position_m: Any = None
-    velocity_m_s: Any = None
-    acceleration_m_s2: Any = None
-    force_n: Any = None
-    torque_nm: Any = None
+    t_s: ca.SX
+    position_m: ca.SX = _ABSENT
+    velocity_m_s: ca.SX = _ABSENT
+    acceleration_m_s2: ca.SX = _ABSENT
+    force_n: ca.SX = _ABSENT
+    torque_nm: ca.SX = _ABSENT
+
+
+def stack_values(values: SensorValues) -> ca.SX:
+    """Return the values of a custom sensor as a column; a matrix column after column."""
+    stacked = ca.vertcat(*values) if isinstance(values, Sequence) else values
+    return ca.vec(ca.SX(cast(ca.SX, stacked)))
 
 
 POINT_INPUTS = ("position_m", "velocity_m_s", "acceleration_m_s2")
@@ -100,11 +111,11 @@ class Gauge(SeparateSensor):
     noise_key: ClassVar[str] = "sigma of the readings"
 
     name: str
-    expression: Callable[..., Any]
-    t_s: ArrayLike
-    values: ArrayLike | None
+    expression: Callable[..., SensorValues]
+    t_s: Array = key(converter=unconverted)
+    values: Array | None = key(converter=unconverted_or_none)
     sigma: float = key(Positive)
-    points_m: ArrayLike = key(list[Vector], converter=identity, default=())
+    points_m: Array = key(list[Vector], converter=unconverted, default=())
     unknowns: Mapping[str, float] = key(
         dict[str, Positive], default_factory=dict
     )
@@ -119,10 +130,9 @@ class Gauge(SeparateSensor):
         """
         where = f"the reading '{self.name}'"
         vars(self)["unknowns"] = self.unknowns or {}
-        points = cast(Sequence[Any], self.points_m)
         times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
         points = read_only_floats(
-            points if len(points) else np.zeros((0, 3)),
+            self.points_m if len(self.points_m) else np.zeros((0, 3)),
             (None, 3),
             name=f"points_m of {where}",
         )
@@ -255,11 +265,7 @@ class Gauge(SeparateSensor):
         )
         if read is None:
             raise TypeError("the function returns None")
-        return ca.vec(
-            ca.SX(
-                ca.vertcat(*read) if isinstance(read, (list, tuple)) else read
-            )
-        )
+        return stack_values(read)
 
     def _count_of_values(self) -> int:
         """Evaluate the expression and its Jacobian at rest, and return the number m of its values.

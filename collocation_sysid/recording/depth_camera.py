@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Literal, cast
+from typing import ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,7 @@ from ..common.schema_tables import Vector
 from ..common.validated_types import Finite, Positive
 from ..errors import InputError
 from ..fem.meshes.selection import Selection
-from .checked_arrays import read_only_floats
+from .checked_arrays import read_only_floats, unconverted, unconverted_or_none
 from .node_selection import Nodes, selection_from_section
 from .poses import PoseSequence
 from .sample_times import first_unordered_time
@@ -34,13 +34,19 @@ UNDISTORTION_ITERATIONS = 12
 # Largest number of images of a recording whose outlines are compared: they are stored in memory,
 # and one of 640 x 480 pixels takes 1.2 MB.
 MOST_OUTLINE_IMAGES = 40
+# Usual distance to which points are thinned [m].
+SPACING_M = 0.004
+# Usual distance from the surface beyond which points belong to other objects [m].
+GATE_M = 0.01
+# Usual standard deviation of the distance of an outline from the edge of a silhouette [pixels].
+OUTLINE_SIGMA_PX = 0.5
 # Factor by which the distance of thinned points grows until there are few enough.
 SPACING_FACTOR = 1.2
 
 Background = Literal["auto", "empty", "unknown"]
 
 
-def _require_poses(poses: Any) -> PoseSequence:
+def _require_poses(poses: PoseSequence) -> PoseSequence:
     """Return `poses` unchanged; an `InputError` if it is no `PoseSequence`."""
     if not isinstance(poses, PoseSequence):
         raise InputError(
@@ -73,11 +79,13 @@ class DepthCamera:
         If the matrix is not that of a pinhole camera, or the pose is no rigid motion.
     """
 
-    matrix: Any = key(
-        tuple[Vector, Vector, Vector] | None, converter=identity, default=None
+    matrix: Array | None = key(
+        tuple[Vector, Vector, Vector] | None,
+        converter=unconverted_or_none,
+        default=None,
     )
-    distortion: Any = key(list[Finite], converter=identity, default=())
-    pose: Any = key(PoseMatrix | None, converter=identity, default=None)
+    distortion: Array = key(list[Finite], converter=unconverted, default=())
+    pose: Array = key(PoseMatrix | None, converter=unconverted, default=None)
     poses: PoseSequence | None = key(converter=_require_poses, default=None)
 
     def __post_init__(self) -> None:
@@ -119,6 +127,11 @@ class DepthCamera:
                 )
             vars(self)["matrix"] = matrix
 
+    def require_matrix(self) -> Array:
+        """Return the matrix (3, 3) of the camera, which must have one."""
+        assert self.matrix is not None
+        return self.matrix
+
     def pose_at(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Return rotations R (S, 3, 3) and translations p (S, 3) [m] from the camera's frame to the
         world, x = R X + p, at times (S,) [s]; the same for all times if the camera does not move.
@@ -145,9 +158,10 @@ class DepthCamera:
         Distortion is inverted by `UNDISTORTION_ITERATIONS` steps of a fixed-point iteration,
         without a check of convergence. The camera must have a matrix.
         """
-        distorted = np.linalg.solve(
-            self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T
-        ).T
+        rows = np.column_stack([pixels, np.ones(len(pixels))])
+        distorted = np.asarray(
+            np.linalg.solve(self.require_matrix(), rows.T).T, dtype=np.float64
+        )
         k1, k2, p1, p2, k3 = np.append(
             self.distortion, np.zeros(5 - len(self.distortion))
         )
@@ -183,23 +197,35 @@ class DepthCamera:
                 np.ones_like(x),
             ]
         )
-        return (self.matrix @ distorted)[:2].T
+        return (self.require_matrix() @ distorted)[:2].T
 
     def undistorted_pixels(self, points_m: Array) -> Array:
         """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, without
         distortion; points must have z > 0, and the camera a matrix.
         """
-        projected = points_m @ self.matrix.T
+        projected = points_m @ self.require_matrix().T
         return projected[:, :2] / projected[:, 2:]
 
 
-def _require_selection(faces: Any) -> Selection:
+def _require_selection(faces: Selection | None) -> Selection | None:
     """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
     if not isinstance(faces, Selection):
         raise InputError(
             f"faces of a depth camera is {faces!r}; expected a selection, such as cs.Named(…)"
         )
     return faces
+
+
+def _unconverted_clouds(clouds: Sequence[ArrayLike]) -> tuple[Array, ...]:
+    """Return the clouds unchanged, which `Depth` thins."""
+    return cast(tuple[Array, ...], clouds)
+
+
+def _unconverted_images(
+    images_m: Sequence[ArrayLike | None],
+) -> tuple[Array | None, ...]:
+    """Return the images unchanged, which `Depth` checks and converts."""
+    return cast(tuple[Array | None, ...], images_m)
 
 
 @declaration
@@ -253,12 +279,12 @@ class Depth(SeparateSensor):
     measures_shape: ClassVar[bool] = True
 
     name: str
-    t_s: Any
-    clouds: Sequence[Any]
+    t_s: Array = key(converter=unconverted)
+    clouds: tuple[Array, ...] = key(converter=_unconverted_clouds)
     sigma_m: float = key(Positive)
     camera: DepthCamera = key(converter=identity, default=DepthCamera())
-    spacing_m: float = key(Positive, default=0.004)
-    gate_m: float = key(Positive, default=0.01)
+    spacing_m: float = key(Positive, default=SPACING_M)
+    gate_m: float = key(Positive, default=GATE_M)
     faces: Selection | None = key(
         Nodes | None,
         converter=_require_selection,
@@ -266,8 +292,10 @@ class Depth(SeparateSensor):
         default=None,
     )
     background: Background = key(Background, default="auto")
-    outline_sigma_px: float = key(Positive, default=0.5)
-    images_m: Sequence[Any] = ()
+    outline_sigma_px: float = key(Positive, default=OUTLINE_SIGMA_PX)
+    images_m: tuple[Array | None, ...] = key(
+        converter=_unconverted_images, default=()
+    )
 
     def __post_init__(self) -> None:
         """Check the times, and thin the clouds in place, see `_thin_cloud`.
@@ -347,7 +375,12 @@ class Depth(SeparateSensor):
         camera: DepthCamera,
         sigma_m: float,
         t_s: ArrayLike = (0.0,),
-        **options: Any,
+        *,
+        spacing_m: float = SPACING_M,
+        gate_m: float = GATE_M,
+        faces: Selection | None = None,
+        background: Background = "auto",
+        outline_sigma_px: float = OUTLINE_SIGMA_PX,
     ) -> Depth:
         """Return the measurements of depth images [m] (S, rows, columns), or (rows, columns) for
         one.
@@ -366,8 +399,8 @@ class Depth(SeparateSensor):
             Standard deviation of the depth [m].
         t_s : (S,) array_like
             Times [s]; one time, 0, by default.
-        **options
-            Further fields of `Depth`; `images_m` is replaced.
+        spacing_m, gate_m, faces, background, outline_sigma_px
+            See `Depth`.
 
         Raises
         ------
@@ -378,11 +411,21 @@ class Depth(SeparateSensor):
         images = images[None] if images.ndim == 2 else images
         clouds = [points_from_image(image, camera) for image in images]
         outlined = samples_with_outlines(len(images))
-        options["images_m"] = [
-            image if k in outlined else None for k, image in enumerate(images)
-        ]
         return cls(
-            name, t_s, clouds=clouds, sigma_m=sigma_m, camera=camera, **options
+            name,
+            t_s,
+            clouds=clouds,
+            sigma_m=sigma_m,
+            camera=camera,
+            spacing_m=spacing_m,
+            gate_m=gate_m,
+            faces=faces,
+            background=background,
+            outline_sigma_px=outline_sigma_px,
+            images_m=[
+                image if k in outlined else None
+                for k, image in enumerate(images)
+            ],
         )
 
     def _thin_cloud(self, cloud: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
@@ -21,7 +21,7 @@ def usual_air_density() -> float:
     return USUAL_KG_M3
 
 
-def air_density(value: Any) -> float:
+def air_density(value: float | Literal["none"]) -> float:
     """Return a stated density of the air [kg/m³]; zero for "none", a vacuum.
 
     Raises

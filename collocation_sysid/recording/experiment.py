@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array, Index
-from ..common.declarations import declaration, identity, key
+from ..common.declarations import declaration, identity_or_none, key
 from ..common.schema_tables import Vector
 from ..common.validated_types import Flag, NotNegative
 from ..errors import InputError
@@ -128,7 +128,7 @@ class Experiment:
     body: Body
     t_s: Array = key(converter=float_converter((None,), "t_s"))
     grasps: tuple[Grasp, ...] = key(converter=tuple[Grasp, ...])
-    markers: Markers = key(converter=identity, default=None)
+    markers: Markers = key(converter=identity_or_none, default=None)
     gravity_m_s2: Array = key(
         Vector,
         converter=float_converter((3,), "gravity_m_s2"),

@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, Literal, Self, get_args
+from typing import TYPE_CHECKING, Literal, Self, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array, Index
-from ..common.declarations import declaration, identity, key
+from ..common.declarations import declaration, key
 from ..common.time_dependence import at_times
 from ..common.validated_types import Finite, NotNegative
 from ..errors import InputError
@@ -34,6 +34,11 @@ if TYPE_CHECKING:
 # Smallest singular value of a constrained rigid motion, relative to the largest: less is rounding.
 SMALLEST_SINGULAR_VALUE = 1e-6
 Axes = Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]
+
+
+def _unconverted_poses(poses: PoseSequence | ArrayLike) -> PoseSequence:
+    """Return the poses unchanged; matrices (T, 4, 4) are converted when their times are known."""
+    return cast(PoseSequence, poses)
 
 
 @declaration
@@ -81,9 +86,7 @@ class Grasp:
         converter=node_converter("the grasp"),
         read=selection_from_section,
     )
-    poses: PoseSequence = key(
-        converter=identity
-    )  # matrices stay until there are times
+    poses: PoseSequence = key(converter=_unconverted_poses)
     from_s: float = key(Finite | None, default=-np.inf)
     until_s: float = key(Finite | None, default=np.inf)
     sigma_m: float | None = key(NotNegative | None, default=None)

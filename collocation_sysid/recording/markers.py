@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array, Index
-from ..common.declarations import Key, declaration, identity, key
+from ..common.declarations import (
+    Key,
+    declaration,
+    identity,
+    identity_or_none,
+    key,
+)
 from ..common.time_dependence import over_time
 from ..common.validated_types import Positive
 from ..errors import InputError
@@ -86,7 +92,7 @@ class Markers:
     sigma_m: Array = key(converter=np.asarray)
     names: tuple[str, ...] = key(converter=tuple[str, ...], default=None)
     places_m: Array | None = key(converter=np.asarray, default=None)
-    placement: Placement = key(converter=identity, default=None)
+    placement: Placement = key(converter=identity_or_none, default=None)
     places_sigma_m: Array | None = key(converter=np.asarray, default=None)
     on_surface: bool = key(_PLACES, converter=bool, default=False)
     located: NDArray[np.bool_] = key(converter=np.asarray, default=None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -98,10 +98,10 @@ def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
         By the converter: if there are no nodes, or as `read_only_nodes` does.
     """
 
-    def chosen(selection: Any) -> Any:
+    def chosen(selection: ArrayLike | Selection) -> Index:
         """Return sorted distinct read-only node indices, or a `Selection` unchanged."""
         if isinstance(selection, Selection):
-            return selection
+            return cast(Index, selection)
         nodes = np.unique(
             read_only_nodes(selection, (None,), name=f"nodes of {what}")
         )

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
+from ..common.array_types import Array
 from ..errors import InputError, listed
 
 DEGREE = float(np.pi / 180)
@@ -65,6 +66,31 @@ READABLE_UNITS = {
     "kg": (1e3, " g"),
 }
 READABLE_UNITS |= {"N m": (1e3, " mN m"), "1": (1e2, " %"), "σ": (1.0, "")}
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingQuantities:
+    """Quantities of a recording on which nuisance parameters may depend.
+
+    Attributes
+    ----------
+    recorded_s : (float, float)
+        First and last time of the recording.
+    interval_s : float
+        Time between samples.
+    duration_s : float
+        Duration of the recording.
+    gravity_m_s2 : (3,)
+        Gravity as stated.
+    pivot_m : (3,)
+        Pivot c of the rigid motion in the frame of the markers.
+    """
+
+    recorded_s: tuple[float, float]
+    interval_s: float
+    duration_s: float
+    gravity_m_s2: Array
+    pivot_m: Array
 
 
 @dataclass(frozen=True)
@@ -128,6 +154,8 @@ class NuisanceRow:
         Standard deviation in the uncertainty budget where the parameter is not estimated.
     """
 
+    # Functions of an `Experiment`, which has nuisance parameters itself: the module of its class
+    # imports this one, so that their argument has no type here.
     name: str
     unit: str
     sigma: float | None
@@ -139,17 +167,19 @@ class NuisanceRow:
     of: Component = "recording"
     axes: str = ""
     changes: tuple[ModelPart, ...] = ("reading",)
-    applies: Callable[[Any], bool] = lambda experiment: True
-    applies_to: Callable[[Any, int], bool] = lambda experiment, index: True
+    applies: Callable[..., bool] = lambda experiment: True
+    applies_to: Callable[..., bool] = lambda experiment, index: True
     low: float = -np.inf
     high: float = np.inf
     reach: float = 1.0
-    step: Callable[[Any], float] | None = None
+    step: Callable[..., float] | None = None
     sentence: str = ""
     by: Literal["length", "worst", "each"] = "each"
-    same: Callable[[Any], dict[str, Any]] = lambda experiment: {}
-    reading: Callable[[Any, Any, Any, Any], Any] | None = None
-    clock: Callable[[Any, Any, Any], Any] | None = None
+    same: Callable[..., dict[str, object]] = lambda experiment: {}
+    reading: (
+        Callable[[ca.SX, ca.SX, ca.SX, RecordingQuantities], ca.SX] | None
+    ) = None
+    clock: Callable[[ca.SX, ca.SX, RecordingQuantities], ca.SX] | None = None
     considered: float | None = None
 
     def __post_init__(self) -> None:
@@ -203,7 +233,9 @@ def in_readable_unit(value: float, unit: str) -> tuple[float, str]:
     return factor * value, shown
 
 
-def _rotate_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
+def _rotate_position(
+    y: ca.SX, values: ca.SX, t_s: ca.SX, data: RecordingQuantities
+) -> ca.SX:
     """Return a marker's predicted position y (3,) [m], rotated by the rotation vector `values` (3,)
     [rad] about the pivot of `data`; the time is not used.
     """
@@ -211,14 +243,18 @@ def _rotate_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
     return cayley_rotation(values) @ (y - pivot) + pivot
 
 
-def _shift_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
+def _shift_position(
+    y: ca.SX, values: ca.SX, t_s: ca.SX, data: RecordingQuantities
+) -> ca.SX:
     """Return a marker's predicted position y (3,) [m] plus `values` (3,) [m]; time and data are not
     used.
     """
     return y + values
 
 
-def _distort_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
+def _distort_position(
+    y: ca.SX, values: ca.SX, t_s: ca.SX, data: RecordingQuantities
+) -> ca.SX:
     """Return a marker's predicted position y (3,) [m] with radial distortion of first order, with
     the coefficient `values` [1/m²], about the pivot of `data`; the time is not used.
     """
@@ -229,6 +265,11 @@ def _distort_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
 def _has_markers(experiment: Any) -> bool:
     """Return whether the experiment has a marker, also one without samples."""
     return bool(experiment.markers.names)
+
+
+def _has_tilt(experiment: Any, index: int) -> bool:
+    """Return whether the obstacle at this index of the grasps has a direction that may be tilted."""
+    return experiment.grasps[index].shape.has_tilt
 
 
 def _has_camera_matrix(experiment: Any, index: int) -> bool:
@@ -251,7 +292,7 @@ def _has_depth_outlines(experiment: Any) -> bool:
     return any(len(depth.images_m) for depth in experiment.depths)
 
 
-def _camera_sharing_key(experiment: Any) -> dict[str, Any]:
+def _camera_sharing_key(experiment: Any) -> dict[str, object]:
     """Return what must agree in recordings that share the pose of their depth cameras: the body
     (the same object), and the pose of each camera in order.
     """
@@ -284,7 +325,7 @@ def _largest_place_step_m(experiment: Any) -> float:
     return EDGES_A_STEP * float(experiment.body.mesh.quality().edge_mean_m)
 
 
-def _hand_eye_sharing_key(experiment: Any) -> dict[str, Any]:
+def _hand_eye_sharing_key(experiment: Any) -> dict[str, object]:
     """Return what must agree in recordings that share the hand–eye transform: the body (the same
     object), and the set of nodes in its grasps without obstacles.
     """
@@ -502,9 +543,7 @@ OBSTACLE_TILT = NuisanceRow(
     applies=lambda experiment: any(
         each.shape.has_tilt for each in experiment.obstacles
     ),
-    applies_to=lambda experiment, index: (
-        experiment.grasps[index].shape.has_tilt
-    ),
+    applies_to=_has_tilt,
     label="tilt of {which}, {axis}",
     sentence="tilt of an obstacle: {size}",
     description="a constant tilt of each obstacle that is a plane or a box, about the "
@@ -968,14 +1007,20 @@ class Nuisance:
         return row.sigma if row in self.own else getattr(self, row.name)
 
     @classmethod
-    def none(cls, **deviations: Any) -> Nuisance:
+    def none(
+        cls,
+        *,
+        scope: Mapping[str, str] | None = None,
+        own: Sequence[NuisanceRow] = (),
+        **deviations: float | None,
+    ) -> Nuisance:
         """Return a `Nuisance` that estimates only the fields given by name, with their standard
         deviations; all others are None and thus exact.
 
-        `scope` and `own` may be given, too; by default they are empty.
+        `scope` and `own` are those of `Nuisance`; by default they are empty.
         """
-        nothing: dict[str, Any] = {row.name: None for row in KINDS}
-        return Nuisance(**(nothing | deviations))
+        nothing = {row.name: None for row in KINDS}
+        return Nuisance(**(nothing | deviations), scope=scope or {}, own=own)
 
 
 def _check_custom_kind(row: NuisanceRow) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ..fem.body import Body
 
 
-def _require_solid(shape: Any) -> Solid:
+def _require_solid(shape: Solid) -> Solid:
     """Return `shape` unchanged; an `InputError` if it is no `Solid`."""
     if not isinstance(shape, Solid):
         kinds = ", ".join(kind.__name__ for kind in KINDS.values())
@@ -40,7 +40,7 @@ def _require_solid(shape: Any) -> Solid:
     return shape
 
 
-def _require_selection(faces: Any) -> Selection:
+def _require_selection(faces: Selection | None) -> Selection | None:
     """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
     if not isinstance(faces, Selection):
         raise InputError(

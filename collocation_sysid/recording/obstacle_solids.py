@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from itertools import product
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
 from ..common.declarations import declaration, key
@@ -64,13 +66,13 @@ class Solid(ABC):
         return np.zeros(3)
 
 
-def _unit_vector_converter(name: str) -> Any:
+def _unit_vector_converter(name: str) -> Callable[[ArrayLike], Array]:
     """Return a function that normalises a vector (3,) to unit length.
 
     It raises an `InputError` that begins with `name` for a zero vector or another shape.
     """
 
-    def made(value: Any) -> Array:
+    def made(value: ArrayLike) -> Array:
         """Return the normalised vector (3,)."""
         vector = float_converter((3,), name)(value)
         length = float(np.linalg.norm(vector))
@@ -162,7 +164,7 @@ class Sphere(Solid):
         return _length(point - ca.DM(self.centre_m)) - self.radius_m
 
 
-def _checked_ends(value: Any) -> Array:
+def _checked_ends(value: ArrayLike) -> Array:
     """Return the two ends (2, 3) of an axis [m] as a read-only array.
 
     Raises

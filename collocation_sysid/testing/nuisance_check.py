@@ -143,7 +143,7 @@ def _read(
     """
     argument = ca.DM(values)
     result = (
-        row.reading(ca.DM(y), argument, t_s, data)
+        row.reading(ca.DM(y), argument, t_s, data)  # type: ignore[arg-type]
         if row.reading
         else row.clock(argument, t_s, data)  # type: ignore[misc]
     )
@@ -173,7 +173,7 @@ def _check_reading(
     )
     symbol = ca.SX.sym("u", 3 + count)
     weights = check.rng.standard_normal(3)
-    expression = ca.SX(row.reading(symbol[:3], symbol[3:], t_s, data))
+    expression = ca.SX(row.reading(symbol[:3], symbol[3:], ca.SX(t_s), data))
     first = ca.jacobian(expression, symbol)
     second, _ = ca.hessian(ca.dot(ca.DM(weights), expression), symbol)
     derivatives = ca.Function(

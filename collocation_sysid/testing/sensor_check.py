@@ -17,7 +17,13 @@ from ..fem.meshes.mesh import TetMesh
 from ..fem.meshes.structured import box_mesh
 from ..problem.code_loader import CodeLoader
 from ..program.collocation import Collocation
-from ..recording.custom_sensor import GRASP_INPUTS, POINT_INPUTS, Gauge, Look
+from ..recording.custom_sensor import (
+    GRASP_INPUTS,
+    POINT_INPUTS,
+    Gauge,
+    Look,
+    stack_values,
+)
 from .program_derivatives import check_program
 from .property_check import PropertyCheck
 from .round_trip import check_pickling, check_problem_file
@@ -177,17 +183,12 @@ class SensorExpression:
         named = dict(
             zip(self.sensor.unknowns, map(float, unknowns), strict=True)
         )
-        at = Look(
-            self.t_s if t_s is None else t_s,
-            **dict(zip(self.make_inputs(), values, strict=True)),
-        )
-        reading = self.sensor.expression(at, **named)
-        column = (
-            ca.vertcat(*reading)
-            if isinstance(reading, list | tuple)
-            else reading
-        )
-        return np.ravel(ca.evalf(ca.SX(column)).full(), order="F")
+        inputs = dict(zip(self.make_inputs(), values, strict=True))
+        now_s = self.t_s if t_s is None else t_s
+        # Numbers in place of expressions.
+        at = Look(now_s, **inputs)  # type: ignore[arg-type]
+        reading = stack_values(self.sensor.expression(at, **named))
+        return ca.evalf(reading).full().ravel()
 
     @cached_property
     def automatic(self) -> ca.Function:

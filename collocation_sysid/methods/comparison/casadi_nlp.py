@@ -76,7 +76,7 @@ class CasadiSolver(MethodOptions):
     tolerance: Positive = 1e-8
     max_iterations: Count = 200
     max_time_s: Positive = 1e6
-    casadi: Mapping[str, Any] = field(default_factory=dict)
+    casadi: Mapping[str, object] = field(default_factory=dict)
 
     def __call__(
         self,
