@@ -178,6 +178,9 @@ class ReducedSearch:
     is_associated : bool
         Whether cameras of unknown position have been associated with trajectories of
         sufficient length.
+    ended_by_association : bool
+        Whether the last `minimise` ended because new correspondences changed the loss by more than
+        short steps did.
     indefinite_steps : int
         Time steps with an indefinite matrix at the best point.
     most_measurements : int
@@ -232,6 +235,7 @@ class ReducedSearch:
         self.reassociations = 0
         self.most_measurements = 0
         self.is_associated = True
+        self.ended_by_association = False
         self.reach = collocation.compute_reach_p()
         self.p: Array = collocation.guess_p
         self.trajectories: list[Any] | None = None
@@ -374,6 +378,7 @@ class ReducedSearch:
             accepted step; failed trials are only rejected.
         """
         assert self.trajectories is not None
+        self.ended_by_association = False
         tolerance = self.options.tolerance
         self.trust = min(self.options.trust, self.largest_trust)
         point = self._accept(
@@ -446,9 +451,9 @@ class ReducedSearch:
             ):
                 return Status.CONVERGED  # rounding keeps it from getting better
             if self.has_correspondences and length <= LEAST_DETERMINED_SHARE:
-                return (
-                    Status.CONVERGED
-                )  # the association changes the loss by more than such a step
+                # The association changes the loss by more than such a step.
+                self.ended_by_association = True
+                return Status.CONVERGED
             if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
                 return Status.STALLED
             self.trust = SHRINK * length

@@ -47,6 +47,12 @@ from .trajectory_sweeps import trajectory_positions
 
 # Misfits above this many standard deviations of the markers are worth a note.
 MISFIT = 3.0
+# Note on a search that ended because new correspondences changed the loss.
+ENDED_BY_ASSOCIATION = (
+    "the search ended where the loss jumps as measured points change to other parts of the surface: "
+    "other guesses may lead to other minima of similar loss, whose spread the intervals do not "
+    "contain; solve from a few guesses to see it"
+)
 
 
 @validated
@@ -124,6 +130,8 @@ class ReducedSpace(SearchOptions):
                 if status is Status.ITERATION_LIMIT:
                     break
             status = status or Status.CONVERGED
+            if search.ended_by_association:
+                recorder.notes.append(ENDED_BY_ASSOCIATION)
             message = status.sentence
         except SEARCH_ENDS as end:
             status, message = status_of_end(end)

@@ -26,9 +26,6 @@ EDGES_A_STEP = 2.0
 SAMPLES_A_STEP = 2.0
 # Shift of a depth camera in a step of the solver [m]: correspondences stay about the same.
 CAMERA_SHIFT_A_STEP_M = 0.02
-# Rotation of a depth camera in a step of the solver [rad]: a quarter of it, which the trust region
-# allows at first, moves points by less than that shift in bodies of usual size.
-CAMERA_TURN_A_STEP_RAD = 0.3
 
 Component = Literal[
     "recording",
@@ -722,8 +719,6 @@ DEPTH_TURN = NuisanceRow(
     applies=_has_depth_cameras,
     low=-4.0,
     high=4.0,
-    reach=UNLIMITED_REACH,
-    step=lambda experiment: CAMERA_TURN_A_STEP_RAD,
     by="length",
     label="turn of {which}, {axis}",
     sentence="rotation of a depth camera: {size}",
