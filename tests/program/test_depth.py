@@ -16,6 +16,7 @@ from kit.depth import (
     NOTHING,
     POSE,
     PROBLEM,
+    SHAPE,
     TRUTH,
     bar,
     fitted,
@@ -342,3 +343,28 @@ def test_a_dropout_is_a_cloud_without_points():
     assert [len(points) > 0 for points in depth.points_m] == [True, False]
     with pytest.raises(InputError, match="no point"):
         replace(depth, clouds=[seen[:0], seen[:0]])
+
+
+@pytest.mark.parametrize(("guess_pa", "is_best"), [(1e5, False), (1.5e5, True)])
+def test_a_search_that_ended_at_a_jump_of_the_loss_says_so(guess_pa, is_best):
+    """Few points from a camera whose stated pose is far off have several minima."""
+    pose = moved(
+        np.array([0.15, -0.09, 0.06]), np.array([0.012, 0.006, -0.009])
+    )
+    image = image_m() + NOISE_M * np.random.default_rng(2).normal(size=SHAPE)
+    depth = cs.Depth.of_images(
+        "front",
+        image,
+        cs.DepthCamera(MATRIX, pose=pose),
+        NOISE_M,
+        spacing_m=0.02,
+    )
+    unknown = TRUTH | {"young_pa": cs.Unknown(guess_pa)}
+    run = cs.run(cs.Problem([hanging((depth,))], unknown), seek_causes=False)
+    assert run.solution.status.converged
+    notes = [each for each in run.solution.notes if "the loss jumps" in each]
+    assert len(notes) == (0 if is_best else 1)
+    error = run.solution.parameters["young_pa"] / TRUTH["young_pa"] - 1
+    assert (abs(error) < 0.01) == is_best
+    # The worse minimum is not rated as a good answer.
+    assert is_best or run.trust.verdict != "good"
