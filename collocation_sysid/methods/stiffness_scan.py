@@ -441,13 +441,15 @@ def _residuals(iterate: ExperimentIterate) -> Array:
     """
     residuals = []
     slopes = []
-    for reading in iterate.segment.residuals:
+    predictions = iterate.linearise_fixed_motion()
+    for reading, (residual, slope) in zip(
+        iterate.segment.residuals, predictions, strict=True
+    ):
         rough = reading.rough_residuals(iterate.x, iterate.phi)
         if rough is not None:
             residuals.append(rough)
-            slopes.append(np.zeros((len(rough), len(iterate.phi))))
+            slopes.append(np.zeros((len(rough), slope.shape[-1])))
             continue
-        residual, slope = iterate.linearise_at_fixed_motion(reading)
         is_compared = reading.compared_with(
             len(iterate.observables[len(residuals)])
         )[: len(residual)]

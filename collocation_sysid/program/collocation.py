@@ -33,7 +33,7 @@ c_{e,t,i} / f_e    equations of motion: experiment e, grid time t from 0 (start 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -493,15 +493,10 @@ class Collocation:
         """
         updated = self._combine_parameters(p[: self.nq], phis)
         segments = _with_shared_associations(self.transcriptions, charts)
-        # Another object of the same fields, which were checked when self was made; a new one would
-        # build its transcriptions again.
-        other = object.__new__(type(self))
-        vars(other).update(
-            {each.name: getattr(self, each.name) for each in fields(self)}
+        other = replace(
+            self,
+            associations={s.experiment.name: s.association for s in segments},
         )
-        vars(other)["associations"] = {
-            s.experiment.name: s.association for s in segments
-        }
         # The same transcriptions, with the values that they have cached.
         vars(other)["transcriptions"] = segments
         return other, updated

@@ -18,7 +18,7 @@ from ..common.array_types import Array
 from ..fem.body import Linearisation
 from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.internal_variables import AnyHistory
-from .measurement_residual import MeasurementResidual, Observable
+from .measurement_residual import Observable
 from .observables import ObservedMotion, ReactionForces
 from .reactions.reaction_forces import reaction_vjp, reactions_at
 from .transcription import Transcription
@@ -195,35 +195,24 @@ class ExperimentIterate:
             For each measurement, residuals (s, G, 3) and derivatives (s, G, 3, k), also
             for sensors of reactions, with the reaction forces of the motion.
         """
-        return [
-            self.linearise_at_fixed_motion(reading)
-            for reading in self.segment.residuals
-        ]
-
-    def linearise_at_fixed_motion(
-        self, reading: MeasurementResidual
-    ) -> tuple[Array, Array]:
-        """Return the residuals (s, G, g) of one of the measurements and their derivatives
-        (s, G, g, k) by φ, at a motion that does not change.
-        """
-        values_and_slopes = reading.observable.linearise(
-            self._fixed_motion,
-            self.phi,
-            np.zeros(0, dtype=np.int64),
-            len(self.phi),
-        )
-        return reading.linearise(*values_and_slopes, self.phi, len(self.phi))
-
-    @cached_property
-    def _fixed_motion(self) -> ObservedMotion:
-        """The motion without changes, with its reaction forces if a measurement needs them."""
+        none = np.zeros(0, dtype=np.int64)
+        count = len(self.phi)
         reactions = None
         if any(r.observable.measures_reactions for r in self.segment.residuals):
             nothing = np.zeros((*self.reactions.reaction.shape, 0))
             reactions = replace(
                 self.reactions, reaction_by=nothing, position_by=nothing
             )
-        return ObservedMotion(self.x, reactions)
+        motion = ObservedMotion(self.x, reactions)
+        linearised = []
+        for reading in self.segment.residuals:
+            values_and_slopes = reading.observable.linearise(
+                motion, self.phi, none, count
+            )
+            linearised.append(
+                reading.linearise(*values_and_slopes, self.phi, count)
+            )
+        return linearised
 
     @cached_property
     def forces(self) -> Linearisation:

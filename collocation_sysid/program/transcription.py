@@ -121,17 +121,10 @@ class Transcription(MotionTranscription):
         its measurements.
 
         Cached values of the motion, which do not depend on the association, are shared with the
-        copy, as is the measurement model of markers whose association is the same.
+        copy.
         """
         other = replace(self, association=association)
         vars(other).update(cached_values(self, MotionTranscription))
-        before = self.association
-        if (
-            "markers" in vars(self)
-            and association.markers is before.markers
-            and association.clock_samples == before.clock_samples
-        ):
-            vars(other)["markers"] = self.markers
         return other
 
     def follow_estimates(

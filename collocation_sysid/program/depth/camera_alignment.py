@@ -367,9 +367,7 @@ def iterate_alignments(
             rotations=rotations,
             translations_m=translations_m,
         )
-        squares = np.einsum(
-            "bpi,bpi->bp", matched.distances_m, matched.distances_m
-        )
+        squares = np.sum(matched.distances_m**2, axis=2)
         counts = matched.is_facing.sum(axis=1)
         limited = np.minimum(squares / gate**2, 1.0) * matched.is_facing
         mismatches = np.where(
@@ -418,23 +416,18 @@ def _match_surface(
 ) -> _MatchedSurface:
     """Return the nearest cloud points of surface points `places` (P, 3) [m] with `normals` (P, 3),
     for camera errors of B rotations and translations (B, 3) [m].
-
-    Points that do not face the camera, which have no weight, get the first point of the cloud.
     """
     pivot = camera.pivot_m
     turns = rotations.as_matrix()
     moved = translations_m[:, None] + pivot
-    is_facing = np.ones((len(turns), len(places)), dtype=bool)
+    # Cloud points p are at R (p − c) + c + d: the surface looks for them in their own frame.
+    nearest = cloud.nearest((places - moved) @ turns + pivot)
+    arms_m = (cloud.points_m[nearest] - pivot) @ turns.swapaxes(1, 2)
+    is_facing = np.ones(nearest.shape, dtype=bool)
     if camera.depth.camera.matrix is not None:
         ways = (moved - (turns @ pivot)[:, None]) - places
-        cosines = np.einsum("pi,bpi->bp", normals, ways)
-        lengths = np.sqrt(np.einsum("bpi,bpi->bp", ways, ways))
-        is_facing = cosines > GRAZING * lengths
-    # Cloud points p are at R (p − c) + c + d: the surface looks for them in their own frame.
-    own_m = (places - moved) @ turns + pivot
-    nearest = np.zeros(is_facing.shape, dtype=np.int64)
-    nearest[is_facing] = cloud.nearest(own_m[is_facing])
-    arms_m = (cloud.points_m[nearest] - pivot) @ turns.swapaxes(1, 2)
+        cosines = np.sum(normals * ways, axis=2)
+        is_facing = cosines > GRAZING * np.linalg.norm(ways, axis=2)
     return _MatchedSurface(arms_m, arms_m + moved - places, is_facing=is_facing)
 
 
@@ -466,11 +459,12 @@ def _alignment_steps(
     """
     arms_m = matched.arms_m
     distances_m = matched.distances_m
-    along = np.empty((*weights.shape, 6))
-    along[..., :3] = _cross_products(arms_m, normals)
-    along[..., 3:] = normals
+    along = np.concatenate(
+        [np.cross(arms_m, normals), np.broadcast_to(normals, arms_m.shape)],
+        axis=2,
+    )
     along *= weights[..., None]
-    offsets = weights * np.einsum("pi,bpi->bp", normals, distances_m)
+    offsets = weights * np.sum(normals * distances_m, axis=2)
     matrices = along.swapaxes(1, 2) @ along
     slopes = np.einsum("bpk,bp->bk", along, offsets)
     # By a rotation vector ω a point moves by ω × r: the same sums of all three components.
@@ -484,7 +478,7 @@ def _alignment_steps(
     matrices[:, :3, 3:] += crossed
     matrices[:, 3:, :3] += crossed.swapaxes(1, 2)
     matrices[:, 3:, 3:] += total[:, None, None] * np.eye(3)
-    slopes[:, :3] += _cross_products(weighted, distances_m).sum(axis=1)
+    slopes[:, :3] += np.cross(weighted, distances_m).sum(axis=1)
     slopes[:, 3:] += np.einsum("bp,bpi->bi", factors, distances_m)
     matrices += np.diag(prior**2)
     slopes += prior**2 * errors
@@ -493,13 +487,6 @@ def _alignment_steps(
     return (
         -np.linalg.solve(scaled, (slopes / scales)[..., None])[..., 0] / scales
     )
-
-
-def _cross_products(first: Array, second: Array) -> Array:
-    """Return the cross products (…, 3) of vectors (…, 3), in less time than `np.cross`."""
-    a, b, c = np.moveaxis(first, -1, 0)
-    d, e, f = np.moveaxis(second, -1, 0)
-    return np.stack([b * f - c * e, c * d - a * f, a * e - b * d], axis=-1)
 
 
 def _cross_product_matrices(vectors: Array) -> Array:

@@ -103,16 +103,6 @@ class DepthCameraModel:
         return {}
 
     @cached_property
-    def alignments(self) -> list[Any]:
-        """Results of alignments with their shapes, the last ones; empty at first."""
-        return []
-
-    @cached_property
-    def nearest_pixels(self) -> dict[int, Any]:
-        """Nearest pixels that show something, by index of the image; empty at first."""
-        return {}
-
-    @cached_property
     def outline_expressions(self) -> dict[tuple[int, int], Any]:
         """Cache of the generated functions of its outline residuals, shared by all copies of the
         measurement model; empty at first.
@@ -144,14 +134,12 @@ class DepthCameraModel:
         pinhole = self.depth.camera.matrix is not None
         return [p / p[:, 2:] if pinhole else np.zeros_like(p) for p in clouds]
 
-    def share_stored_values(self, other: DepthCameraModel) -> None:
-        """Use what another model of the camera has stored of its images and alignments from now on,
-        if both have the same measured points.
+    def share_alignment_clouds(self, other: DepthCameraModel) -> None:
+        """Use the points for alignments of another model of the camera from now on, if both have the
+        same measured points.
         """
         if self.depth is other.depth:
             vars(self)["alignment_clouds"] = other.alignment_clouds
-            vars(self)["alignments"] = other.alignments
-            vars(self)["nearest_pixels"] = other.nearest_pixels
 
     def corrected_expression(
         self, point: ca.SX, ray: ca.SX, values: Mapping[NuisanceRow, ca.SX]

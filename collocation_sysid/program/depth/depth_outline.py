@@ -445,10 +445,7 @@ def _edges(
         is_nothing = (image_m > points.depth_m.max() + gate_m) | (
             np.isnan(image_m) & empty
         )
-        nearest_edges = _nearest_edges(
-            _nearest_other_pixels(camera_in, is_nothing, sample=sample),
-            points.pixels[is_beyond],
-        )
+        nearest_edges = _nearest_edges(is_nothing, points.pixels[is_beyond])
         edges[is_beyond] = nearest_edges.edges
         outwards[is_beyond] = nearest_edges.outwards
         is_beyond[is_beyond] = nearest_edges.exists
@@ -544,45 +541,27 @@ def _classify_pixels(
     return shown
 
 
-def _nearest_other_pixels(
-    camera: DepthCameraModel, nothing: NDArray[np.bool_], sample: int
-) -> Array | None:
-    """Return row and column (2, rows, columns) of the pixel nearest to each pixel that is not
-    `nothing` (rows, columns); None if all are.
-
-    The camera's model stores the result of each image, with `nothing`, which hardly changes.
-    """
-    stored = camera.nearest_pixels.get(sample)
-    if stored is not None and np.array_equal(stored[0], nothing):
-        return stored[1]
-    places = None
-    if not nothing.all():
-        # Of the smallest type, so that they take less memory than the image.
-        places = np.asarray(
-            distance_transform_edt(
-                nothing, return_distances=False, return_indices=True
-            )
-        ).astype(np.min_scalar_type(max(nothing.shape)))
-    camera.nearest_pixels[sample] = nothing, places
-    return places
-
-
-def _nearest_edges(places: Array | None, pixels: Array) -> _NearestEdges:
+def _nearest_edges(nothing: NDArray[np.bool_], pixels: Array) -> _NearestEdges:
     """Return the edges nearest to pixels (P, 2).
 
     Parameters
     ----------
-    places : (2, rows, columns) array or None
-        Result of `_nearest_other_pixels`.
+    nothing : (rows, columns) array of bool
+        Pixels of the image that show nothing, among them `pixels`.
     pixels : (P, 2) array
-        Pixels u, v that show nothing.
+        Pixels u, v.
     """
-    if places is None:
+    if nothing.all():
         return _NearestEdges(
             pixels,
             np.ones_like(pixels),
             exists=np.zeros(len(pixels), dtype=bool),
         )
+    places: Array = np.asarray(
+        distance_transform_edt(
+            nothing, return_distances=False, return_indices=True
+        )
+    )
     column, row = np.round(pixels).astype(np.int64).T
     nearest = places[::-1, row, column].T.astype(float)
     way = pixels - nearest

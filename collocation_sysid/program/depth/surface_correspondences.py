@@ -39,8 +39,6 @@ NARROWER = 0.8
 SAME = 0.2
 # Largest alignment in standard deviations of its prior; more belongs to something else.
 FARTHEST = 4.0
-# Number of alignments of a camera that are stored: more than a scan of the stiffness has.
-STORED_ALIGNMENTS = 40
 # Reasons for leaving points out, in the order in which they are tested.
 EXCLUSION_REASONS = (
     "far",
@@ -266,10 +264,10 @@ class SurfaceCorrespondences(Correspondences):
         )
 
     def with_camera(self, camera: DepthCameraModel) -> SurfaceCorrespondences:
-        """Return the same correspondences with another model of their camera, which uses the stored
-        values of the present one if both have the same measured points.
+        """Return the same correspondences with another model of their camera, which uses the points
+        for alignments of the present one if both have the same measured points.
         """
-        camera.share_stored_values(self.camera)
+        camera.share_alignment_clouds(self.camera)
         return replace(self, camera=camera)
 
     def is_aligned_with(self, shapes_m: Array, phi: Array) -> bool:
@@ -423,51 +421,12 @@ def _aligned_parameters(
     """
     first = camera.depth.find_first_sample_with_points()
     surface = VisibleSurface.from_body(body, camera.depth)
-    turn, shift_m = _alignment(camera, surface, x=shapes_m[first], image=first)
+    turn, shift_m = align_camera(
+        camera, surface, x=shapes_m[first], image=first
+    )
     moved = camera.with_pose(phi, turn, shift_m=shift_m)
     errors = np.abs(moved[camera.parameter_indices])
     return phi if errors.max(initial=0.0) > FARTHEST else moved
-
-
-def _alignment(
-    camera: DepthCameraModel, surface: VisibleSurface, x: Array, image: int
-) -> tuple[Array, Array]:
-    """Return the result of `align_camera` for a shape x (n, 3) [m], or a stored one of the same image
-    for a shape that differs by less than the share `SAME` of σ.
-
-    The scan of the stiffness and the searches that follow it align the camera with the same shapes.
-    """
-    for stored in camera.alignments:
-        if (
-            stored.image == image
-            and np.abs(stored.shape_m - x).max() < SAME * camera.depth.sigma_m
-        ):
-            return stored.rotation_vector, stored.shift_m
-    turn, shift_m = align_camera(camera, surface, x=x, image=image)
-    camera.alignments.append(
-        _StoredAlignment(image, x, rotation_vector=turn, shift_m=shift_m)
-    )
-    del camera.alignments[:-STORED_ALIGNMENTS]
-    return turn, shift_m
-
-
-class _StoredAlignment(NamedTuple):
-    """Alignment of a camera with a shape.
-
-    Attributes
-    ----------
-    image : int
-        Index of the image.
-    shape_m : (n, 3) array
-        Surface nodes [m].
-    rotation_vector, shift_m : (3,) arrays
-        Result of `align_camera` [rad], [m].
-    """
-
-    image: int
-    shape_m: Array
-    rotation_vector: Array
-    shift_m: Array
 
 
 class _NearestPoints(NamedTuple):
