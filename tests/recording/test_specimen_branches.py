@@ -125,6 +125,7 @@ def test_a_drift_is_explained_by_hysteresis_where_the_branches_differ(tmp_path):
     assert "hysteresis" not in concern.message
 
 
+@pytest.mark.long
 def test_a_solve_of_both_branches_names_hysteresis_and_of_one_does_not(
     tmp_path,
 ):

@@ -40,6 +40,7 @@ def folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.long
 def test_an_undetermined_parameter_is_stated_once(folder):
     outcome = run_command(
         "solve", folder / "problem.toml", "--out", folder / "run"
