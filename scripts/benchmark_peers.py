@@ -10,8 +10,9 @@ computing times: unlike elapsed times they do not depend on what else the machin
     python scripts/benchmark_peers.py
     python scripts/benchmark_peers.py --only reduced-space mujoco-sysid --out peers.md
 
-MuJoCo is required, because it simulates the recording: ``pip install mujoco``. Other tools are
-optional; a row of the table names those that are not installed.
+MuJoCo is required, because it simulates the recording: ``pip install 'mujoco[sysid]'``, whose extra
+its own candidates need. Other tools are optional; a row of the table names those that are not
+installed.
 """
 
 from __future__ import annotations
