@@ -74,11 +74,18 @@ def bar() -> Body:
 def camera_pose() -> Array:
     """Return the pose (4, 4) of a camera that looks at the bar from the side and from above."""
     optical_axis = (TARGET_M - EYE_M) / np.linalg.norm(TARGET_M - EYE_M)
+    return upright_pose(EYE_M, optical_axis)
+
+
+def upright_pose(eye_m: Array, optical_axis: Array) -> Array:
+    """Return the pose (4, 4) of a camera at `eye_m` (3,) [m] that looks along a unit vector (3,),
+    with its rows of pixels horizontal.
+    """
     right = np.cross(optical_axis, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3] = np.column_stack(
-        [right, np.cross(optical_axis, right), optical_axis, EYE_M]
+        [right, np.cross(optical_axis, right), optical_axis, eye_m]
     )
     return pose
 

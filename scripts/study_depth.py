@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from depth_twins import upright_pose
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
@@ -62,15 +63,8 @@ NUISANCE = cs.Nuisance.none(
 
 def camera(distance_m: float) -> cs.DepthCamera:
     """Return a camera that looks at the middle of the bar from a distance [m]."""
-    pose = np.eye(4)
     optical_axis = -VIEW_DIRECTION / np.linalg.norm(VIEW_DIRECTION)
-    right = np.cross(optical_axis, [0, 0, 1]) / np.linalg.norm(
-        np.cross(optical_axis, [0, 0, 1])
-    )
-    eye_m = CENTRE_M - distance_m * optical_axis
-    pose[:3] = np.column_stack(
-        [right, np.cross(optical_axis, right), optical_axis, eye_m]
-    )
+    pose = upright_pose(CENTRE_M - distance_m * optical_axis, optical_axis)
     return cs.DepthCamera(MATRIX, pose=pose)
 
 
@@ -240,14 +234,9 @@ def soft_experiment(depth: cs.Depth) -> cs.Experiment:
 
 def soft_camera(turn_rad: np.ndarray, shift_m: np.ndarray) -> cs.DepthCamera:
     """Return the camera of the soft bar, rotated about a point of the bar and shifted [rad, m]."""
-    pose = np.eye(4)
     optical_axis = -SOFT_VIEW_DIRECTION / np.linalg.norm(SOFT_VIEW_DIRECTION)
-    right = np.cross(optical_axis, [0, 0, 1]) / np.linalg.norm(
-        np.cross(optical_axis, [0, 0, 1])
-    )
-    eye_m = SOFT_CENTRE_M - SOFT_DISTANCE_M * optical_axis
-    pose[:3] = np.column_stack(
-        [right, np.cross(optical_axis, right), optical_axis, eye_m]
+    pose = upright_pose(
+        SOFT_CENTRE_M - SOFT_DISTANCE_M * optical_axis, optical_axis
     )
     rotation = Rotation.from_rotvec(turn_rad).as_matrix()
     pose[:3, :3] = rotation @ pose[:3, :3]

@@ -97,11 +97,12 @@ def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
     ) | dict.fromkeys(ROUTINE, significance_limit(solved_fit.changes))
     significant = [p for p in relaxed if p.is_beyond(limits[p.name])]
     with counted_phase(StepUnit.ASSUMPTION, len(significant)):
-        iterated = {}
-        for probe in significant:
-            iterated[probe.name] = _iterate_probe(
+        iterated = {
+            probe.name: _iterate_probe(
                 solved_fit, probe, limit=limits[probe.name]
             )
+            for probe in significant
+        }
     return (
         *(_with_significant_moves(each, limit) for each in parts),
         *(iterated.get(probe.name, probe) for probe in relaxed),
