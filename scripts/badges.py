@@ -12,6 +12,8 @@ import tomllib
 from pathlib import Path
 from urllib.parse import quote, urlsplit
 
+from script_arguments import require_no_arguments
+
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = "scripts/notebooks"
 NAMES = {
@@ -120,4 +122,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    require_no_arguments(__doc__)
     main()

@@ -4,12 +4,12 @@ A cube of foam is on a foot that moves to and fro, and a plate descends on a par
 compared with the same cube without the plate. Rounds of all cases alternate; the best processor times
 are compared.
 
-    python scripts/benchmark_contact.py [divisions] [steps] [rounds]
+    python scripts/benchmark_contact.py [--divisions 6] [--steps 30] [--rounds 7]
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 import time
 from collections.abc import Callable
 from functools import partial
@@ -137,4 +137,14 @@ def main(divisions: int = 6, steps: int = 30, rounds: int = 7) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--divisions", type=int, default=6, help="elements along an edge"
+    )
+    parser.add_argument("--steps", type=int, default=30)
+    parser.add_argument("--rounds", type=int, default=7)
+    options = parser.parse_args()
+    main(options.divisions, options.steps, options.rounds)

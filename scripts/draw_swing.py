@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from script_arguments import require_no_arguments
+
 from collocation_sysid import Problem, simulate
 from collocation_sysid.result.pictures import save_pictures, shapes_picture
 from collocation_sysid.result.replay import MotionRecord
@@ -28,4 +30,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    require_no_arguments(__doc__)
     main()

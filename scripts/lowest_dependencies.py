@@ -6,6 +6,8 @@ import re
 import tomllib
 from pathlib import Path
 
+from script_arguments import require_no_arguments
+
 PROJECT = Path(__file__).parents[1] / "pyproject.toml"
 
 
@@ -45,4 +47,5 @@ def project_pins() -> list[str]:
 
 
 if __name__ == "__main__":
+    require_no_arguments(__doc__)
     print("\n".join(project_pins()))

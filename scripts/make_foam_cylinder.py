@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from script_arguments import require_no_arguments
 from synthetic import Swing, prepare_experiment, simulate_tracks
 
 from collocation_sysid.fem.meshes.structured import cylinder_mesh
@@ -56,4 +57,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    require_no_arguments(__doc__)
     main()

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from script_arguments import require_no_arguments
 
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.problem import Problem
@@ -96,4 +97,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    require_no_arguments(__doc__)
     main()

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from script_arguments import require_no_arguments
 from synthetic import (
     Swing,
     exchanged,
@@ -107,4 +108,5 @@ def with_true_places(experiment: Experiment) -> Experiment:
 
 
 if __name__ == "__main__":
+    require_no_arguments(__doc__)
     main()

@@ -1,6 +1,6 @@
 """Make the mesh of problems/phantom_compression/whole_stroke.toml: an eighth of a cylinder.
 
-    python scripts/make_phantom_mesh.py [FILE.vtu] [coarse | fine]
+    python scripts/make_phantom_mesh.py [FILE.vtu] [--section coarse]
 
 Triangles of a radial section are rotated about the axis; between two angles each forms a wedge of
 three tetrahedra. The triangles are smaller near the edge that rolls onto the platen, and a diagonal
@@ -10,7 +10,7 @@ the side wall lies on the platen.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -107,13 +107,23 @@ def quarter_revolution(
 
 
 def main() -> None:
-    file = Path(sys.argv[1]) if len(sys.argv) > 1 else FILE
-    mesh = quarter_revolution(
-        *SECTIONS_MM[sys.argv[2] if len(sys.argv) > 2 else "shipped"]
+    """Write the mesh with the options of the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    mesh.write(file)
+    parser.add_argument("file", type=Path, nargs="?", default=FILE)
+    parser.add_argument(
+        "--section",
+        choices=sorted(SECTIONS_MM),
+        default="shipped",
+        help="size of the triangles",
+    )
+    options = parser.parse_args()
+    mesh = quarter_revolution(*SECTIONS_MM[options.section])
+    mesh.write(options.file)
     print(
-        f"{file}: {len(mesh.points_m)} nodes, {len(mesh.tetrahedra)} tetrahedra"
+        f"{options.file}: {len(mesh.points_m)} nodes, {len(mesh.tetrahedra)} tetrahedra"
     )
 
 

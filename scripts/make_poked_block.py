@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from script_arguments import require_no_arguments
 
 from collocation_sysid.common.files import write_text_file
 from collocation_sysid.fem.meshes.mesh import TetMesh
@@ -100,4 +101,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    require_no_arguments(__doc__)
     main()

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from script_arguments import require_no_arguments
 
 from collocation_sysid.common.array_types import Array
 from collocation_sysid.common.files import write_text_file
@@ -176,5 +177,6 @@ KINDS = {
 }
 
 if __name__ == "__main__":
+    require_no_arguments(__doc__)
     for kind, write in KINDS.items():
         write(TEMPLATES / kind)

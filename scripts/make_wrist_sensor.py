@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from script_arguments import require_no_arguments
 from synthetic import Swing
 
 from collocation_sysid.fem.meshes.structured import box_mesh
@@ -86,4 +87,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    require_no_arguments(__doc__)
     main()

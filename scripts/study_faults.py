@@ -323,7 +323,7 @@ def simulated(experiment: Experiment) -> Experiment:
 
 
 def with_stated_sigma(factor: float) -> Callable[..., TrueAndStated]:
-    """Return a fault by which the stated sigma_m is `factor` times the truth."""
+    """Return a fault by which the stated sigma_m is `factor` times the true value."""
 
     def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
         markers = experiment.markers
@@ -354,13 +354,13 @@ def misplaced(experiment: Experiment, rng: Generator) -> TrueAndStated:
 
 
 def unplaced(experiment: Experiment, rng: Generator) -> TrueAndStated:
-    """Return a description in which the places of the markers are unknown."""
+    """Return a description in which the positions of the markers are unknown."""
     places_m = np.full((len(experiment.markers.names), 3), np.nan)
     return experiment, at_places(experiment, places_m)
 
 
 def at_places(experiment: Experiment, places_m: Array) -> Experiment:
-    """Return the experiment with markers at other places (M, 3) on the body [m]; NaN if unknown."""
+    """Return the experiment with markers at other positions (M, 3) on the body [m]; NaN if unknown."""
     markers = replace(
         experiment.markers,
         placement=None,
@@ -416,15 +416,15 @@ FAULTS: dict[str, Callable[[Experiment, Generator], TrueAndStated]] = {
     "none": without_fault,
     "clock 2 ms late": late(0.002),
     "poses 0.5 mm, 0.3°, given": noisy_poses(5e-4, 0.3, is_stated=True),
-    "poses 0.5 mm, 0.3°, judged": noisy_poses(5e-4, 0.3, is_stated=False),
+    "poses 0.5 mm, 0.3°, estimated": noisy_poses(5e-4, 0.3, is_stated=False),
     "poses 0.1 mm, 0.06°, given": noisy_poses(1e-4, 0.06, is_stated=True),
-    "poses 0.1 mm, 0.06°, judged": noisy_poses(1e-4, 0.06, is_stated=False),
+    "poses 0.1 mm, 0.06°, estimated": noisy_poses(1e-4, 0.06, is_stated=False),
     "gravity 1°": tilted,
-    "in the gripper 1 mm, 0.5°": misplaced_in_gripper,
-    "sigma_m 0.3 of the truth": with_stated_sigma(0.3),
+    "pose in the gripper 1 mm, 0.5°": misplaced_in_gripper,
+    "sigma_m 0.3 of the true value": with_stated_sigma(0.3),
     "one marker 3 times as noisy": with_noisy_marker,
-    "places 1 mm": misplaced,
-    "places not known": unplaced,
+    "marker positions 1 mm": misplaced,
+    "marker positions unknown": unplaced,
 } | {fault: draw_assumption_errors(names) for fault, names in ASSUMED.items()}
 
 

@@ -1,6 +1,6 @@
 """Coverage of intervals for noise and discretisation, for twins of a finer mesh and time step.
 
-    python scripts/study_refinement.py [twins of each body] [first seed]
+    python scripts/study_refinement.py [--twins 20] [--first 0]
 
 A block of linear and a bar of quadratic elements are moved at random. Their markers are simulated
 with random parameters, with every tetrahedron divided into 64 and a quarter of the time step, and
@@ -10,7 +10,7 @@ intervals that contain the truth: for independent noise alone, and with the nume
 
 from __future__ import annotations
 
-import sys
+import argparse
 from dataclasses import replace
 
 import numpy as np
@@ -167,4 +167,11 @@ def main(twins: int = 20, first: int = 0) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--twins", type=int, default=20, help="of each body")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    options = parser.parse_args()
+    main(options.twins, options.first)

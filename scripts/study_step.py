@@ -1,6 +1,6 @@
 """Coverage of intervals for noise and time step, with one step per sample and with the chosen number.
 
-    python scripts/study_step.py [twins of each body and noise] [first seed]
+    python scripts/study_step.py [--twins 20] [--first 0]
 
 The bodies of `study_refinement` are simulated on the mesh of the fit by Newmark's scheme with a
 sixteenth of the sampling interval, and with noise of 0.05, 0.2 or 1 mm.
@@ -8,7 +8,7 @@ sixteenth of the sampling interval, and with noise of 0.05, 0.2 or 1 mm.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections import Counter
 from dataclasses import replace
 
@@ -104,4 +104,13 @@ def _interval_with_step(
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--twins", type=int, default=20, help="of each body and noise"
+    )
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    options = parser.parse_args()
+    main(options.twins, options.first)

@@ -249,7 +249,7 @@ def test_faults_are_as_large_as_they_are_called():
         5e-4, rel=0.2
     )
     assert noisy.grasps[0].sigma_rad == pytest.approx(np.radians(0.3))
-    moved, _ = study_faults.FAULTS["places 1 mm"](measured, rng)
+    moved, _ = study_faults.FAULTS["marker positions 1 mm"](measured, rng)
     offsets = moved.markers.positions_m - before
     assert np.linalg.norm(offsets, axis=2).mean() == pytest.approx(
         1.6e-3, rel=0.4

@@ -27,10 +27,10 @@ COMMANDS = (
     "study_methods --starts 1 --methods reduced-space --workers 1",
     "study_mismatch --schemes midpoint --substeps 1",
     "study_mistakes --groups tracks --only wxyz --seeds 1",
-    "study_refinement 1",
+    "study_refinement --twins 1",
     "study_specimen_coverage --twins 2 --case 0",
     "study_starts --starts 1 --bodies cylinder",
-    "study_step 1",
+    "study_step --twins 1",
     "study_table1 --methods reduced-space",
     "study_trust --twins 1 --faulty 1 --only none",
     "study_wrench --twins 2",
@@ -58,3 +58,15 @@ def test_a_study_or_benchmark_runs_to_its_end(command: str, tmp_path: Path):
     )
     assert finished.returncode == 0, finished.stderr
     assert finished.stdout.strip()
+
+
+def test_every_script_prints_a_help_text():
+    """Without it, `--help` would run a script that writes files."""
+    without_help = [
+        file.name
+        for file in SCRIPTS.glob("*.py")
+        if "__main__" in (text := file.read_text(encoding="utf-8"))
+        and "ArgumentParser" not in text
+        and "require_no_arguments" not in text
+    ]
+    assert not without_help
