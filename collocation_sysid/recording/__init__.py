@@ -30,7 +30,8 @@ selections.
 
 from .alignment import align as align
 from .custom_sensor import Gauge as Gauge
-from .custom_sensor import Look as Look
+from .custom_sensor import GraspQuantities as GraspQuantities
+from .custom_sensor import PointQuantities as PointQuantities
 from .depth_camera import Depth as Depth
 from .depth_camera import DepthCamera as DepthCamera
 from .depth_camera import depth_image as depth_image

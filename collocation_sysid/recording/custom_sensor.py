@@ -25,31 +25,46 @@ from .separate_sensor import SeparateSensor
 
 # Values of a custom sensor as its function returns them.
 SensorValues = ca.SX | ca.DM | float | Sequence[ca.SX | ca.DM | float]
-# Quantity that a sensor does not have: None, although functions of sensors need no check for it.
-_ABSENT = cast(ca.SX, None)
 
 
 @dataclass(frozen=True)
-class Look:
-    """Quantities that a custom sensor may measure, as CasADi expressions at the time of a sample.
+class PointQuantities:
+    """Motion of the points of a custom sensor at the time of a sample, for its prediction.
+
+    They are CasADi expressions, or numbers where a sensor is checked.
 
     Attributes
     ----------
     t_s : expression
         Time of the sample.
     position_m, velocity_m_s, acceleration_m_s2 : (3, P) expressions
-        Of the sensor's points; None for a sensor at a grasp.
-    force_n, torque_nm : (3,) expressions
-        Force and torque that the grasp exerts on the body, in the sensor's frame and about its
-        origin; None for a sensor on points.
+        Motion of the P points in the world, one column per point.
     """
 
     t_s: ca.SX
-    position_m: ca.SX = _ABSENT
-    velocity_m_s: ca.SX = _ABSENT
-    acceleration_m_s2: ca.SX = _ABSENT
-    force_n: ca.SX = _ABSENT
-    torque_nm: ca.SX = _ABSENT
+    position_m: ca.SX
+    velocity_m_s: ca.SX
+    acceleration_m_s2: ca.SX
+
+
+@dataclass(frozen=True)
+class GraspQuantities:
+    """Force and torque of the grasp of a custom sensor at the time of a sample, for its prediction.
+
+    They are CasADi expressions, or numbers where a sensor is checked.
+
+    Attributes
+    ----------
+    t_s : expression
+        Time of the sample.
+    force_n, torque_nm : (3,) expressions
+        Force and torque that the grasp exerts on the body, in the sensor's frame and about its
+        origin.
+    """
+
+    t_s: ca.SX
+    force_n: ca.SX
+    torque_nm: ca.SX
 
 
 def stack_values(values: SensorValues) -> ca.SX:
@@ -70,9 +85,9 @@ class Gauge(SeparateSensor):
     ----------
     name : str
     expression : callable
-        ``expression(at, **unknowns) -> numbers``, of `Look` and of the sensor's unknowns, in CasADi
-        operations; one number, or a column of m. It must be smooth, as ``ca.tanh`` is in contrast
-        to ``ca.fmin``.
+        ``expression(at, **unknowns) -> numbers``, of `PointQuantities` or, for a sensor at a grasp,
+        `GraspQuantities`, and of the sensor's unknowns, in CasADi operations; one number, or a
+        column of m. It must be smooth, as ``ca.tanh`` is in contrast to ``ca.fmin``.
     t_s : (S,) array
         Sample times, ascending, at any rate; samples outside the times of the experiment are
         ignored, and their predictions are NaN.
@@ -258,8 +273,8 @@ class Gauge(SeparateSensor):
         (m,) SX
             Predicted numbers.
         """
-        names = POINT_INPUTS if self.grasp is None else GRASP_INPUTS
-        at = Look(t_s, **dict(zip(names, inputs, strict=True)))
+        quantities = PointQuantities if self.grasp is None else GraspQuantities
+        at = quantities(t_s, *inputs)
         read = self.expression(
             at, **dict(zip(self.unknowns, unknowns, strict=True))
         )

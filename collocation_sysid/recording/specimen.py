@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..fem.body import Body
 from ..fem.laws.materials import DampingLaw, Energy, Material, Prony
 from .checked_arrays import float_converter
-from .custom_sensor import Gauge, Look
+from .custom_sensor import Gauge, GraspQuantities, PointQuantities
 from .experiment import Experiment
 from .grasp import Grasp
 from .homogeneous_deformation import (
@@ -392,7 +392,7 @@ class NominalStress:
 
     def __call__(
         self,
-        at: Look,
+        at: GraspQuantities,
         area_error: ca.SX | float = 0.0,
         stress_zero_pa: ca.SX | float = 0.0,
     ) -> ca.SX:
@@ -401,8 +401,8 @@ class NominalStress:
 
         Parameters
         ----------
-        at : Look
-            Has the force [N].
+        at : GraspQuantities
+            Force of the grasp [N].
         area_error : SX or float
             Relative error of the area: stated smaller than it is by this share.
         stress_zero_pa : SX or float
@@ -424,7 +424,7 @@ class LateralStretch:
     def __init__(self, axis: int) -> None:
         self.axis = axis
 
-    def __call__(self, at: Look) -> ca.SX:
+    def __call__(self, at: PointQuantities) -> ca.SX:
         """Return the stretch along the axis: the coordinate of the first point of `at` over the
         size of the cell.
         """

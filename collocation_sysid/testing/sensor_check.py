@@ -21,7 +21,8 @@ from ..recording.custom_sensor import (
     GRASP_INPUTS,
     POINT_INPUTS,
     Gauge,
-    Look,
+    GraspQuantities,
+    PointQuantities,
     stack_values,
 )
 from .program_derivatives import check_program
@@ -183,10 +184,12 @@ class SensorExpression:
         named = dict(
             zip(self.sensor.unknowns, map(float, unknowns), strict=True)
         )
-        inputs = dict(zip(self.make_inputs(), values, strict=True))
+        quantities = (
+            PointQuantities if self.sensor.grasp is None else GraspQuantities
+        )
         now_s = self.t_s if t_s is None else t_s
         # Numbers in place of expressions.
-        at = Look(now_s, **inputs)  # type: ignore[arg-type]
+        at = quantities(now_s, *values)  # type: ignore[arg-type]
         reading = stack_values(self.sensor.expression(at, **named))
         return ca.evalf(reading).full().ravel()
 

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from collocation_sysid.program.simulation import with_readings
-from collocation_sysid.recording import Experiment, Gauge, Look
+from collocation_sysid.recording import Experiment, Gauge, PointQuantities
 
 LOW_M = [[0.05, 0.05, 0.01]]
 
@@ -16,12 +16,12 @@ LOW_M = [[0.05, 0.05, 0.01]]
 ENDS_M = [[0.0, 0.0, 0.02], [0.0, 0.0, 0.08]]
 
 
-def specific_force(at: Look, bias_m_s2):
+def specific_force(at: PointQuantities, bias_m_s2):
     """Three axes of the world, its bias along z not known."""
     return at.acceleration_m_s2[:, 0] + ca.vertcat(0, 0, 9.81 + bias_m_s2)
 
 
-def strain(at: Look, scale):
+def strain(at: PointQuantities, scale):
     """Of the way between two points, with a factor that is not known."""
     way = at.position_m[:, 1] - at.position_m[:, 0]
     return (1 + scale) * (ca.norm_2(way) / 0.06 - 1)

@@ -34,7 +34,14 @@ from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_readings
-from collocation_sysid.recording import Experiment, Gauge, Look, Markers, Wrench
+from collocation_sysid.recording import (
+    Experiment,
+    Gauge,
+    GraspQuantities,
+    Markers,
+    PointQuantities,
+    Wrench,
+)
 from collocation_sysid.result.pictures.album import (
     experiment_pictures as album_pictures,
 )
@@ -43,12 +50,12 @@ from collocation_sysid.result.replay import read_run
 from collocation_sysid.runs.solving import solve
 
 
-def pull(at: Look, gain):
+def pull(at: GraspQuantities, gain):
     """One axis of a load cell between the clamp and the robot, its gain not known."""
     return (1 + gain) * at.force_n[2]
 
 
-def speed(at: Look):
+def speed(at: PointQuantities):
     return ca.norm_2(at.velocity_m_s)
 
 

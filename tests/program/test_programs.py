@@ -340,7 +340,7 @@ def clamp(**changes) -> Collocation:
     return program(replace(cube, readings=[cell]), **changes)
 
 
-def bent(at: cs.Look, gain):
+def bent(at: cs.GraspQuantities, gain):
     """Curved in all that it looks at."""
     return ca.vertcat(
         gain + at.force_n[2] ** 2, (1 + gain) * at.torque_nm[0] * at.force_n[1]
