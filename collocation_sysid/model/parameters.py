@@ -784,6 +784,33 @@ class Parameters:
             )
         )
 
+    def with_estimates(self, values: Mapping[str, float]) -> Parameters:
+        """Return these parameters with estimates of an earlier search as guesses, limited to their
+        bounds.
+
+        An estimate at a bound may exceed it by rounding, because the search uses logarithms, or by
+        more if the bounds have changed.
+
+        Parameters
+        ----------
+        values : mapping of name to float
+            Estimates in SI units, as in `with_guess`.
+
+        Raises
+        ------
+        InputError
+            For a name that does not exist.
+        """
+        free = {item.name: item for item in self.free}
+        return self.with_guess(
+            {
+                name: float(np.clip(value, free[name].lower, free[name].upper))
+                if name in free
+                else value
+                for name, value in values.items()
+            }
+        )
+
     def with_fixed(self, values: Mapping[str, float]) -> Parameters:
         """Return these parameters with some of them fixed at given values; a fixed one loses its
         prior, its bounds and its tie to another.

@@ -239,7 +239,7 @@ class ParameterSliders:
             by_name[name],
             segment=segment,
             phi=phi,
-            parameters=run.solution.collocation.parameters.with_guess(
+            parameters=run.solution.collocation.parameters.with_estimates(
                 {
                     each.name: run.solution.parameters[each.name]
                     for each in run.solution.collocation.parameters.free
@@ -254,7 +254,7 @@ class ParameterSliders:
         at the optimum.
         """
         chosen = {name: each.value for name, each in self.sliders.items()}
-        return self._parameters.with_guess(chosen).guesses
+        return self._parameters.with_estimates(chosen).guesses
 
     def reset(self, _: object = None) -> None:
         """Set all sliders to the estimates, and simulate once; the argument, the button that was

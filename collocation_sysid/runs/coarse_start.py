@@ -101,14 +101,12 @@ class CoarseStart:
         parameters = solution.collocation.parameters
         estimates = solution.parameters
         values = {
-            item.name: float(
-                np.clip(estimates[item.name], item.lower, item.upper)
-            )
+            item.name: estimates[item.name]
             for item in parameters.free
             if item.name not in undetermined
         }
         return replace(
-            problem.collocation(), parameters=parameters.with_guess(values)
+            problem.collocation(), parameters=parameters.with_estimates(values)
         )
 
     def variables(self, collocation: Collocation, solution: Solution) -> Array:

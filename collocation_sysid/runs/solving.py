@@ -734,7 +734,7 @@ def second_start_parameters(solution: Solution) -> Parameters | None:
         not free[n].lower < v < free[n].upper for n, v in changed.items()
     ):
         return None
-    return collocation.parameters.with_guess(
+    return collocation.parameters.with_estimates(
         {name: values[name] for name in free} | changed
     )
 

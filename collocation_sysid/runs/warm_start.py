@@ -148,19 +148,17 @@ class WarmStart:
             If no estimated parameter has a name among the values.
         """
         free = problem.parameters.free
-        known = {i: self.values[i.name] for i in free if i.name in self.values}
+        known = {
+            i.name: self.values[i.name] for i in free if i.name in self.values
+        }
         if not known:
             raise InputError(
                 f"found the parameters {', '.join(self.values)}; expected at least one of those that are "
                 f"estimated, {', '.join(i.name for i in problem.parameters.free_scalars)}",
                 self.folder / RESULT_FILE,
             )
-        guesses = {
-            i.name: float(np.clip(value, i.lower, i.upper))
-            for i, value in known.items()
-        }
         return replace(
-            problem, parameters=problem.parameters.with_guess(guesses)
+            problem, parameters=problem.parameters.with_estimates(known)
         )
 
     def apply_to_places(self, collocation: Collocation) -> Collocation:

@@ -58,3 +58,22 @@ def test_the_better_of_two_answers_counts():
     assert better.parameters["poisson"] == pytest.approx(
         first.parameters["poisson"], rel=1e-3
     )
+
+
+def test_a_second_start_keeps_a_parameter_at_its_bound():
+    """An estimate at a bound may be beyond it by rounding, as exp(ln 5) is below 5."""
+    swung = hung_cube()
+    tracks_m = cs.simulate(swung, TRUTH, "midpoint", substeps=1).markers_m
+    estimated = {
+        "young_pa": cs.Unknown(TRUTH["young_pa"]),
+        "poisson": cs.Unknown(TRUTH["poisson"]),
+        "gamma_m_1_s": cs.Unknown(6.0, lower=5.0, upper=100.0),
+    }
+    first = cs.solve(
+        cs.Problem([cs.with_markers(swung, tracks_m)], {**TRUTH, **estimated})
+    )
+    assert first.parameters["gamma_m_1_s"] == pytest.approx(5.0)
+    assert first.parameters["poisson"] > NEARLY_INCOMPRESSIBLE
+    start = second_start_parameters(first)
+    assert start is not None
+    assert start.guesses["gamma_m_1_s"] == pytest.approx(5.0)

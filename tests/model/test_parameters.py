@@ -576,6 +576,13 @@ def test_with_guess_refuses_unknown_names_and_values_out_of_bounds():
         MIXED.with_guess({"young_pa": 1.0})
 
 
+def test_estimates_beyond_the_bounds_start_at_the_bounds():
+    below = 10.0 * (1 - 1e-15)
+    assert MIXED.with_estimates({"young_pa": below}).guesses["young_pa"] == 10.0
+    with pytest.raises(InputError, match="no parameter 'lambda_pa'"):
+        MIXED.with_estimates({"lambda_pa": 3.0})
+
+
 def test_with_fixed_fixes_what_it_names():
     other = IN_LAME.with_fixed({"mu_pa": 200.0})
     assert [item.name for item in other.free] == [

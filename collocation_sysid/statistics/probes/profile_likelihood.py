@@ -312,7 +312,7 @@ def _loss_with_fixed(
         If the solve is interrupted.
     """
     before = solution.collocation
-    started = before.parameters.with_guess(solution.parameters)
+    started = before.parameters.with_estimates(solution.parameters)
     fixed = started.with_fixed({item.name: value})
     refit = ReducedSpace()(
         replace(before, parameters=fixed)
