@@ -29,6 +29,7 @@ from .estimates import Estimate, display_name
 from .misspecification.misspecification_hypothesis import Hypothesis
 from .probes.relaxed_assumptions import DRIFT, Probe
 from .probes.routine_probes import ROUTINE, is_alarming
+from .residuals.autocorrelation import PERSISTENT
 from .residuals.noise_level import NoiseLevel
 from .residuals.residual_diagnostics import MOST_WILD, MarkerDiagnosis
 from .uncertainty import Uncertainty
@@ -47,8 +48,9 @@ MISFIT = 1.5
 GROSS_MISFIT = 3.0
 # Factor by which one marker may be noisier than the others.
 MARKER_MISFIT = 2.0
-# Autocorrelation from which on errors matter.
-PERSISTENT = 0.2
+# Autocorrelation of residuals of more than `GROSS_MISFIT` that are not noise, although the samples
+# are too few for a test at the level `RARE`.
+CLEARLY_PERSISTENT = 0.8
 # Additional distance of a forward simulation, over the RMS distance of the fit or of noise:
 # "check".
 ROLLOUT = 0.35
@@ -171,7 +173,8 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     "residuals/shared". Residuals more than `MISFIT` times σ are "doubtful" above `GROSS_MISFIT` if
     they are also correlated, or if nothing is known about their correlation in time. Residuals less
     than 1/`MISFIT` of σ are "check" unless they are exactly zero or correlated. All need
-    significance at `RARE`. One concern for each outlier, for noisy markers, and for parameters on
+    significance at `RARE`, except the correlation of large residuals, which may also be above
+    `CLEARLY_PERSISTENT`. One concern for each outlier, for noisy markers, and for parameters on
     which recordings disagree is added.
 
     Parameters
@@ -187,9 +190,13 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     shared = dependence.shared_p < RARE
     is_used = uncertainty.errors == "autocorrelated" and (persistent or shared)
     larger = factor > MISFIT and level.larger_p < RARE
-    # Of single samples nothing tells that it is noise.
+    # Of single samples nothing tells that it is noise; of a few, only a clear correlation tells that
+    # it is not.
     no_noise = (
-        persistent or shared or not np.isfinite(dependence.lag1_deviation)
+        persistent
+        or shared
+        or not np.isfinite(dependence.lag1_deviation)
+        or abs(dependence.lag1) > CLEARLY_PERSISTENT
     )
     # Residuals of exactly zero are those of no measurement at all.
     smaller = (

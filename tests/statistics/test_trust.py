@@ -35,9 +35,11 @@ from collocation_sysid.statistics.assessment import (
 )
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.concerns import TOPICS, Concern, topics_of
+from collocation_sysid.statistics.estimates import correlation_notes
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
     Hypothesis,
 )
+from collocation_sysid.statistics.residuals.autocorrelation import Dependence
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 RNG = np.random.default_rng
@@ -175,6 +177,41 @@ def test_gross_residuals_of_single_samples_are_doubtful():
         found = uncertainty_from_fit(fit, PARAMETERS, np.zeros(4))
         assert np.isfinite(found.dependence.lag1)
         assert Assessment.from_concerns(fit_concerns(found)).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("lag1", "grade"), [(0.95, "doubtful"), (0.5, "check"), (-0.2, "check")]
+)
+def test_gross_residuals_of_few_samples_are_doubtful_if_clearly_correlated(
+    lag1, grade
+):
+    """A test at the level of the others cannot find a correlation of so few samples."""
+    fit, _ = OF.fit(
+        [6 * RNG(0).normal(size=(80, 3, 3))], np.zeros(len(OF.names))
+    )
+    found = uncertainty_from_fit(fit, PARAMETERS, np.zeros(4))
+    few_samples = Dependence(lag1, lag1_deviation=0.4, shared_p=1.0)
+    (larger,) = (
+        each
+        for each in fit_concerns(replace(found, dependence=few_samples))
+        if each.code == "noise/larger"
+    )
+    assert larger.grade == grade
+
+
+def test_the_note_on_a_slight_correlation_does_not_contradict_a_good_verdict():
+    slight, strong = (
+        Dependence(lag1, lag1_deviation=0.01, shared_p=1.0)
+        for lag1 in (0.08, 0.4)
+    )
+    (note,) = correlation_notes("auto", "autocorrelated", slight)
+    assert "slightly correlated" in note
+    assert "may lack a small effect" in note
+    (note,) = correlation_notes("auto", "autocorrelated", strong)
+    assert "lacks an effect" in note
+    fit, _ = OF.fit([RNG(0).normal(size=(80, 3, 3))], np.zeros(len(OF.names)))
+    found = uncertainty_from_fit(fit, PARAMETERS, np.zeros(4))
+    assert not fit_concerns(replace(found, dependence=slight))
 
 
 def test_the_remedy_of_an_unknown_of_a_specimen_is_on_the_page_of_specimens():

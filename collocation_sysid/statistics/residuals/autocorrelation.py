@@ -298,6 +298,8 @@ SETTLED = 0.01
 SIGNIFICANCE = 0.01
 # Autocorrelation that changes error bars by less than 5 %, significant or not.
 NOTICEABLE = 0.05
+# Autocorrelation from which on the residuals are not noise, if it is significant.
+PERSISTENT = 0.2
 
 
 @dataclass(frozen=True)
@@ -329,6 +331,12 @@ class Dependence:
         """
         limit = float(normal_isf(SIGNIFICANCE / 2)) * self.lag1_deviation
         return abs(self.lag1) > max(limit, NOTICEABLE)
+
+    def is_slightly_correlated_in_time(self) -> bool:
+        """Return whether `is_correlated_in_time` holds with an absolute `lag1` up to `PERSISTENT`,
+        which does not change the verdict.
+        """
+        return self.is_correlated_in_time() and abs(self.lag1) <= PERSISTENT
 
     def is_correlated_in_space(self) -> bool:
         """Return whether errors of neighbours on the surface are correlated: `space_p` below
