@@ -177,6 +177,7 @@ def _body(
         ]
     density = old.mass_kg / old.mesh.volume_m3 * (1 + errors.get("mass", 0.0))
     body = Body(mesh, density_kg_m3=density, **body_options)
+    body = body.with_stiffness_factors(_stiffness_factors(body, errors))
     factor = np.ones(len(body.nodes_m))
     for axis, name in enumerate(AXES):
         distance_m = body.nodes_m[:, axis] - np.average(
@@ -192,6 +193,22 @@ def _body(
     ]
     body.node_mass = body.node_mass * factor
     return body
+
+
+def _stiffness_factors(body: Body, errors: Mapping[str, float]) -> Array:
+    """Return the factors (E,) of the stiffness of all elements, linear along each axis of the body."""
+    factors = np.ones(len(body.cells))
+    volumes_m3 = body.mesh.volumes_m3
+    for axis, name in enumerate(AXES):
+        place_m = body.nodes_m[:, axis]
+        centres_m = place_m[body.cells].mean(axis=1)
+        middle_m = np.average(centres_m, weights=volumes_m3)
+        factors += (
+            errors.get(f"stiffness_gradient {name}", 0.0)
+            * (centres_m - middle_m)
+            / np.abs(place_m - middle_m).max()
+        )
+    return factors
 
 
 def _anisotropic_law(shares: Sequence[float]) -> Material:

@@ -398,6 +398,7 @@ SINGLE = (
         "body_scale",
         "mass",
         "density_gradient",
+        "stiffness_gradient",
         "anisotropy",
         "stiffness_drift",
         "time_scale",

@@ -301,9 +301,24 @@ class Body(Discretisation):
         positions_m : (n, 3)
             Stress-free positions of all nodes [m], mid nodes included.
         """
-        other = copy(self)
-        other.geometry = self._geometry_at(positions_m)
+        other = self._with_geometry(self._geometry_at(positions_m))
         other.rest_shape = "stress_free"
+        return other
+
+    def with_stiffness_factors(self, factors: Array) -> Body:
+        """Return a copy of this body with the same masses, in which the stress of each element is
+        multiplied by a factor (E,), with its damping and memory.
+
+        Kernels are built again at their first use.
+        """
+        geometry = self.geometry.copy()
+        geometry[..., -1] *= factors[:, None]
+        return self._with_geometry(geometry)
+
+    def _with_geometry(self, geometry: Array) -> Body:
+        """Return a copy of this body with the same masses and another geometry (E, q, 3·nodes + 1)."""
+        other = copy(self)
+        other.geometry = geometry
         for name in self._list_cached_names() - {"pattern", "part_of_cells"}:
             vars(other).pop(name, None)
         other._evaluators = {}

@@ -548,3 +548,39 @@ def test_unknown_materials_and_dampings_of_a_region_are_refused(slab):
             density_kg_m3=1.0,
             regions=[Region("core", [0], damping="raleigh")],
         )
+
+
+@pytest.mark.parametrize("evaluator", EVALUATORS)
+def test_a_stiffness_factor_of_an_element_is_that_of_its_moduli(
+    evaluator: str, small_mesh: TetMesh, rng: np.random.Generator
+):
+    core = Region("core", BELOW, damping="kelvin-voigt")
+    body = Body(
+        small_mesh,
+        density_kg_m3=DENSITY_KG_M3,
+        damping="kelvin-voigt",
+        regions=[core],
+        evaluator=evaluator,
+    )
+    x, v, _ = states(body, rng)
+    same = {**SOFT, "gamma_m_1_s": 0.0}
+    stiffer = {
+        name: 1.7 * value if name.endswith("_pa") else value
+        for name, value in same.items()
+    }
+    in_core = np.zeros(len(body.cells), dtype=bool)
+    in_core[body.parts[1].cells] = True
+    scaled = body.with_stiffness_factors(np.where(in_core, 1.7, 1.0))
+    theta, of_stiffer = (
+        body.theta_from_values({**same, **of_region("core", own)})
+        for own in (same, stiffer)
+    )
+    expected = body.force(x, v, of_stiffer)
+    np.testing.assert_allclose(
+        scaled.force(x, v, theta),
+        expected,
+        atol=1e-12 * np.abs(expected).max(),
+    )
+    np.testing.assert_array_equal(
+        scaled.mass_of_dofs(theta), body.mass_of_dofs(theta)
+    )

@@ -17,10 +17,14 @@ from collocation_sysid import (
     Experiment,
     Force,
     Grasp,
+    Markers,
     NodeForce,
     Nuisance,
+    PointMass,
+    PoseSequence,
     Tied,
     Unknown,
+    box_mesh,
     simulate,
 )
 from collocation_sysid.fem.air import AIR_KG_M3
@@ -48,6 +52,8 @@ OFF = {
     "mass": 1e-3,
     "density_gradient x": 1e-3,
     "density_gradient z": 1e-3,
+    "stiffness_gradient x": 1e-3,
+    "stiffness_gradient z": 1e-3,
     "anisotropy x": 1e-3,
     "anisotropy z": 1e-3,
     "stiffness_drift": 1e-3,
@@ -139,6 +145,78 @@ def test_a_grip_that_gives_way_is_a_body_on_springs():
     np.testing.assert_allclose(
         expected, simulated, atol=0.01 * np.abs(simulated).max()
     )
+
+
+@pytest.mark.parametrize("has_stated_places", [True, False])
+def test_markers_with_a_mass_are_point_masses(has_stated_places):
+    mass_kg = 1e-6
+    experiment = swung()
+    placement = experiment.markers.placement
+    loaded = replace(
+        experiment,
+        masses=[
+            PointMass([int(node)], mass_kg * weight)
+            for nodes, weights in zip(
+                placement.nodes, placement.weights, strict=True
+            )
+            for node, weight in zip(nodes, weights, strict=True)
+            if weight > 0
+        ],
+    )
+    tracks = [
+        simulate(each, VALUES, "midpoint", substeps=1).markers_m
+        for each in (loaded, experiment)
+    ]
+    simulated = (tracks[0] - tracks[1]) / mass_kg
+    described = experiment
+    if not has_stated_places:
+        places_m = experiment.markers.predict_positions(experiment.body.nodes_m)
+        markers = replace(
+            experiment.markers,
+            placement=None,
+            places_m=places_m,
+            places_sigma_m=1e-3,
+            located=None,
+        ).on_body(experiment.body)
+        described = replace(experiment, markers=markers)
+    np.testing.assert_allclose(
+        changed(described, "marker_mass_kg"),
+        simulated,
+        atol=0.01 * np.abs(simulated).max(),
+    )
+
+
+def hanging_bar(layers: int) -> Experiment:
+    """A bar of layers of 5 mm that hangs from its top at rest, with a marker at its lower end."""
+    height_m = 0.005 * layers
+    mesh = box_mesh((0.01, 0.01, height_m), (2, 2, layers))
+    body = Body(mesh, density_kg_m3=60.0)
+    top = np.flatnonzero(body.nodes_m[:, 2] > height_m - 1e-9)
+    markers = Markers(
+        np.zeros(1), np.zeros((1, 1, 3)), 1e-3, places_m=[[0.005, 0.005, 0.0]]
+    ).on_body(body)
+    grasp = Grasp(top, PoseSequence.fixed())
+    return Experiment(
+        body,
+        [0.0],
+        [grasp],
+        markers,
+        kind="static",
+        nuisance=Nuisance.none(),
+        air_density_kg_m3=0.0,
+    )
+
+
+def test_a_gripper_that_holds_less_of_the_body_leaves_a_longer_bar():
+    """The row is that of a compliant layer, whose areas are estimated from the volumes of nodes."""
+    sag_m = [
+        simulate(hanging_bar(layers), VALUES).markers_m[0, 0, 2]
+        for layers in (16, 17)
+    ]
+    # The additional layer at the top carries the weight of the bar below it.
+    simulated = (sag_m[1] - sag_m[0]) / 0.005
+    (expected,) = changed(hanging_bar(16), "grasp_edge_m")[:, 0, 2]
+    assert 0.5 < expected / simulated < 2.0
 
 
 def platen_forces_n(experiment: Experiment, platen: int) -> np.ndarray:

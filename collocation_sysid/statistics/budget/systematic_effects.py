@@ -41,6 +41,7 @@ from ...recording.homogeneous_deformation import (
     HomogeneousDeformation,
 )
 from ...recording.nuisance import DEGREE
+from ...recording.placement import place_markers
 from .obstacle_effects import (
     contact_changes_by_size_n,
     obstacle_shifts_m,
@@ -483,6 +484,20 @@ def _density_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
     return Effect(at.weight_and_drag(mass), mass)
 
 
+def _stiffness_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
+    """Return the effect of a stiffness that increases along an axis (index) of the body, by a share
+    at the end farther from the middle of its volume, linearly through zero there; damping and
+    memory are proportional to the stiffness.
+    """
+    body = at.body.with_stress_free(at.stress_free_m)
+    place = at.stress_free_m[:, axis]
+    centres = place[body.cells].mean(axis=1)
+    middle = np.average(centres, weights=body.geometry[..., -1].sum(axis=1))
+    shares = (centres - middle) / np.abs(place - middle).max()
+    stiffer = body.with_stiffness_factors(1.0 + shares)
+    return Effect(at.internal_n(body=stiffer) - at.internal_force_n)
+
+
 def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
     """Return the effect of a stiffness that is higher along one axis (index) by a share of E, the
     Young's modulus of the softest part: the energy ½ E e² of the strain e along it.
@@ -574,6 +589,31 @@ def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
         for way in (step, -step)
     )
     return Effect((larger - smaller) / (2 * step))
+
+
+def _marker_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of a mass of each marker, per kilogram, which is part of neither the mass of
+    the body nor a point mass of the problem; None without markers.
+
+    It is distributed to nodes by the weights of the marker's place; estimated places are those of
+    the association at the answer.
+    """
+    segment = at.iterate.segment
+    placement = segment.experiment.markers.placement
+    if not len(placement.nodes):
+        return None
+    association = segment.association.markers
+    if association.sigma_m.any():
+        placement = place_markers(
+            association.centre_places_m, at.body.nodes_m, at.body
+        )
+    node_mass_kg = np.bincount(
+        placement.nodes.ravel(),
+        weights=placement.weights.ravel(),
+        minlength=len(at.body.nodes_m),
+    )
+    mass_kg = np.repeat(node_mass_kg, 3)
+    return Effect(at.weight_and_drag(mass_kg), mass_kg)
 
 
 def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
@@ -875,6 +915,16 @@ ASSUMPTIONS = (
         effect=_mass,
     ),
     Assumption(
+        "marker_mass_kg",
+        "kg",
+        sigma=None,
+        description="mass of each marker, which is not part of the mass of the body",
+        remedy="weigh the markers and state "
+        "marker_mass_kg = { mean = …, deviation = … } in [uncertainty.assumptions], "
+        "or add them as point masses",
+        effect=_marker_mass,
+    ),
+    Assumption(
         "density_gradient",
         "1",
         sigma=0.05,
@@ -882,6 +932,16 @@ ASSUMPTIONS = (
         "its middle",
         remedy="weigh two halves of a specimen",
         effect=_density_gradient,
+        component_names="x y z",
+    ),
+    Assumption(
+        "stiffness_gradient",
+        "1",
+        sigma=0.05,
+        description="relative difference of the stiffness at one end of the body from that in "
+        "its middle",
+        remedy="press specimens from both ends of the body, or estimate a field of the stiffness",
+        effect=_stiffness_gradient,
         component_names="x y z",
     ),
     Assumption(
@@ -951,6 +1011,16 @@ ASSUMPTIONS = (
         sigma=2e-4,
         description="compliance of grip and skin, as the thickness of a layer of the body's material",
         remedy="glue the body to a stiff plate, or attach markers to the body beside the grip",
+        effect=_grip,
+    ),
+    Assumption(
+        "grasp_edge_m",
+        "m",
+        sigma=5e-4,
+        description="distance by which the gripper holds more or less of the body than the "
+        "grasped nodes",
+        remedy="measure where the gripper ends on the body, and place the edge of the grasped nodes "
+        "there",
         effect=_grip,
     ),
     Assumption(
@@ -1037,7 +1107,7 @@ class KnownEffect(Section):
 Deviation = Annotated[Literal["none"] | Positive, ByForm(str)]
 KnownDeviation = Annotated[KnownEffect | Deviation, ByForm((dict, KnownEffect))]
 # Rows that are never negative, of which a mean may be stated: what gives way does not push.
-OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n")
+OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n", "marker_mass_kg")
 
 
 @validated(kw_only=True)
@@ -1060,8 +1130,12 @@ class Assumptions:
         the thickness [1].
     mass : float or "none"
         Relative error of the mass of the body, if the mass is not estimated [1].
+    marker_mass_kg : float, "none" or table
+        Mass of each marker, which is not part of the mass of the body [kg].
     density_gradient : float or "none"
         Relative difference of the density at one end of the body from that in its middle [1].
+    stiffness_gradient : float or "none"
+        Relative difference of the stiffness at one end of the body from that in its middle [1].
     anisotropy : float or "none"
         Relative difference of the stiffness along one axis from that across it [1].
     stiffness_drift : float or "none"
@@ -1078,6 +1152,8 @@ class Assumptions:
         from that of the stated law [1].
     grip_layer_m : float, "none" or table
         Compliance of grip and skin, as the thickness of a layer of the body's material [m].
+    grasp_edge_m : float or "none"
+        Distance by which the gripper holds more or less of the body than the grasped nodes [m].
     machine_compliance_m_n : float, "none" or table
         Compliance of the test bench [m/N].
     platen_friction : float or "none"
@@ -1177,7 +1253,9 @@ class Assumptions:
     rest_shape: Deviation = 0.58
     surface: Deviation = 0.005
     mass: Deviation = 0.01
+    marker_mass_kg: KnownDeviation = "none"
     density_gradient: Deviation = 0.05
+    stiffness_gradient: Deviation = 0.05
     anisotropy: Deviation = 0.05
     stiffness_drift: Deviation = 0.02
     time_scale: Deviation = 0.0001
@@ -1185,6 +1263,7 @@ class Assumptions:
     damping_law: Deviation = 1.0
     rayleigh_damping: Deviation = "none"
     grip_layer_m: KnownDeviation = 0.0002
+    grasp_edge_m: Deviation = 0.0005
     machine_compliance_m_n: KnownDeviation = 1e-06
     platen_friction: Deviation = 0.1
     platen_slip: Deviation = 1.0
