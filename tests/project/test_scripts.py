@@ -21,6 +21,7 @@ COMMANDS = (
     "study_damping --speeds 1",
     "study_design --twins 2 --evaluations 5",
     "study_faults --twins 2 --only none",
+    "study_hidden_errors --twins 1 --only none",
     "study_kawabata --laws neo-hookean",
     "study_live --twins 2 --rows 3",
     "study_memory --twins 2 --branches 1",

@@ -1,0 +1,249 @@
+"""Errors of the description that the residuals do not show: bias of E, intervals and verdicts.
+
+A block of foam is moved at random, as in `twins`. Its tracks are simulated with an effect that the
+described body does not have, or with another body, and are fitted with all options at their default.
+The estimated parameters absorb such errors, so that the residuals look like noise. The table has
+the mean of the estimated E over the true one, how many combined intervals contain the true E, and
+the verdicts.
+
+    python scripts/study_hidden_errors.py [--twins 5] [--only markers memory]
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from twins import random_poses
+
+import collocation_sysid as cs
+
+TRUTH = {
+    "young_pa": 5e3,
+    "poisson": 0.3,
+    "gamma_r_s": 0.01,
+    "gamma_m_1_s": 2.0,
+}
+UNKNOWN = {name: cs.Unknown() for name in TRUTH}
+# Edges of the block [m], numbers of elements along them, and density.
+SIZE_M = (0.05, 0.05, 0.1)
+DIVISIONS = (2, 2, 5)
+DENSITY_KG_M3 = 100.0
+# Number of samples, the time between them [s], and the number of markers with their noise [m].
+SAMPLES = 80
+STEP_S = 0.01
+MARKERS = 8
+NOISE_M = 5e-4
+# Sizes of the errors: mass of a marker [kg], share and relaxation time [s] of a branch of memory,
+# lengths that the gripper holds or the mesh lacks [m], and relative difference of the stiffness at
+# the ends of the body from that in its middle.
+MARKER_MASS_KG = 5e-4
+MEMORY = {"prony_1.share": 0.3, "prony_1.tau_s": 0.1}
+HELD_M = 1e-3
+LACKING_M = 1e-2
+GRADIENT = 0.1
+
+
+@dataclass(frozen=True)
+class HiddenError:
+    """Real recording and its description.
+
+    Attributes
+    ----------
+    actual : Experiment
+        Simulated experiment.
+    described : Experiment
+        Experiment that is fitted, with the markers at the same places.
+    more_constants : mapping
+        Constants of the simulated body beside `TRUTH`.
+    assumptions : mapping
+        Stated assumptions of the budget; the defaults otherwise.
+    """
+
+    actual: cs.Experiment
+    described: cs.Experiment
+    more_constants: Mapping[str, float] = field(default_factory=dict)
+    assumptions: Mapping[str, object] = field(default_factory=dict)
+
+
+def block(height_m: float = SIZE_M[2], **options) -> cs.Body:
+    """Return the block, or a higher one; options are those of `Body`."""
+    mesh = cs.box_mesh((*SIZE_M[:2], height_m), DIVISIONS)
+    return cs.Body(mesh, density_kg_m3=DENSITY_KG_M3, **options)
+
+
+def recording(body: cs.Body, seed: int) -> cs.Experiment:
+    """Return the block, held at its lower face and moved at random, with markers on the upper part
+    that every body of the study has.
+    """
+    rng = np.random.default_rng(seed)
+    t_s = STEP_S * np.arange(SAMPLES)
+    nodes_m = block().nodes_m
+    high = np.flatnonzero(
+        (nodes_m[:, 2] > 0.3 * SIZE_M[2])
+        & (nodes_m[:, 2] < SIZE_M[2] - LACKING_M)
+    )
+    places_m = nodes_m[rng.choice(high, MARKERS, replace=False)]
+    markers = cs.Markers(
+        t_s, np.zeros((SAMPLES, MARKERS, 3)), NOISE_M, places_m=places_m
+    )
+    held = np.flatnonzero(body.nodes_m[:, 2] < body.nodes_m[:, 2].min() + 1e-9)
+    return cs.Experiment(
+        body,
+        t_s,
+        [cs.Grasp(held, random_poses(t_s, rng))],
+        markers,
+        name="swing",
+    )
+
+
+def no_error(seed: int) -> HiddenError:
+    """Return a correct description."""
+    experiment = recording(block(), seed)
+    return HiddenError(experiment, experiment)
+
+
+def with_heavy_markers(seed: int) -> HiddenError:
+    """Return a body with markers whose mass is not stated."""
+    described = recording(block(), seed)
+    nodes_m = described.body.nodes_m
+    places_m = described.markers.predict_positions(nodes_m)
+    masses = [
+        cs.PointMass(
+            [int(np.linalg.norm(nodes_m - place_m, axis=1).argmin())],
+            MARKER_MASS_KG,
+        )
+        for place_m in places_m
+    ]
+    return HiddenError(replace(described, masses=masses), described)
+
+
+def with_stated_markers(seed: int) -> HiddenError:
+    """Return the same body with the mass of the markers stated in the budget."""
+    stated = {"mean": MARKER_MASS_KG, "deviation": 0.1 * MARKER_MASS_KG}
+    return replace(
+        with_heavy_markers(seed), assumptions={"marker_mass_kg": stated}
+    )
+
+
+def with_memory(seed: int) -> HiddenError:
+    """Return a body whose material has a branch of memory; the true E is the long-term modulus."""
+    actual = recording(block(prony=["prony_1"]), seed)
+    return HiddenError(actual, recording(block(), seed), MEMORY)
+
+
+def held_higher(seed: int) -> HiddenError:
+    """Return a body that the gripper holds up to a greater height than described."""
+    described = recording(block(), seed)
+    mesh = cs.box_mesh((*SIZE_M[:2], SIZE_M[2] - HELD_M), DIVISIONS)
+    shorter = cs.TetMesh(
+        mesh.points_m + np.array([0, 0, HELD_M]), mesh.tetrahedra
+    )
+    body = cs.Body(shorter, density_kg_m3=DENSITY_KG_M3)
+    return HiddenError(recording(body, seed), described)
+
+
+def with_lacking_end(seed: int) -> HiddenError:
+    """Return a body whose free end is missing in the mesh."""
+    lower = block(SIZE_M[2] - LACKING_M)
+    return HiddenError(recording(block(), seed), recording(lower, seed))
+
+
+def with_gradient(seed: int) -> HiddenError:
+    """Return a body whose stiffness grows linearly from its lower to its upper end."""
+    body = block()
+    centres_m = body.nodes_m[body.cells, 2].mean(axis=1)
+    shares = GRADIENT * (2 * centres_m / SIZE_M[2] - 1)
+    actual = recording(body.with_stiffness_factors(1 + shares), seed)
+    return HiddenError(actual, recording(body, seed))
+
+
+ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {
+    "none": ("none", no_error),
+    "markers": ("8 markers of 0.5 g on the body of 25 g", with_heavy_markers),
+    "stated-markers": (
+        "the same, with `marker_mass_kg` stated",
+        with_stated_markers,
+    ),
+    "memory": ("memory: share 0.3, 0.1 s", with_memory),
+    "grasp": ("the gripper holds 1 mm more", held_higher),
+    "mesh": ("the mesh lacks 10 mm at the free end", with_lacking_end),
+    "gradient": ("stiffness ± 10 % at the ends", with_gradient),
+}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Fit of one twin.
+
+    Attributes
+    ----------
+    young_ratio : float
+        Estimated over true Young's modulus.
+    contains_truth : bool
+        Whether the combined interval contains the true modulus.
+    verdict : str
+    """
+
+    young_ratio: float
+    contains_truth: bool
+    verdict: str
+
+
+def fit(name: str, seed: int) -> Outcome:
+    """Simulate a twin with an error, a key of `ERRORS`, and identify it."""
+    error = ERRORS[name][1](seed)
+    tracks_m = cs.simulate(
+        error.actual, TRUTH | dict(error.more_constants), "newmark"
+    ).markers_m
+    noise_m = np.random.default_rng((seed, 1)).normal(
+        scale=NOISE_M, size=tracks_m.shape
+    )
+    problem = cs.Problem(
+        [cs.with_markers(error.described, tracks_m + noise_m)],
+        UNKNOWN,
+        uncertainty=cs.UncertaintyOptions(
+            assumptions=cs.Assumptions(**error.assumptions)
+        ),
+    )
+    run = cs.run(problem)
+    low_pa, high_pa = run.interval("young_pa")
+    return Outcome(
+        run.estimates["young_pa"].value / TRUTH["young_pa"],
+        contains_truth=low_pa <= TRUTH["young_pa"] <= high_pa,
+        verdict=run.trust.verdict,
+    )
+
+
+def main() -> None:
+    """Run the study with the options of the command line, and print its table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--twins", type=int, default=5, help="of each error")
+    parser.add_argument(
+        "--only", nargs="+", choices=tuple(ERRORS), default=tuple(ERRORS)
+    )
+    options = parser.parse_args()
+    print(
+        "| error | E over the true E | intervals that contain it | verdicts |"
+    )
+    print("|---|---|---|---|")
+    for name in options.only:
+        outcomes = [fit(name, seed) for seed in range(options.twins)]
+        ratios = np.array([each.young_ratio for each in outcomes])
+        verdicts = Counter(each.verdict for each in outcomes)
+        counted = ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items())
+        print(
+            f"| {ERRORS[name][0]} | {ratios.min():.2f} to {ratios.max():.2f} "
+            f"| {sum(each.contains_truth for each in outcomes)} of {len(outcomes)} | {counted} |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
