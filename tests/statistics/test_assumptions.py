@@ -219,6 +219,11 @@ def test_a_gripper_that_holds_less_of_the_body_leaves_a_longer_bar():
     assert 0.5 < expected / simulated < 2.0
 
 
+def test_the_edge_of_a_platen_is_the_face_of_the_specimen():
+    assert changed(block("xyz"), "grip_layer_m").any()
+    assert not changed(block("xyz"), "grasp_edge_m").any()
+
+
 def platen_forces_n(experiment: Experiment, platen: int) -> np.ndarray:
     """(T, k, 3) what a platen gives each node that it holds, which is what the body gives it."""
     x = simulate(experiment, VALUES).positions_m.reshape(

@@ -640,6 +640,17 @@ def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect(displacement_m=displacement_m)
 
 
+def _grasp_edge(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of a gripper that holds less of the body than the grasped nodes, per metre:
+    that of a layer of the body's material between both, see `_grip`.
+
+    None without a gripper, and on a test bench, where platens end at the faces of the specimen.
+    """
+    if at.iterate.segment.experiment.is_static and _is_driven(at).any():
+        return None
+    return _grip(at, 0)
+
+
 def _is_driven(at: ExperimentAtAnswer) -> NDArray[np.bool_]:
     """Return the mask (g,) of grasped dofs whose prescribed position changes; times at which a dof
     is free (NaN) are ignored.
@@ -1021,7 +1032,7 @@ ASSUMPTIONS = (
         "grasped nodes",
         remedy="measure where the gripper ends on the body, and place the edge of the grasped nodes "
         "there",
-        effect=_grip,
+        effect=_grasp_edge,
     ),
     Assumption(
         "machine_compliance_m_n",
