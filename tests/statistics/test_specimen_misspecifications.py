@@ -11,6 +11,8 @@ import pytest
 import collocation_sysid as cs
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.recording.specimen_checks import order_warnings
+from collocation_sysid.statistics.concerns import Concern
+from collocation_sysid.statistics.specimen_concerns import as_specimen_concerns
 
 FIXED = {"kappa_pa": 1e9, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 LAWS = {
@@ -94,3 +96,41 @@ def test_nothing_is_named_after_a_search_that_did_not_converge():
     run = cs.run(problem)
     assert not run.solution.status.converged
     assert not run.causes
+
+
+# Words --------------------------------------------------------------------------------------------
+
+
+def test_residuals_of_a_simple_law_name_the_law_first():
+    run, _ = causes_of(
+        TRELOAR[:, 0] - 1, 1e6 * TRELOAR[:, 1], sigma_pa=1e4, law="neo-hookean"
+    )
+    first = run.trust.concerns[0]
+    assert first.code == "specimen/law"
+    assert "the law neo-hookean may be too simple" in first.message
+    assert "stretches of 1.13 to 7.63" in first.message
+    assert "compare-models FILE --materials neo-hookean," in first.message
+    text = str(run)
+    for word in ("reference_m", "motion", "move the body", "marker"):
+        assert not any(word in reason for reason in run.trust.reasons), word
+    assert "move the body" not in text
+
+
+def test_concerns_of_specimens_name_no_markers():
+    test = cs.Specimen("planar", STRAIN, 1e5 * STRAIN, SIGMA_PA)
+    data = {"marker": "planar/second stress", "factor": 4.0, "count": 2}
+    general = [
+        Concern("information/none", data={"names": ["c10_pa"]}),
+        Concern("noise/marker", data=data),
+        Concern("noise/markers", data=data),
+        Concern("noise/larger", data={"factor": 2.0, "stated": "sigma"}),
+        Concern("noise/smaller", data={"factor": 2.0, "stated": "sigma"}),
+        Concern("residuals/persist", data={"autocorrelation": 0.9}),
+    ]
+    concerns = as_specimen_concerns(general, [test.experiment(name="pull")])
+    assert concerns[0].code == "specimen/law"
+    text = " ".join(each.message for each in concerns)
+    assert "sigma_pa seems 2 times too large" in text
+    for word in ("marker", "reference_m", "sigma_m", "motion", "over time"):
+        assert word not in text
+    assert as_specimen_concerns(general, []) == general
