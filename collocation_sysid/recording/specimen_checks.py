@@ -159,8 +159,8 @@ def require_equal_units(specimens: Mapping[str, Specimen]) -> None:
 
 def order_warnings(specimen: Specimen) -> Iterator[str]:
     """Yield warnings about rows that are not in the order of time: a jump of the strain where most
-    changes are small, or sorted strains with a stress that jumps up and down. Tables of fewer than
-    `FEWEST_ORDERED` rows yield none.
+    changes are small, or sorted strains with a stress that jumps up and down; and about a table
+    without loading. Tables of fewer than `FEWEST_ORDERED` rows yield none.
     """
     strain = specimen.strain
     span = float(np.ptp(strain))
@@ -178,6 +178,12 @@ def order_warnings(specimen: Specimen) -> Iterator[str]:
             "the strains are sorted, but the stress jumps up and down between neighbouring rows: "
             "loading and unloading, or several cycles, are mixed; expected rows in the order of "
             "time"
+        )
+    if (np.diff(np.abs(strain)) <= 0).all():
+        yield (
+            "the strain decreases from the first row to the last: in the order of time, the table "
+            "contains only unloading, in which the stress is smaller than in loading (hysteresis); "
+            "fit the loading branch"
         )
 
 

@@ -7,7 +7,7 @@ measured, else from incompressibility.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
@@ -41,6 +41,7 @@ from .formats.columns import (
     fitting_column_names,
     name_and_unit,
     read_columns,
+    similar_column_names,
 )
 from .formats.text import TextTable, names_file_in_errors
 from .formats.units import si_factor
@@ -223,8 +224,9 @@ def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
     "or", at most `MOST_STATEMENTS`.
 
     Each names one deformation, one load and the optional quantities that one column fits, with the
-    names of the table's own columns; "…" stands for a quantity that no column fits. Columns that
-    the layout states are kept. Sizes of the specimen that a statement needs and the layout lacks
+    names of the table's own columns; of several that fit only by their unit, the first is that of
+    the first axis. "…" stands for a quantity that no column fits. Columns that the layout states
+    are kept. Sizes of the specimen that a statement needs and the layout lacks
     are named after it.
 
     Parameters
@@ -233,26 +235,44 @@ def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
     layout : SpecimenLayout
         Meaning of the columns.
     """
-    groups = [
-        _column_choices(grid, group, stated=layout.columns)
-        for group in (
-            layout.list_deformations(),
-            layout.list_second_deformations(),
-            layout.loads,
+    deformations = _column_choices(
+        grid, layout.list_deformations(), stated=layout.columns
+    )
+    groups = [deformations]
+    if second := layout.list_second_deformations():
+        groups.append(
+            _column_choices(
+                grid,
+                second,
+                stated=layout.columns,
+                taken=_names_of(deformations),
+            )
         )
-        if group
-    ]
+    groups.append(_column_choices(grid, layout.loads, stated=layout.columns))
     required = {*layout.list_deformations(), *layout.list_second_deformations()}
     required |= {*layout.loads}
     other = {
         quantity.key: choices[0][quantity.key]
         for quantity in (TIME, *layout.list_quantities())
         if quantity not in required
-        and len(choices := _column_choices(grid, (quantity,), layout.columns))
+        and len(
+            choices := _column_choices(
+                grid, (quantity,), stated=layout.columns, is_optional=True
+            )
+        )
         == 1
-        and choices[0][quantity.key] != "…"
         and (quantity != TIME or TIME.key in layout.columns)
     }
+    # Two stresses of unknown axes: the first column is taken for the first axis.
+    has_second_stress = SECOND_STRESS in layout.list_quantities()
+    loads = groups[-1]
+    if (
+        has_second_stress
+        and SECOND_STRESS.key not in other
+        and [*map(list, loads)] == [[STRESS.key]] * 2
+    ):
+        groups[-1] = loads[:1]
+        other[SECOND_STRESS.key] = loads[1][STRESS.key]
     statements = []
     for combination in product(*groups):
         names = {
@@ -272,24 +292,45 @@ def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
 
 
 def _column_choices(
-    grid: TextTable, quantities: tuple[Quantity, ...], stated: Mapping[str, str]
+    grid: TextTable,
+    quantities: tuple[Quantity, ...],
+    stated: Mapping[str, str],
+    taken: Collection[str] = (),
+    *,
+    is_optional: bool = False,
 ) -> list[dict[str, str]]:
     """Return the possible choices of one column for one of several quantities, each as the name by
     the quantity's key.
 
-    These are the `stated` columns of the quantities, else all columns that fit one of them; without
-    any, the last quantity with the name "…".
+    These are the `stated` columns of the quantities, else all columns that fit one of them, else
+    those that are similar (`similar_column_names`), without columns `taken` for other quantities;
+    without any, the last quantity with the name "…". If `is_optional`, only columns that are stated
+    or fit, and an empty list without any.
     """
     choices = [
         {quantity.key: stated[quantity.key]}
         for quantity in quantities
         if quantity.key in stated
-    ] or [
-        {quantity.key: name}
-        for quantity in quantities
-        for name in fitting_column_names(grid, quantity)
     ]
-    return choices or [{quantities[-1].key: "…"}]
+    searches = [fitting_column_names]
+    if not is_optional:
+        searches.append(similar_column_names)
+    for names_for in searches:
+        if not choices:
+            choices = [
+                {quantity.key: name}
+                for quantity in quantities
+                for name in names_for(grid, quantity)
+                if name not in taken
+            ]
+    if not choices and not is_optional:
+        return [{quantities[-1].key: "…"}]
+    return choices
+
+
+def _names_of(choices: Iterable[Mapping[str, str]]) -> set[str]:
+    """Return the names of all columns that choices of columns contain."""
+    return {name for each in choices for name in each.values()}
 
 
 def _one_of(

@@ -24,6 +24,8 @@ EXPLICABLE_CONCERNS = (
     "residuals/recordings",
     "residuals/shared",
     "roll-out/predicted",
+    "specimen/law",
+    "specimen/persist",
 )
 # Topics of a verdict that come first.
 FIRST_TO_CORRECT = ("description", "solve")

@@ -290,7 +290,8 @@ def _undetermined_sentence(result: Result) -> list[str]:
     stated = {
         name
         for concern in result.trust.concerns
-        if concern.code in ("information/none", "information/combined")
+        if concern.code
+        in ("information/none", "information/combined", "specimen/none")
         for name in concern.data.get("names", [concern.data.get("name")])
     }
     sources = []

@@ -37,6 +37,7 @@ from ..statistics.misspecification.plausibility import (
 from ..statistics.remedies import remedy_for
 from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
 from ..statistics.scale_identifiability import scale_concerns
+from ..statistics.specimen_concerns import as_specimen_concerns
 from ..statistics.stability_concerns import strain_stability_concerns
 from ..statistics.uncertainty import Uncertainty
 from .check.modes_check import ModesCheck, check_modes
@@ -80,8 +81,10 @@ def solution_concerns(
     if status is Status.ACCEPTABLE:
         yield Concern("solve/acceptable")
     if uncertainty is not None:
-        yield from fit_concerns(uncertainty)
-        yield from parameter_concerns(uncertainty)
+        yield from as_specimen_concerns(
+            [*fit_concerns(uncertainty), *parameter_concerns(uncertainty)],
+            [each.experiment for each in solution.collocation.transcriptions],
+        )
     elif solution.collocation.nq:
         yield Concern("solve/no-error-bars", "doubtful")
     yield from allowance_concerns(solution)

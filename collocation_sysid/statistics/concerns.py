@@ -215,7 +215,7 @@ TOPICS: dict[str, Topic] = {
         "Parameters that the data do not determine",
         "budget",
         remedy="Fix such a parameter at a known value, give it a prior or wider bounds, or record a "
-        "motion that depends on it.",
+        "motion or a test that depends on it.",
         messages={
             "bound": "{names} ended at its bound: widen the bound, or fix the parameter",
             "bounds": "{names} ended at their bounds: widen the bounds, or fix the parameters",
@@ -269,18 +269,33 @@ TOPICS: dict[str, Topic] = {
         },
     ),
     "specimen": Topic(
-        "Unknowns of a material test",
+        "Material tests",
         "specimen",
-        remedy="Check the table: does the strain begin at zero in the unloaded specimen, are the area "
-        "and the units right, and are the first cycles left out? If the value is possible, widen its "
-        "prior in the [[experiment]], for example strain_zero = 0.02. A law that does not fit the "
-        "material has the same effect: compare-models --materials.",
+        remedy="A law that does not fit the material is the most frequent cause: compare-models "
+        "--materials. Then check the table: does the strain begin at zero in the unloaded specimen, "
+        "are the area and the units right, and are the first cycles left out? If the value of an "
+        "unknown is possible, widen its prior in the [[experiment]], for example strain_zero = 0.02.",
         messages={
             "limit": "{name} ended at the largest value allowed: check whether this value is "
             "possible, and if it is, widen its prior in the [[experiment]]",
             "far": "{name} is {deviations:.1f} standard deviations of its prior away from zero: "
             "check whether this value is possible, and if it is, widen its prior in the "
             "[[experiment]]",
+            "law": "the residuals are {factor:.2g} times as large as expected from sigma_pa: the "
+            "law {laws} may be too simple for {range}. First compare laws with "
+            "collocation-sysid compare-models FILE --materials {others}; then check sigma_pa, the "
+            "units of the columns and the kind of test",
+            "stress": "the residuals of {marker} are {factor:.2g} times sigma_pa: check sigma_pa, "
+            "the unit of the column and the kind of test, and compare laws with compare-models "
+            "--materials",
+            "stresses": "the residuals of {count} tests or stresses are larger than sigma_pa, most "
+            "of all those of {marker} ({factor:.2g} times): check sigma_pa, the units of the "
+            "columns and the kinds of test, and compare laws with compare-models --materials",
+            "persist": "the residuals are not independent noise: consecutive samples are "
+            "correlated (autocorrelation {autocorrelation:.2f}). The law or the description of the "
+            "test lacks an effect: look at measured and fitted stresses over the strain",
+            "none": "the data do not determine {names}: state known values or priors, or add "
+            "another kind of test or larger stretches",
         },
     ),
     "scheme": Topic(

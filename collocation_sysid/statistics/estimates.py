@@ -484,7 +484,7 @@ def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:
         if other not in mentioned:
             notes.append(
                 f"{which} not identifiable from these data: {because}; fix {pronoun}, give it a "
-                "prior, or move the body differently"
+                "prior, or record other deformations"
             )
         mentioned.add(name)
     return notes

@@ -12,8 +12,9 @@ LAW = "law"
 # One remedy per source of the budget, as an imperative phrase that ends a sentence.
 REMEDIES: Mapping[str, str] = {
     **{each.name: each.remedy for each in ASSUMPTIONS},
-    NOISE: "record longer, more often, or a motion that depends more on this parameter",
-    NUISANCES: "measure clocks, marker positions and the grip, and state tighter priors",
+    NOISE: "record longer, more often, or a motion or test that depends more on this parameter",
+    NUISANCES: "measure clocks, marker positions and the grip, or the area and unloaded length of "
+    "a specimen, and state tighter priors",
     NUMERICAL: "raise transcription.substeps, or run refine",
     BETWEEN: "find out what differs between the recordings, such as temperature or clamping",
     LAW: "record larger strains, which distinguish the material laws",

@@ -78,6 +78,45 @@ def test_a_stated_time_is_kept(tmp_path):
 
 
 def test_a_load_that_is_not_recognised_is_left_open(tmp_path):
-    header = HEADER.replace("Force", "Kanal 3")
+    header = HEADER.replace("Force (N)", "Kanal 3")
     text = message(tmp_path, header, {"strain": VIDEO})
     assert statements(text) == [{"strain": VIDEO, "force": "…"}]
+
+
+def test_a_load_is_recognised_by_its_unit(tmp_path):
+    header = HEADER.replace("Force", "Kanal 3")
+    text = message(tmp_path, header, {"strain": VIDEO})
+    assert statements(text) == [{"strain": VIDEO, "force": "Kanal 3 (N)"}]
+    assert text.endswith("with area_m2")
+    text = message(tmp_path, "e_strain_1,a (s),s_mpa,u_mm")
+    assert statements(text) == [{"strain": "e_strain_1", "stress": "s_mpa"}]
+
+
+BIAXIAL = "lambda_1,lambda_2,s_1_mpa,s_2_mpa"
+
+
+def test_numbered_columns_are_those_of_the_axes(tmp_path):
+    path = tmp_path / "wide.csv"
+    path.write_text(f"{BIAXIAL}\n1.1,1.2,0.1,0.2\n1.2,1.4,0.15,0.3\n")
+    with pytest.raises(cs.InputError) as raised:
+        read_specimen(path, SpecimenLayout(test="biaxial", columns={}))
+    (stated,) = statements(str(raised.value))
+    assert stated == {
+        "stretch": "lambda_1",
+        "second_stretch": "lambda_2",
+        "stress": "s_1_mpa",
+        "second_stress": "s_2_mpa",
+    }
+    table = read_specimen(path, SpecimenLayout(test="biaxial", columns=stated))
+    np.testing.assert_allclose(table.second_strain, [0.2, 0.4])
+    np.testing.assert_allclose(table.second_stress_pa, [2e5, 3e5])
+
+
+def test_a_number_behind_a_named_column_is_no_unit(tmp_path):
+    path = tmp_path / "pull.csv"
+    path.write_text("eps_1,eps_2,s_1\n10,20,0.1\n20,30,0.2\n")
+    for column, strains in (("eps_1", [0.1, 0.2]), ("eps_2", [0.2, 0.3])):
+        columns = {"strain": f"{column} (%)", "stress": "s_1 (MPa)"}
+        table = read_specimen(path, SpecimenLayout(**of_test(columns)))
+        np.testing.assert_allclose(table.strain, strains)
+        np.testing.assert_allclose(table.stress_pa, [1e5, 2e5])

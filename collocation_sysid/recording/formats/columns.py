@@ -296,7 +296,8 @@ def _column_named_by_user(
     """Return index and factor to SI of the column that the user names for a quantity.
 
     The unit is in the name of the column or else behind it in `name`, as in "Load (N)"; a quantity
-    that is `unitless` needs none.
+    that is `unitless` needs none. A number at the end of a name, as in "lambda_2", is no unit; only
+    a 1 is, if there is no other.
 
     Raises
     ------
@@ -312,7 +313,11 @@ def _column_named_by_user(
             f"columns.{quantity.key} is {name!r}, which {fault}; the columns are "
             f"{', '.join(grid.columns)}{hint_at(name, grid.columns)}"
         )
-    unit = name_and_unit(column)[1] or unit_of_user
+    units = [each for each in (name_and_unit(column)[1], unit_of_user) if each]
+    unit = next(
+        (each for each in units if not each.isdigit()),
+        "1" if "1" in units else None,
+    )
     if unit is None and quantity.unitless:
         unit = quantity.unit
     if quantity in (STRAIN, STRESS) and _words(column) & _DEFORMED:
@@ -401,6 +406,34 @@ def _fitting_columns(
 def fitting_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
     """Return the names of all columns whose name and unit fit a quantity, in their order."""
     return [grid.columns[k] for k, _ in _fitting_columns(grid, quantity)]
+
+
+def similar_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
+    """Return the names of all columns that may hold a quantity although their names do not fit it,
+    in their order.
+
+    These are columns of quantities with a dimension whose unit fits, as "s_mpa" for a stress, and of
+    `unitless` quantities those with one of its words and no unit but a number, as "lambda_2" for a
+    second stretch. Names that fit another known quantity are left out.
+    """
+    names = []
+    for column in grid.columns:
+        name, unit = name_and_unit(column)
+        if quantity.unitless:
+            is_similar = bool(_words(name) & set(quantity.words.split())) and (
+                unit is None or unit.isdigit()
+            )
+            others = ()
+        else:
+            is_similar = (
+                quantity.dimension != "ratio"
+                and unit is not None
+                and si_factor(unit, quantity.dimension) is not None
+            )
+            others = KNOWN_QUANTITIES
+        if is_similar and not any(_name_fits(column, each) for each in others):
+            names.append(column)
+    return names
 
 
 def column_statement(names: Mapping[str, str]) -> str:

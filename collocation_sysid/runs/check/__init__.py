@@ -145,7 +145,12 @@ class LiftedKind(NamedTuple):
 
 LIFTED_KINDS = (
     LiftedKind("memory", "overstresses", "memory", "the viscoelastic stresses"),
-    LiftedKind("reaction", "wrenches", "wrenches", "the measured wrenches"),
+    LiftedKind(
+        "reaction",
+        "wrenches",
+        "reactions",
+        "the measured wrenches or stresses",
+    ),
 )
 
 

@@ -4,6 +4,9 @@ Mistakes in a table that show without a fit are in `recording.specimen_checks`. 
 plausible curve: true in place of engineering stress, compression with positive signs, percent in
 place of ratios, and stresses in another unit. All specimens are fitted again with one of them
 corrected; the misfit contains the nuisance parameters, so that a wrong area does not explain all.
+
+A law that is too simple, a toe region or hysteresis also decrease the misfit of some correction. A
+mistake is therefore named only if the corrected description explains the data, see `_is_explained`.
 """
 
 from __future__ import annotations
@@ -42,6 +45,19 @@ CERTAIN = 4.0
 REFITTED_SAMPLES = 8
 # Factor between initial slopes from which on a wrong unit is tested.
 UNIT_LIKE = 20.0
+# Root mean square residual of a corrected fit over sigma up to which it explains the data: that of
+# the concern about the noise.
+EXPLAINED = 1.5
+# Autocorrelation of its residuals, in standard deviations of that of noise, 1/√n, up to which
+# they are noise.
+UNCORRELATED = 2.0
+# Largest nuisance parameter of a corrected fit, in standard deviations of its prior.
+PLAUSIBLE_NUISANCE = 4.0
+# Decrease of χ² that no statistical fluctuation causes: a ratio of likelihoods of e^10.
+DECISIVE = 20.0
+# Samples of each specimen, and most iterations, of the fit that decides.
+DECIDING_SAMPLES = 60
+DECIDING_ITERATIONS = 30
 # Units that stresses are confused in: name of the factor that corrects the file.
 UNIT_FACTORS = {"kPa": 1e-3, "MPa": 1e3}
 # Largest strain from which on a table of ratios may be one of percent.
@@ -50,10 +66,12 @@ PERCENT_STRAIN = 1.0
 
 def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
     """Return hypotheses of what is described wrongly of the specimens of a fit; empty without
-    specimens, where they fit, or if refits fail.
+    specimens, where they fit, after a search that did not converge, or if refits fail.
 
     The specimens with the largest misfit are tested first; a nearly certain hypothesis (`CERTAIN`)
-    ends the search.
+    ends the search. A hypothesis is returned only if the corrected description explains the data
+    (`_is_explained`). A wrong unit needs no explanation: the initial slopes of the tests show it
+    with any law.
 
     Parameters
     ----------
@@ -65,29 +83,24 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
         for part in solution.parts
         if part.segment.experiment.specimen is not None
     ]
-    if not fitted:
+    if not fitted or not solution.status.converged:
         return []
-    if _misfit(fitted) <= NOISE_LEVEL:
+    stated_misfit = _misfit(fitted)
+    if stated_misfit <= NOISE_LEVEL:
         return []
     fitted.sort(key=lambda part: -_misfit([part]))
-    experiments = [_thinned(part.segment.experiment) for part in fitted]
+    originals = [part.segment.experiment for part in fitted]
+    experiments = [
+        _thinned(each, most_samples=REFITTED_SAMPLES) for each in originals
+    ]
 
     def misfit_of(corrected: Experiment) -> float | None:
         """Return the misfit of all specimens with one of them corrected; None without a fit."""
         chosen = [
             corrected if e.name == corrected.name else e for e in experiments
         ]
-        method = ReducedSpace(
-            max_iterations=MOST_ITERATIONS, tolerance=TOLERANCE
-        )
-        try:
-            refit = method(
-                replace(solution.collocation, experiments=tuple(chosen))
-            )
-        except (InputError, SimulationError):
-            return None
-        refit.unless_interrupted()
-        return _misfit(refit.parts)
+        refit = _refit(solution, chosen, iterations=MOST_ITERATIONS)
+        return None if refit is None else _misfit(refit.parts)
 
     misfit = misfit_of(experiments[0])
     if misfit is None:
@@ -100,28 +113,113 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
         smallest_misfit=1.0,
         noise_level=NOISE_LEVEL,
     )
-    for experiment in experiments:
+    for index, experiment in enumerate(experiments):
         if len(experiment.t_s) < FEWEST_SAMPLES:
             continue
-        others = [
-            _initial_slope(each)
-            for each in experiments
-            if each is not experiment
-        ]
-        for hypothesis in test.accepted(_hypotheses(experiment, others)):
+        slopes_pa = [_initial_slope(each) for each in experiments]
+        other_slopes_pa = slopes_pa[:index] + slopes_pa[index + 1 :]
+        for hypothesis in test.accepted(
+            _hypotheses(experiment, other_slopes_pa)
+        ):
+            if hypothesis.cause != "specimen-unit" and not _is_explained(
+                solution,
+                originals,
+                index=index,
+                code=hypothesis.code,
+                stated_misfit=stated_misfit,
+            ):
+                continue
             hypotheses.append(hypothesis)
             if hypothesis.strength > CERTAIN:
                 return hypotheses
     return hypotheses
 
 
-def _thinned(experiment: Experiment) -> Experiment:
-    """Return a copy of the experiment of a specimen with at most `REFITTED_SAMPLES` of its samples,
+def _refit(
+    solution: Solution, experiments: Sequence[Experiment], iterations: int
+) -> Solution | None:
+    """Return the fit of other experiments with the parameters of a solution, from their guess; None
+    if it fails.
+    """
+    method = ReducedSpace(max_iterations=iterations, tolerance=TOLERANCE)
+    try:
+        refit = method(
+            replace(solution.collocation, experiments=tuple(experiments))
+        )
+    except (InputError, SimulationError):
+        return None
+    return refit.unless_interrupted()
+
+
+def _is_explained(
+    solution: Solution,
+    experiments: Sequence[Experiment],
+    index: int,
+    code: str,
+    stated_misfit: float,
+) -> bool:
+    """Return whether the data are as expected from noise if one mistake is corrected.
+
+    The residuals of all specimens must be at most `EXPLAINED` times sigma, with the number of
+    estimated parameters considered, those of each stress uncorrelated, the nuisance parameters
+    plausible (`PLAUSIBLE_NUISANCE`), and χ² smaller by at least `DECISIVE`.
+
+    Parameters
+    ----------
+    solution : Solution
+        The fit of the description as stated.
+    experiments : sequence of Experiment
+        All specimens as stated.
+    index : int
+        Index of the specimen to correct.
+    code : str
+        Code of the mistake.
+    stated_misfit : float
+        Misfit of the fit, see `_misfit`.
+    """
+    chosen = [
+        _thinned(each, most_samples=DECIDING_SAMPLES) for each in experiments
+    ]
+    corrected = [
+        each.corrected
+        for each in _hypotheses(chosen[index], ())
+        if each.code == code
+    ]
+    if not corrected:
+        return False
+    chosen[index] = corrected[0]
+    refit = _refit(solution, chosen, iterations=DECIDING_ITERATIONS)
+    if refit is None:
+        return False
+    residuals = [row for part in refit.parts for row in _residuals(part)]
+    count = sum(len(row) for row in residuals)
+    freedom = max(1, count - refit.collocation.nq)
+    squares = sum(float(np.sum(row**2)) for row in residuals)
+    stated_squares = count * stated_misfit**2
+    remaining_squares = count * _misfit(refit.parts) ** 2
+    phi = np.concatenate([part.phi for part in refit.parts])
+    return bool(
+        np.sqrt(squares / freedom) <= EXPLAINED
+        and not any(_is_correlated(row) for row in residuals)
+        and np.abs(phi).max(initial=0.0) <= PLAUSIBLE_NUISANCE
+        and stated_squares - remaining_squares >= DECISIVE
+    )
+
+
+def _is_correlated(residuals: Array) -> bool:
+    """Return whether consecutive residuals (n,) are more alike than those of noise (`UNCORRELATED`)."""
+    squares = float(np.sum(residuals**2))
+    products = float(np.sum(residuals[1:] * residuals[:-1]))
+    return products > UNCORRELATED / np.sqrt(max(1, len(residuals))) * squares
+
+
+def _thinned(experiment: Experiment, most_samples: int) -> Experiment:
+    """Return a copy of the experiment of a specimen with at most `most_samples` of its samples,
     evenly chosen by index, without markers and without sensors that have no value there.
     """
     count = len(experiment.t_s)
     chosen = np.unique(
-        np.linspace(0, count - 1, min(count, REFITTED_SAMPLES)).astype(int)
+        np.linspace(0, count - 1, min(count, most_samples)).astype(int)
     )
     readings = [
         replace(
@@ -164,18 +262,26 @@ def _misfit(parts: Sequence[ExperimentIterate]) -> float:
     count = 0
     for part in parts:
         squares += float(np.sum(part.phi**2))
-        for sensor in part.segment.custom_sensors:
-            predicted = sensor.without_padding(
-                sensor.predict_motion(
-                    part.motion_for(sensor.observable), part.phi
-                )
-            )
-            residuals = (
-                predicted - sensor.sensor.measured_values
-            ) / sensor.sensor.sigma
-            squares += float(np.nansum(residuals**2))
-            count += int(np.isfinite(residuals).sum())
+        for residuals in _residuals(part):
+            squares += float(np.sum(residuals**2))
+            count += len(residuals)
     return float(np.sqrt(squares / max(1, count)))
+
+
+def _residuals(part: ExperimentIterate) -> list[Array]:
+    """Return for each component of each sensor its residuals (n,) over sigma, in the order of the
+    samples and without NaN.
+    """
+    rows: list[Array] = []
+    for sensor in part.segment.custom_sensors:
+        predicted = sensor.without_padding(
+            sensor.predict_motion(part.motion_for(sensor.observable), part.phi)
+        )
+        residuals = (
+            predicted - sensor.sensor.measured_values
+        ) / sensor.sensor.sigma
+        rows += [row[np.isfinite(row)] for row in residuals.T]
+    return rows
 
 
 def _hypotheses(
@@ -197,7 +303,9 @@ def _hypotheses(
     of = f"'{experiment.name}'"
     strain, _ = specimen_strains(experiment)
     areas = area_ratios(deformation, strain)
-    if areas is not None and np.ptp(areas):
+    # Stresses in unloading are smaller than in loading, like engineering in place of true stresses.
+    is_unloading = bool((np.diff(np.abs(strain)) <= 0).all())
+    if areas is not None and np.ptp(areas) and not is_unloading:
         yield Hypothesis(
             "specimen-true-stress",
             of,

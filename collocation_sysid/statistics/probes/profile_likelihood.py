@@ -228,7 +228,7 @@ def _message(
     if lower is None and upper is None:
         return (
             f"{parameter} is not identifiable: the loss hardly changes between {bounds[0]:.4g} "
-            f"and {bounds[1]:.4g}; fix it, give it a prior, or move the body differently"
+            f"and {bounds[1]:.4g}; fix it, give it a prior, or record other deformations"
         )
     least = lower is not None
     return (

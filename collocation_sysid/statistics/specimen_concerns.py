@@ -1,0 +1,95 @@
+"""Concerns about fits of material tests, in the terms of specimens.
+
+The general concerns name markers, motions and the noise of cameras. For fits of specimens only,
+those with another remedy are replaced by concerns of the topic "specimen".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..recording.experiment import Experiment
+from ..recording.specimen_files import specimen_strains
+from .concerns import Concern
+
+# Code of the concern about a specimen by that of the general concern with the same data.
+SPECIMEN_CODES: Mapping[str, str] = {
+    "noise/larger": "specimen/law",
+    "noise/marker": "specimen/stress",
+    "noise/markers": "specimen/stresses",
+    "residuals/persist": "specimen/persist",
+    "information/none": "specimen/none",
+}
+# Laws of rubber to compare, in the order of their number of constants.
+COMPARED_LAWS = ("neo-hookean", "mooney-rivlin", "yeoh", "ogden-2")
+
+
+def as_specimen_concerns(
+    concerns: Iterable[Concern], experiments: Sequence[Experiment]
+) -> list[Concern]:
+    """Return concerns about a fit, replaced by those of `SPECIMEN_CODES` if all experiments are
+    specimens, whose noise is stated by `sigma_pa`; else as they are.
+
+    The concern "specimen/law" about residuals larger than sigma comes first, because a law that is
+    too simple is the most frequent cause of the others.
+
+    Parameters
+    ----------
+    concerns : iterable of Concern
+        Concerns from the residuals and the error bars of the fit.
+    experiments : sequence of Experiment
+        Fitted experiments.
+    """
+    if not experiments or any(each.specimen is None for each in experiments):
+        return list(concerns)
+    data = {"stated": "sigma_pa", **_law_data(experiments)}
+    replaced = [
+        replace(
+            concern,
+            code=SPECIMEN_CODES.get(concern.code, concern.code),
+            data={**concern.data, **data},
+        )
+        for concern in concerns
+    ]
+    return sorted(replaced, key=lambda each: each.code != "specimen/law")
+
+
+def _law_data(experiments: Sequence[Experiment]) -> dict[str, object]:
+    """Return the placeholders "laws", "range" and "others": fitted laws, range of the stretches or
+    strains, and laws to compare with.
+    """
+    laws = list(
+        dict.fromkeys(
+            part.material.name
+            for each in experiments
+            for part in each.body.parts
+        )
+    )
+    others = [*laws, *(law for law in COMPARED_LAWS if law not in laws)]
+    return {
+        "laws": laws,
+        "range": " and ".join(_ranges(experiments)),
+        "others": ",".join(others),
+    }
+
+
+def _ranges(experiments: Sequence[Experiment]) -> Iterator[str]:
+    """Yield the range of the stretches of all tests but simple shear, and that of the amounts of
+    shear, if there are such tests.
+    """
+    tests = [each.specimen.test for each in experiments if each.specimen]
+    for is_shear, name, offset in (
+        (False, "stretches", 1.0),
+        (True, "amounts of shear", 0.0),
+    ):
+        values = [
+            offset + specimen_strains(each)[0]
+            for each, test in zip(experiments, tests, strict=True)
+            if (test == "simple-shear") == is_shear
+        ]
+        if values:
+            joined = np.concatenate(values)
+            yield f"{name} of {joined.min():.3g} to {joined.max():.3g}"

@@ -1,0 +1,136 @@
+"""Mistakes in the description of specimens are named only where the correction explains the data.
+
+The cases without a mistake are those in which a correction decreases the misfit although the cause
+is another: a law that is too simple, a toe region, and an unloading branch. That mistakes are found
+is tested in tests/recording/test_specimen.py.
+"""
+
+import numpy as np
+import pytest
+
+import collocation_sysid as cs
+from collocation_sysid.methods.solution import Status
+from collocation_sysid.recording.specimen_checks import order_warnings
+from collocation_sysid.statistics.concerns import Concern
+from collocation_sysid.statistics.specimen_concerns import as_specimen_concerns
+
+FIXED = {"kappa_pa": 1e9, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+LAWS = {
+    "neo-hookean": ("mu_pa",),
+    "mooney-rivlin": ("c10_pa", "c01_pa"),
+    "yeoh": ("c10_pa", "c20_pa", "c30_pa"),
+}
+SIGMA_PA = 500.0
+STRAIN = np.linspace(0.02, 0.5, 25)
+# Stretch and engineering stress [MPa] of rubber in uniaxial tension, every second row (Treloar 1944).
+TRELOAR = np.array(
+    [
+        (1.1267, 0.126771),
+        (1.3946, 0.312342),
+        (1.8861, 0.500561),
+        (2.4165, 0.665391),
+        (3.5696, 1.04205),
+        (4.7573, 1.58522),
+        (5.7558, 2.29225),
+        (6.4093, 3.0246),
+        (6.8789, 3.75201),
+        (7.1765, 4.46749),
+        (7.4509, 5.2134),
+        (7.629, 6.30148),
+    ]
+)
+
+
+def neo_hookean_pa(strain):
+    """Engineering stress of an incompressible neo-Hookean solid with a shear modulus of 100 kPa."""
+    stretch = 1 + strain
+    return 1e5 * (stretch - stretch**-2)
+
+
+def causes_of(strain, stress_pa, sigma_pa, law):
+    """Run of a uniaxial test with one law, and the codes of its causes."""
+    test = cs.Specimen("uniaxial", strain, stress_pa, sigma_pa)
+    unknown = {name: cs.Unknown() for name in LAWS[law]}
+    run = cs.run(cs.Problem([test.experiment(law, "pull")], unknown | FIXED))
+    return run, [each.cause for each in run.causes]
+
+
+@pytest.mark.parametrize("law", ["neo-hookean", "yeoh"])
+def test_a_law_that_is_too_simple_is_no_mistake_of_the_description(law):
+    run, causes = causes_of(
+        TRELOAR[:, 0] - 1, 1e6 * TRELOAR[:, 1], sigma_pa=1e4, law=law
+    )
+    assert run.solution.status is Status.CONVERGED
+    assert causes == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("law", ["mooney-rivlin", "yeoh"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_toe_region_is_no_mistake_of_the_description(law, seed):
+    noise_pa = SIGMA_PA * np.random.default_rng((seed, 3)).normal(size=25)
+    straightened = STRAIN - 0.03 * (1 - np.exp(-STRAIN / 0.03))
+    stress_pa = neo_hookean_pa(straightened) + noise_pa
+    assert causes_of(STRAIN, stress_pa, sigma_pa=SIGMA_PA, law=law)[1] == []
+
+
+@pytest.mark.parametrize("law", ["mooney-rivlin", "yeoh"])
+def test_unloading_is_no_mistake_of_the_description(law):
+    noise_pa = SIGMA_PA * np.random.default_rng((1, 3)).normal(size=25)
+    strain = STRAIN[::-1]
+    stress_pa = neo_hookean_pa(strain) * (0.6 + 0.8 * strain) + noise_pa
+    assert causes_of(strain, stress_pa, sigma_pa=SIGMA_PA, law=law)[1] == []
+    test = cs.Specimen("uniaxial", strain, stress_pa, SIGMA_PA)
+    assert "only unloading" in "".join(order_warnings(test))
+
+
+def test_nothing_is_named_after_a_search_that_did_not_converge():
+    test = cs.Specimen(
+        "uniaxial", STRAIN, neo_hookean_pa(STRAIN) * (1 + STRAIN), SIGMA_PA
+    )
+    problem = cs.Problem(
+        [test.experiment("neo-hookean", "pull")],
+        {"mu_pa": cs.Unknown(3e4)} | FIXED,
+        method=cs.ReducedSpace(max_iterations=1),
+    )
+    run = cs.run(problem)
+    assert not run.solution.status.converged
+    assert not run.causes
+
+
+# Words --------------------------------------------------------------------------------------------
+
+
+def test_residuals_of_a_simple_law_name_the_law_first():
+    run, _ = causes_of(
+        TRELOAR[:, 0] - 1, 1e6 * TRELOAR[:, 1], sigma_pa=1e4, law="neo-hookean"
+    )
+    first = run.trust.concerns[0]
+    assert first.code == "specimen/law"
+    assert "the law neo-hookean may be too simple" in first.message
+    assert "stretches of 1.13 to 7.63" in first.message
+    assert "compare-models FILE --materials neo-hookean," in first.message
+    text = str(run)
+    for word in ("reference_m", "motion", "move the body", "marker"):
+        assert not any(word in reason for reason in run.trust.reasons), word
+    assert "move the body" not in text
+
+
+def test_concerns_of_specimens_name_no_markers():
+    test = cs.Specimen("planar", STRAIN, 1e5 * STRAIN, SIGMA_PA)
+    data = {"marker": "planar/second stress", "factor": 4.0, "count": 2}
+    general = [
+        Concern("information/none", data={"names": ["c10_pa"]}),
+        Concern("noise/marker", data=data),
+        Concern("noise/markers", data=data),
+        Concern("noise/larger", data={"factor": 2.0, "stated": "sigma"}),
+        Concern("noise/smaller", data={"factor": 2.0, "stated": "sigma"}),
+        Concern("residuals/persist", data={"autocorrelation": 0.9}),
+    ]
+    concerns = as_specimen_concerns(general, [test.experiment(name="pull")])
+    assert concerns[0].code == "specimen/law"
+    text = " ".join(each.message for each in concerns)
+    assert "sigma_pa seems 2 times too large" in text
+    for word in ("marker", "reference_m", "sigma_m", "motion", "over time"):
+        assert word not in text
+    assert as_specimen_concerns(general, []) == general
