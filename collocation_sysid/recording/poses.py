@@ -64,6 +64,10 @@ class PoseSequence:
         Between samples: cubic splines of the position and of the quaternion, which is then
         normalised; linear in position with SLERP in rotation; or the latest sample. Across a jump
         (see `jump_intervals`) and between only two poses "smooth" is linear.
+    first_motion : (4, 4) array
+        Constant rigid motion [[R, p], [0, 1]] [m] that the poses contain as their first part, such
+        as a hand–eye transform; set by `after`, by default the identity. It changes no pose, but
+        separates the poses of a file from it when mistakes in the file are searched.
 
     Raises
     ------
@@ -78,6 +82,10 @@ class PoseSequence:
     positions_m: Array = key(converter=np.asarray)
     quaternions_xyzw: Array = key(converter=np.asarray)
     interpolation: Interpolation = key(Interpolation, default="smooth")
+    first_motion: Array = key(
+        converter=float_converter((4, 4), "first_motion of the poses"),
+        default_factory=lambda: np.eye(4),
+    )
 
     def __post_init__(self) -> None:
         """Check the poses, see `first_pose_fault`, and normalise the quaternions, in place."""
@@ -166,11 +174,15 @@ class PoseSequence:
             first = PoseSequence.from_matrices([0.0], np.asarray(first)[None])
         rotations = self._rotations
         positions_m = self.positions_m
+        motion = np.eye(4)
+        motion[:3, :3] = first._rotations[0].as_matrix()
+        motion[:3, 3] = first.positions_m[0]
         return replace(
             self,
             positions_m=positions_m
             + rotations.as_matrix() @ first.positions_m[0],
             quaternions_xyzw=(rotations * first._rotations[0]).as_quat(),
+            first_motion=self.first_motion @ motion,
         )
 
     def with_shift(self, shift_m: ArrayLike) -> PoseSequence:

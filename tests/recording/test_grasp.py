@@ -202,6 +202,10 @@ def test_after_moves_by_the_matrix_first():
         gripper.moved_positions(in_gripper, gripper.t_s),
         atol=1e-14,
     )
+    np.testing.assert_allclose(body.first_motion, of_body, atol=1e-14)
+    np.testing.assert_allclose(
+        body.after(of_body).first_motion, of_body @ of_body, atol=1e-14
+    )
     quaternion = Rotation.from_matrix(of_body[:3, :3]).as_quat()
     by_pose = gripper.after(PoseSequence([0.0], [of_body[:3, 3]], [quaternion]))
     np.testing.assert_allclose(

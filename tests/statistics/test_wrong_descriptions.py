@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -13,7 +14,7 @@ from kit.problem_files import both, replace_text, run_command
 from kit.problems import GUESS, TRUTH, box, released_cube
 from twins import BODIES, SOFT, STIFF, twin
 from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
-from wrong_twins import FAULTS, TRACK_FAULTS
+from wrong_twins import FAULTS, TRACK_FAULTS, reordered
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
@@ -23,7 +24,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import Experiment, Grasp
+from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.runs.check import misspecification_hypotheses
 from collocation_sysid.runs.check.body_check import check_grasps, grasp_concerns
 from collocation_sysid.runs.misspecifications import find_misspecifications
@@ -87,6 +88,58 @@ def test_a_wrong_description_is_named_before_solving(
     assert causes, fault
     assert causes[0].cause in FAULTS[fault].causes
     assert causes[0].strength > 2
+
+
+BODY_IN_GRIPPER = np.array(
+    [
+        [1.0, 0.0, 0.0, -0.03],
+        [0.0, 0.0, 1.0, 0.02],
+        [0.0, -1.0, 0.0, 0.12],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+
+
+def gripped(problem: Problem, reading: Callable[[PoseSequence], PoseSequence]):
+    """Return the problem with markers without stated places, and with poses that are those of a
+    gripper, changed by `reading`, followed by the constant pose of the body in the gripper."""
+    (experiment,) = problem.experiments
+    (grasp,) = experiment.grasps
+    of_gripper = grasp.poses.after(np.linalg.inv(BODY_IN_GRIPPER))
+    of_file = PoseSequence(
+        of_gripper.t_s,
+        of_gripper.positions_m,
+        quaternions_xyzw=of_gripper.quaternions_xyzw,
+    )
+    poses = reading(of_file).after(BODY_IN_GRIPPER)
+    markers = replace(
+        experiment.markers, placement=None, located=None, places_m=None
+    )
+    changed = replace(
+        experiment, grasps=[Grasp(grasp.nodes, poses)], markers=markers
+    )
+    return replace(problem, experiments=[changed])
+
+
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("turn", [1, -1])
+def test_a_quaternion_order_is_named_behind_a_gripper_and_without_places(
+    name: str, turn: int
+):
+    """Wrong poses place the markers at wrong points of the body, unless their places are stated."""
+    wrong = gripped(soft(name), reordered(turn))
+    causes = misspecification_hypotheses(wrong)
+    assert causes[0].cause == "quaternion-order"
+    assert causes[0].strength > 2
+
+
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_poses_of_a_gripper_without_stated_places_are_not_doubted(
+    name: str, seed: int
+):
+    right = gripped(soft(name, seed), lambda poses: poses)
+    assert misspecification_hypotheses(right) == ()
 
 
 @pytest.mark.parametrize("name", BODIES)

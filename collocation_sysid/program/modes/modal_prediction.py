@@ -10,14 +10,16 @@ it to test statements of a problem (poses, places, units) before anything is fit
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ...common.array_types import Array
+from ...fem.body import Body
 from ...model.forces import Forces
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
+from ...recording.markers import Markers
 from .natural_modes import natural_modes
 
 # Largest number of natural modes of the prediction.
@@ -59,6 +61,8 @@ class DeclaredMotion:
         Delay of the markers' clock [s].
     name : str
         Name of the experiment in quotation marks.
+    first_motion : (4, 4) array
+        Constant motion that is part of the poses and is applied first, such as `gripper_to_body`.
     """
 
     t_s: Array
@@ -69,6 +73,7 @@ class DeclaredMotion:
     mesh_scale: float = 1.0
     lag_s: float = 0.0
     name: str = ""
+    first_motion: Array = field(default_factory=lambda: np.eye(4))
 
     @classmethod
     def from_experiment(cls, experiment: Experiment) -> DeclaredMotion | None:
@@ -92,6 +97,7 @@ class DeclaredMotion:
             tracks_m=tracks,
             gravity_m_s2=gravity_m_s2,
             name=name,
+            first_motion=grasp.poses.first_motion,
         )
 
     def to_world(self, points_m: Array) -> Array:
@@ -110,6 +116,18 @@ class DeclaredMotion:
             self.rotations,
             points_m - self.translations_m[:, None],
         )
+
+    def without_first_motion(self) -> DeclaredMotion:
+        """Return the statements with the poses before `first_motion` is applied."""
+        inverse: Array = np.linalg.inv(self.first_motion).astype(np.float64)
+        return self.with_prior_motion(inverse[:3, :3], inverse[:3, 3])
+
+    def with_first_motion(self) -> DeclaredMotion:
+        """Return the statements with `first_motion` applied before the poses, as the inverse of
+        `without_first_motion`.
+        """
+        first = self.first_motion
+        return self.with_prior_motion(first[:3, :3], first[:3, 3])
 
     def with_prior_motion(
         self, rotation: Array, translation_m: Array
@@ -158,8 +176,10 @@ class ModalResponse:
         Markers on the undeformed body [m].
     relative_frequencies : (K,) array
         Angular frequencies relative to the lowest.
+    node_shapes : (K, n, 3) array
+        Displacements of the nodes, for modes with φᵀ M φ = 1 kg.
     shapes : (K, M, 3) array
-        Displacements of the markers, for modes with φᵀ M φ = 1 kg.
+        Displacements of the markers in these modes.
     translation_loads : (K, 3) array
         Modal loads φᵀM of a uniform acceleration.
     rotation_loads : (K, 3, 3) array
@@ -172,6 +192,7 @@ class ModalResponse:
 
     places_m: Array
     relative_frequencies: Array
+    node_shapes: Array
     shapes: Array
     translation_loads: Array
     rotation_loads: Array
@@ -206,11 +227,20 @@ class ModalResponse:
         return cls(
             markers.predict_positions(body.nodes_m),
             omega / omega[:1],
+            node_shapes=modes.shapes,
             shapes=markers.predict_positions(modes.shapes),
             translation_loads=weighted.sum(axis=1),
             rotation_loads=np.einsum("kni,nj->kij", weighted, body.nodes_m),
             size_m=float(np.linalg.norm(np.ptp(body.nodes_m, axis=0))),
             is_initially_at_rest=experiment.start == "equilibrium",
+        )
+
+    def with_markers(self, markers: Markers, body: Body) -> ModalResponse:
+        """Return the response at the places of other markers on the same body."""
+        return replace(
+            self,
+            places_m=markers.predict_positions(body.nodes_m),
+            shapes=markers.predict_positions(self.node_shapes),
         )
 
     def predict(self, declared: DeclaredMotion) -> Array:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -23,6 +24,7 @@ from ...program.modes.modal_prediction import (
     delayed_tracks,
 )
 from ...recording.experiment import Experiment
+from ...recording.placement import LocatedBody, place_markers
 from ..axes import OTHER_AXES
 from .initial_motion import initial_motion_hypotheses
 from .misspecification_hypothesis import (
@@ -192,18 +194,18 @@ class ModalComparison:
 
     Attributes
     ----------
+    experiment : Experiment
+        The recording.
     declared : DeclaredMotion
         Description as stated.
-    names : (M,) tuple of str
-        Names of the markers.
     response : ModalResponse
         Natural modes at the markers.
     floor_m : float
         Smallest misfit that can be expected [m].
     """
 
+    experiment: Experiment
     declared: DeclaredMotion
-    names: tuple[str, ...]
     response: ModalResponse
     floor_m: float
 
@@ -230,11 +232,10 @@ class ModalComparison:
             response = ModalResponse.from_experiment(experiment, constants)
         except (SimulationError, np.linalg.LinAlgError, ArpackError):
             return None
-        markers = experiment.markers
-        noise_m = np.sqrt(3) * np.median(markers.sigma_m)
+        noise_m = np.sqrt(3) * np.median(experiment.markers.sigma_m)
         return cls(
+            experiment,
             declared,
-            markers.names,
             response=response,
             floor_m=float(np.hypot(noise_m, ROUGHLY * response.size_m)),
         )
@@ -247,6 +248,59 @@ class ModalComparison:
             self._misfits_m(declared, self.response.predict(declared)).min()
         )
 
+    def misfit_at_implied_places_m(self, declared: DeclaredMotion) -> float:
+        """Return the misfit of a corrected description as `misfit_m` does, with the markers at the
+        places on the body that this description implies [m].
+
+        A marker without a stated place is attached where its first sample is on the body as the
+        grasp carries it; poses with a mistake attach it to a wrong place, and correct poses alone
+        would not fit there.
+        """
+        response = self._response_at_implied_places(declared)
+        return float(
+            self._misfits_m(declared, response.predict(declared)).min()
+        )
+
+    def _response_at_implied_places(
+        self, declared: DeclaredMotion
+    ) -> ModalResponse:
+        """Return the response with the markers without a stated place attached to the point of the
+        body that is nearest to their first sample in the frame of the grasp.
+
+        The response is unchanged if all places are stated, or if the rotations are. With another
+        unit of length, the places have no meaning: tracks that shrink to a point fit anywhere.
+        """
+        markers = self.experiment.markers
+        has_same_rotations = declared.rotations is self.declared.rotations
+        if has_same_rotations or markers.located.all():
+            return self.response
+        body = self.experiment.body
+        in_grasp_m = declared.to_grasp_frame(declared.tracks_m)
+        first_rows = np.isfinite(in_grasp_m[..., 0]).argmax(axis=0)
+        places_m = self.response.places_m.copy()
+        for m in np.flatnonzero(~markers.located).tolist():
+            point_m = in_grasp_m[first_rows[m], m]
+            if np.isfinite(point_m).all():
+                nodes, weights = self._located_body.weights_at_nearest_point(
+                    point_m
+                )
+                places_m[m] = weights @ body.nodes_m[nodes]
+        placement = place_markers(
+            places_m,
+            body.nodes.points_m,
+            body=body,
+            attach=markers.attach,
+            max_distance_m=np.inf,
+        )
+        return self.response.with_markers(
+            replace(markers, placement=placement), body
+        )
+
+    @cached_property
+    def _located_body(self) -> LocatedBody:
+        """The undeformed body, prepared for locating points in it."""
+        return LocatedBody(self.experiment.body.nodes_m, self.experiment.body)
+
     def best_prediction(self, declared: DeclaredMotion) -> Array:
         """Return the markers (T, M, 3) [m] as predicted from a description with the stiffness and
         damping that fit best.
@@ -258,18 +312,15 @@ class ModalComparison:
         """Yield the hypotheses that fit far better than the description as stated, with their
         strength.
         """
-        trial = HypothesisTest(
-            self.misfit_m(self.declared),
-            self.misfit_m,
+        misfit_m = self.misfit_m(self.declared)
+        yield from HypothesisTest(
+            misfit_m,
+            self.misfit_at_implied_places_m,
             required_factor=LEAST_IMPROVEMENT,
-        )
-        yield from trial.accepted(
-            [
-                *simple_hypotheses(self.declared),
-                *self._frame_hypotheses(),
-                *self._clock_hypotheses(),
-            ]
-        )
+        ).accepted(simple_hypotheses(self.declared))
+        yield from HypothesisTest(
+            misfit_m, self.misfit_m, required_factor=LEAST_IMPROVEMENT
+        ).accepted([*self._frame_hypotheses(), *self._clock_hypotheses()])
         yield from self._name_hypotheses()
         yield from self._other_axes()
 
@@ -388,6 +439,7 @@ class ModalComparison:
         two markers or a marker without samples.
         """
         declared = self.declared
+        names = self.experiment.markers.names
         squares = np.sum(
             (
                 declared.tracks_m[:, :, None]
@@ -397,7 +449,7 @@ class ModalComparison:
             axis=3,
         )
         is_complete = np.isfinite(squares).any(axis=0).all()
-        if not is_complete or len(self.names) < 2:
+        if not is_complete or len(names) < 2:
             return
         _, chosen = linear_sum_assignment(np.nanmean(squares, axis=0))
         exchanged = np.flatnonzero(chosen != np.arange(len(chosen)))
@@ -410,7 +462,7 @@ class ModalComparison:
             for order in (np.arange(len(chosen)), np.argsort(chosen))
         )
         listed = ", ".join(
-            f"{self.names[k]} is {self.names[chosen[k]]}" for k in exchanged
+            f"{names[k]} is {names[chosen[k]]}" for k in exchanged
         )
         hypothesis = Hypothesis(
             "markers-exchanged",
@@ -494,18 +546,23 @@ def simple_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
 
 def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     """Yield untested hypotheses of inverted poses, inverted rotations and other quaternion
-    orders.
+    orders, each of the poses as they are in the file, before a constant first motion is applied.
     """
-    inverse = declared.rotations.transpose(0, 2, 1)
-    shift = -np.einsum("tij,tj->ti", inverse, declared.translations_m)
-    inverted = replace(declared, rotations=inverse, translations_m=shift)
-    yield Hypothesis("poses-inverted", declared.name, corrected=inverted)
+    poses = declared.without_first_motion()
+    inverse = poses.rotations.transpose(0, 2, 1)
+    shift = -np.einsum("tij,tj->ti", inverse, poses.translations_m)
+    inverted = replace(poses, rotations=inverse, translations_m=shift)
+    yield Hypothesis(
+        "poses-inverted",
+        declared.name,
+        corrected=inverted.with_first_motion(),
+    )
     yield Hypothesis(
         "rotation-inverted",
         declared.name,
-        corrected=replace(declared, rotations=inverse),
+        corrected=replace(poses, rotations=inverse).with_first_motion(),
     )
-    quaternions = Rotation.from_matrix(declared.rotations).as_quat()
+    quaternions = Rotation.from_matrix(poses.rotations).as_quat()
     # Signs are free; neighbours of one sign keep the reordered ones continuous.
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     quaternions *= np.cumprod(np.r_[1.0, np.where(flips, -1.0, 1.0)])[:, None]
@@ -513,7 +570,7 @@ def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
         reordered = Rotation.from_quat(
             np.roll(quaternions, turn, axis=1)
         ).as_matrix()
-        without = replace(declared, rotations=reordered)
+        without = replace(poses, rotations=reordered).with_first_motion()
         yield Hypothesis(
             "quaternion-order",
             declared.name,
