@@ -216,7 +216,7 @@ def test_tables_are_markdown():
 
 
 def test_a_twin_with_noisy_poses_is_identified_and_listed():
-    found = study_faults.run("poses 0.1 mm, 0.06°, judged", (0, 1))
+    found = study_faults.run("poses 0.1 mm, 0.06°, estimated", (0, 1))
     assert found.converged
     assert found.contains_truth.sum() >= 3
     (line,) = cells(
