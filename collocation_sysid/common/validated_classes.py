@@ -112,9 +112,8 @@ def validate_arguments(kind: Any, refusal: Refusal) -> None:
             return
         except ValidationError as error:
             fault = error.errors(include_url=False)[0]
-        # Outside of the handler, so that the error is shown alone. Other arguments than those of
-        # the constructor are a TypeError.
-        bound = inspect.signature(kind).bind(*arguments, **by_name).arguments
+        # Outside of the handler, so that the error is shown alone.
+        bound = _bind_arguments(kind, arguments, by_name)
         vars(self).update(bound | vars(self))
         if fault["loc"] and isinstance(fault["loc"][0], int):
             names = [*bound][fault["loc"][0]], *fault["loc"][1:]
@@ -123,6 +122,31 @@ def validate_arguments(kind: Any, refusal: Refusal) -> None:
 
     kind.__pydantic_config__ = _CONFIGURATION
     kind.__init__ = construct
+
+
+def _bind_arguments(
+    kind: Any, arguments: tuple[Any, ...], by_name: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the arguments of the constructor of a class by the names of its fields.
+
+    Raises
+    ------
+    TypeError
+        If the arguments are others than those of the constructor; the message names the class, and
+        its other constructors (class methods from_…) if there are any.
+    """
+    try:
+        return inspect.signature(kind).bind(*arguments, **by_name).arguments
+    except TypeError as error:
+        message = str(error)
+    others = [
+        f"{kind.__name__}.{name}"
+        for name in dir(kind)
+        if name.startswith("from_")
+        and isinstance(inspect.getattr_static(kind, name), classmethod)
+    ]
+    hint = f"; other constructors: {', '.join(others)}" if others else ""
+    raise TypeError(f"{kind.__name__}: {message}{hint}")
 
 
 @cache

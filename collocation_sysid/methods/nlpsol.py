@@ -150,7 +150,17 @@ def solve(
     problem_variables = convert_variables(z, program, target=collocation)
     status = judge(status, problem_variables, problem_multipliers)
     name = NAMES.get(plugin, plugin)
-    message = f"{status.sentence} ({name}: {result.return_status})"
+    limits = [
+        value
+        for option, value in options.items()
+        if option.rpartition(".")[2] == "max_iter"
+    ]
+    sentence = (
+        status.explain(recorder.method, max_iterations=limits[0])
+        if limits
+        else status.sentence
+    )
+    message = f"{sentence} ({name}: {result.return_status})"
     return recorder.solution(
         status,
         message,

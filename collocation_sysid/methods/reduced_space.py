@@ -132,7 +132,9 @@ class ReducedSpace(SearchOptions):
             status = status or Status.CONVERGED
             if search.ended_by_association:
                 recorder.notes.append(ENDED_BY_ASSOCIATION)
-            message = status.sentence
+            message = status.explain(
+                self.name, max_iterations=self.max_iterations
+            )
         except SEARCH_ENDS as end:
             status, message = status_of_end(end)
         return _solution_of_search(

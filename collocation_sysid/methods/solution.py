@@ -55,6 +55,24 @@ class Status(Enum):
         """Explanation of the status for the user, one sentence with advice."""
         return _SENTENCES[self]
 
+    def explain(self, method: str, max_iterations: int) -> str:
+        """Return `sentence`; at the iteration limit, with the complete option that doubles it.
+
+        Parameters
+        ----------
+        method : str
+            Name of the method, such as "reduced-space".
+        max_iterations : int
+            Limit of the method that ended.
+        """
+        if self is not Status.ITERATION_LIMIT:
+            return self.sentence
+        key = f"solver.{method}.max_iterations"
+        return (
+            f"Stopped at the iteration limit of {max_iterations}; raise it "
+            f"(--set {key}={2 * max_iterations}) or start from a better guess."
+        )
+
 
 _SENTENCES = {
     Status.CONVERGED: "Converged: the optimality conditions hold to the tolerance.",

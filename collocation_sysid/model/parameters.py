@@ -855,9 +855,9 @@ class Parameters:
                         None,
                         where=name,
                     )
-                expected = ", ".join(
-                    dict.fromkeys(n for body in bodies for n in body.constants)
-                )
+                # Names with and without a region are one entry: those without come first.
+                plain = [n for n in known if "." not in n] or known
+                expected = ", ".join(dict.fromkeys(plain))
                 raise InputError(
                     f"the model has no such parameter; expected one of {expected}{hint_at(name, known)}",
                     None,

@@ -290,10 +290,17 @@ def _marker_summary(recording: RecordingCheck) -> str:
         if recording.missing
         else "none missing"
     )
-    return (
-        f"{len(recording.markers)} markers, {missing}; farthest from the body "
-        f"'{farthest.name}', {round(1e3 * farthest.distance_m, 2):g} mm{besides}"
-    )
+    nearest = "attached at the point of the body nearest to the first sample"
+    if recording.unplaced == len(recording.markers):
+        place = f"no place stated, each {nearest}"
+    else:
+        place = (
+            f"farthest from the body '{farthest.name}', "
+            f"{round(1e3 * farthest.distance_m, 2):g} mm"
+        )
+        if recording.unplaced:
+            place += f"; {recording.unplaced} without a stated place, {nearest}"
+    return f"{len(recording.markers)} markers, {missing}; {place}{besides}"
 
 
 def _solve_section(findings: CheckResult) -> Table:

@@ -168,7 +168,8 @@ PROBLEM_FILE = [
         edit=replace_text(MU, 'mu_pa = "soft"'),
     ),
     bad(
-        "unknown-parameter", "parameters.mu_p: the model has no such parameter", "did you mean 'mu_pa'?",
+        "unknown-parameter", "parameters.mu_p: the model has no such parameter", "young_pa, poisson",
+        "did you mean 'mu_pa'?",
         edit=replace_text("mu_pa  ", "mu_p"),
     ),
     bad(

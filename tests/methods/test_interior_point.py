@@ -263,6 +263,7 @@ def test_ipopt_starts_near_the_optimum_and_the_notes_tell_how():
 def test_the_initial_point_is_not_the_answer():
     solution = InteriorPoint(max_iterations=1, tolerance=1e-15)(cube())
     assert solution.status is Status.ITERATION_LIMIT
+    assert "--set solver.interior-point.max_iterations=2)" in solution.message
     coarse = ReducedSpace(tolerance=LARGEST_CORRECTION)(cube())
     assert not np.array_equal(solution.z, coarse.z)
 

@@ -334,6 +334,7 @@ def test_rows_that_stay_out_of_reach_are_a_status(
 def test_the_iteration_limit_is_a_status():
     solution = ReducedSpace(max_iterations=3)(cube())
     assert solution.status is Status.ITERATION_LIMIT
+    assert "--set solver.reduced-space.max_iterations=6)" in solution.message
     assert solution.iterations <= 4
     assert solution.parameters == solution.history[-1].parameters
 

@@ -190,6 +190,14 @@ def test_a_motion_that_samples_resolve_has_no_jumps(rate_hz):
     assert PoseSequence(t_s, started, upright).jumps_s.size == 0
 
 
+def test_matrices_in_place_of_positions_and_quaternions_name_the_constructor():
+    matrices: Any = np.eye(4)[None]
+    with pytest.raises(
+        TypeError, match=r"PoseSequence: missing .*PoseSequence\.from_matrices"
+    ):
+        PoseSequence([0.0], matrices)  # pyright: ignore[reportCallIssue]
+
+
 def test_after_moves_by_the_matrix_first():
     gripper = recorded(20)
     of_body = np.eye(4)

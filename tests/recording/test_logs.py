@@ -52,6 +52,11 @@ def about_z(angle: float) -> np.ndarray:
     return Rotation.from_rotvec([0, 0, angle]).as_quat()
 
 
+def test_a_missing_log_is_not_called_damaged(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no such file or folder"):
+        list_topics(tmp_path / "none.bag")
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_problem_read_from_a_log_is_the_one_of_its_files(
     tmp_path: Path, kind: str

@@ -36,6 +36,7 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.recording.obstacle import Obstacle
 from collocation_sysid.recording.obstacle_solids import Sphere
 from collocation_sysid.result.check_sections import (
+    _marker_summary,
     full_check_tables,
     quick_check_tables,
 )
@@ -353,6 +354,20 @@ def test_a_marker_far_from_the_body_is_named(tiny: Path):
     assert about(findings, "marker 'side' of 'swing' lies 25 mm", "reference_m")
     assert findings.recordings[0].find_farthest_marker().name == "side"
     assert findings.largest_marker_distance_m == pytest.approx(0.025)
+
+
+def test_places_that_the_poses_determine_have_no_distance(tiny: Path):
+    """It would be small for wrong poses, too."""
+    without = replace_text(f"reference_m = {REFERENCES}\n", "")
+    without(tiny)
+    (recording,) = checked(tiny).recordings
+    assert recording.unplaced == len(recording.markers)
+    summary = _marker_summary(recording)
+    assert "no place stated, each attached at the point" in summary
+    assert "farthest" not in summary
+    some = _marker_summary(replace(recording, unplaced=1))
+    assert "farthest from the body" in some
+    assert "1 without a stated place" in some
 
 
 def blank(*samples: tuple[int, int]) -> Edit:

@@ -140,9 +140,11 @@ def open_log(path: Path, episode: int | None = None) -> Iterator[Log]:
     Raises
     ------
     InputError
-        If it is no log, is damaged, or a package that reads it is missing. Any other exception in
-        the ``with`` block, except `ImportError`, is taken for damage.
+        If it does not exist, is no log, is damaged, or a package that reads it is missing. Any
+        other exception in the ``with`` block, except `ImportError`, is taken for damage.
     """
+    if not path.exists():
+        raise InputError("there is no such file or folder")
     for each in (path, *(path.iterdir() if path.is_dir() else ())):
         require_regular(each)
     if (path / "meta" / "info.json").is_file():

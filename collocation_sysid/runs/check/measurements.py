@@ -64,6 +64,9 @@ class RecordingCheck:
         Numbers of marker samples that are present, and that are missing.
     markers : tuple of MarkerCheck
         One for each marker; empty without markers.
+    unplaced : int
+        Number of markers without a stated place, which are attached at the point of the body that is
+        nearest to their first sample, so that their distance says nothing about the poses.
     instruments : tuple of str
         Other instruments, in words.
     air_density_kg_m3 : float
@@ -84,6 +87,7 @@ class RecordingCheck:
     instruments: tuple[str, ...]
     air_density_kg_m3: float = 0.0
     test: str = ""
+    unplaced: int = 0
 
     def find_farthest_marker(self) -> MarkerCheck:
         """Return the marker farthest from the body; `ValueError` without markers."""
@@ -147,6 +151,7 @@ def check_recording(
         test=""
         if experiment.specimen is None
         else f"{experiment.specimen.test} specimen",
+        unplaced=int((~markers.located).sum()),
     )
 
 
