@@ -20,6 +20,7 @@ import numpy as np
 from twins import random_poses
 
 import collocation_sysid as cs
+from collocation_sysid.statistics.budget.systematic_effects import KnownEffect
 
 TRUTH = {
     "young_pa": 5e3,
@@ -59,14 +60,14 @@ class HiddenError:
         Experiment that is fitted, with the markers at the same places.
     more_constants : mapping
         Constants of the simulated body beside `TRUTH`.
-    assumptions : mapping
-        Stated assumptions of the budget; the defaults otherwise.
+    assumptions : Assumptions
+        Assumptions of the budget.
     """
 
     actual: cs.Experiment
     described: cs.Experiment
     more_constants: Mapping[str, float] = field(default_factory=dict)
-    assumptions: Mapping[str, object] = field(default_factory=dict)
+    assumptions: cs.Assumptions = field(default_factory=cs.Assumptions)
 
 
 def block(height_m: float = SIZE_M[2], **options) -> cs.Body:
@@ -123,9 +124,10 @@ def with_heavy_markers(seed: int) -> HiddenError:
 
 def with_stated_markers(seed: int) -> HiddenError:
     """Return the same body with the mass of the markers stated in the budget."""
-    stated = {"mean": MARKER_MASS_KG, "deviation": 0.1 * MARKER_MASS_KG}
+    stated = KnownEffect(mean=MARKER_MASS_KG, deviation=0.1 * MARKER_MASS_KG)
     return replace(
-        with_heavy_markers(seed), assumptions={"marker_mass_kg": stated}
+        with_heavy_markers(seed),
+        assumptions=cs.Assumptions(marker_mass_kg=stated),
     )
 
 
@@ -205,9 +207,7 @@ def fit(name: str, seed: int) -> Outcome:
     problem = cs.Problem(
         [cs.with_markers(error.described, tracks_m + noise_m)],
         UNKNOWN,
-        uncertainty=cs.UncertaintyOptions(
-            assumptions=cs.Assumptions(**error.assumptions)
-        ),
+        uncertainty=cs.UncertaintyOptions(assumptions=error.assumptions),
     )
     run = cs.run(problem)
     low_pa, high_pa = run.interval("young_pa")

@@ -612,7 +612,7 @@ def _marker_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
         weights=placement.weights.ravel(),
         minlength=len(at.body.nodes_m),
     )
-    mass_kg = np.repeat(node_mass_kg, 3)
+    mass_kg: Array = np.repeat(node_mass_kg, 3).astype(float)
     return Effect(at.weight_and_drag(mass_kg), mass_kg)
 
 
