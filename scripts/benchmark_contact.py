@@ -9,12 +9,12 @@ are compared.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+from script_arguments import make_parser
 
 import collocation_sysid as cs
 from collocation_sysid.model.contact.contact_force import contact_terms
@@ -137,10 +137,7 @@ def main(divisions: int = 6, steps: int = 30, rounds: int = 7) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser(__doc__)
     parser.add_argument(
         "--divisions", type=int, default=6, help="elements along an edge"
     )

@@ -10,10 +10,10 @@ the side wall lies on the platen.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
+from script_arguments import make_parser
 
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.mesh_checks import orient_elements
@@ -108,10 +108,7 @@ def quarter_revolution(
 
 def main() -> None:
     """Write the mesh with the options of the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("file", type=Path, nargs="?", default=FILE)
     parser.add_argument(
         "--section",

@@ -1,8 +1,18 @@
-"""Arguments of scripts that have none: `--help` prints their description, others are refused."""
+"""Arguments of scripts: a parser whose help text is the description of the script as it is written."""
 
 from __future__ import annotations
 
 import argparse
+
+
+def make_parser(description: str | None) -> argparse.ArgumentParser:
+    """Return a parser without options, whose `--help` prints the docstring `description` of a script
+    with its own line breaks.
+    """
+    return argparse.ArgumentParser(
+        description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
 
 
 def require_no_arguments(description: str | None) -> None:
@@ -16,7 +26,4 @@ def require_no_arguments(description: str | None) -> None:
     description : str or None
         Docstring of the script.
     """
-    argparse.ArgumentParser(
-        description=description,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    ).parse_args()
+    make_parser(description).parse_args()

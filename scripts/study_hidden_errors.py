@@ -3,20 +3,20 @@
 A block of foam is moved at random, as in `twins`. Its tracks are simulated with an effect that the
 described body does not have, or with another body, and are fitted with all options at their default.
 The estimated parameters absorb such errors, so that the residuals look like noise. The table has
-the mean of the estimated E over the true one, how many combined intervals contain the true E, and
-the verdicts.
+the smallest and the largest estimated E over the true one, how many combined intervals contain the
+true E, and the verdicts.
 
     python scripts/study_hidden_errors.py [--twins 5] [--only markers memory]
 """
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from script_arguments import make_parser
 from twins import random_poses
 
 import collocation_sysid as cs
@@ -71,7 +71,7 @@ class HiddenError:
 
 
 def block(height_m: float = SIZE_M[2], **options) -> cs.Body:
-    """Return the block, or a higher one; options are those of `Body`."""
+    """Return the block, or one of another height; options are those of `Body`."""
     mesh = cs.box_mesh((*SIZE_M[:2], height_m), DIVISIONS)
     return cs.Body(mesh, density_kg_m3=DENSITY_KG_M3, **options)
 
@@ -220,10 +220,7 @@ def fit(name: str, seed: int) -> Outcome:
 
 def main() -> None:
     """Run the study with the options of the command line, and print its table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--twins", type=int, default=5, help="of each error")
     parser.add_argument(
         "--only", nargs="+", choices=tuple(ERRORS), default=tuple(ERRORS)

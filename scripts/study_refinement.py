@@ -10,10 +10,10 @@ intervals that contain the truth: for independent noise alone, and with the nume
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 
 import numpy as np
+from script_arguments import make_parser
 from twins import random_poses
 
 from collocation_sysid.fem.body import Body
@@ -167,10 +167,7 @@ def main(twins: int = 20, first: int = 0) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--twins", type=int, default=20, help="of each body")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     options = parser.parse_args()

@@ -8,11 +8,11 @@ sixteenth of the sampling interval, and with noise of 0.05, 0.2 or 1 mm.
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from dataclasses import replace
 
 import numpy as np
+from script_arguments import make_parser
 from study_refinement import BODIES, NAMES, STEP_S, unmeasured_problem
 
 from collocation_sysid.pipeline import run
@@ -104,10 +104,7 @@ def _interval_with_step(
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser(__doc__)
     parser.add_argument(
         "--twins", type=int, default=20, help="of each body and noise"
     )

@@ -150,16 +150,16 @@ def solve(
     problem_variables = convert_variables(z, program, target=collocation)
     status = judge(status, problem_variables, problem_multipliers)
     name = NAMES.get(plugin, plugin)
-    limits = [
-        value
-        for option, value in options.items()
-        if option.rpartition(".")[2] == "max_iter"
-    ]
-    sentence = (
-        status.explain(recorder.method, max_iterations=limits[0])
-        if limits
-        else status.sentence
+    # Solvers that have a limit call it max_iter, some with a prefix, as "ipopt.max_iter".
+    limit = next(
+        (
+            value
+            for option, value in options.items()
+            if option.rpartition(".")[2] == "max_iter"
+        ),
+        None,
     )
+    sentence = status.explain(recorder.method, max_iterations=limit)
     message = f"{sentence} ({name}: {result.return_status})"
     return recorder.solution(
         status,

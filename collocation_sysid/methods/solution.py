@@ -55,17 +55,17 @@ class Status(Enum):
         """Explanation of the status for the user, one sentence with advice."""
         return _SENTENCES[self]
 
-    def explain(self, method: str, max_iterations: int) -> str:
+    def explain(self, method: str, max_iterations: int | None) -> str:
         """Return `sentence`; at the iteration limit, with the complete option that doubles it.
 
         Parameters
         ----------
         method : str
             Name of the method, such as "reduced-space".
-        max_iterations : int
-            Limit of the method that ended.
+        max_iterations : int or None
+            Limit of the method that ended; None if it is unknown, with which the result is `sentence`.
         """
-        if self is not Status.ITERATION_LIMIT:
+        if self is not Status.ITERATION_LIMIT or max_iterations is None:
             return self.sentence
         key = f"solver.{method}.max_iterations"
         return (

@@ -5,7 +5,7 @@ force.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar, cast
 
 import casadi as ca
@@ -71,10 +71,6 @@ def stack_values(values: SensorValues) -> ca.SX:
     """Return the values of a custom sensor as a column; a matrix column after column."""
     stacked = ca.vertcat(*values) if isinstance(values, Sequence) else values
     return ca.vec(ca.SX(cast(ca.SX, stacked)))
-
-
-POINT_INPUTS = ("position_m", "velocity_m_s", "acceleration_m_s2")
-GRASP_INPUTS = ("force_n", "torque_nm")
 
 
 @declaration
@@ -253,6 +249,11 @@ class Gauge(SeparateSensor):
 
     # The expression ---------------------------------------------------------------------------
 
+    @property
+    def quantities(self) -> type[PointQuantities | GraspQuantities]:
+        """Class of the quantities of which the expression is a function."""
+        return PointQuantities if self.grasp is None else GraspQuantities
+
     def read(
         self, t_s: ca.SX, inputs: Sequence[ca.SX], unknowns: Sequence[ca.SX]
     ) -> ca.SX:
@@ -273,10 +274,9 @@ class Gauge(SeparateSensor):
         (m,) SX
             Predicted numbers.
         """
-        quantities = PointQuantities if self.grasp is None else GraspQuantities
-        at = quantities(t_s, *inputs)
         read = self.expression(
-            at, **dict(zip(self.unknowns, unknowns, strict=True))
+            self.quantities(t_s, *inputs),
+            **dict(zip(self.unknowns, unknowns, strict=True)),
         )
         if read is None:
             raise TypeError("the function returns None")
@@ -304,7 +304,7 @@ class Gauge(SeparateSensor):
         ]
         t_s = ca.SX.sym("t_s")
         own = ca.SX.sym("own", len(self.unknowns))
-        names = POINT_INPUTS if self.grasp is None else GRASP_INPUTS
+        names = [each.name for each in fields(self.quantities)]
         try:
             read = self.read(
                 t_s,
@@ -314,7 +314,7 @@ class Gauge(SeparateSensor):
         except (Exception, SystemExit) as error:
             raise InputError(
                 f"the reading '{self.name}' cannot be evaluated ({reason(error)}); expected a "
-                f"function of an argument `at` with the attributes t_s, {', '.join(names)}, and "
+                f"function of an argument `at` with the attributes {', '.join(names)}, and "
                 f"of its unknowns {', '.join(self.unknowns) or '(none)'}, in CasADi operations, such "
                 "as ca.if_else in place of if"
             ) from error

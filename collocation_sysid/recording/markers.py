@@ -226,7 +226,6 @@ class Markers:
         known = self.located
         places = self.places_m.copy()
         if not known.all():
-            shape = LocatedBody(body.nodes_m, body)
             points_m, times_s = self.first_samples
             back = (
                 points_m
@@ -239,8 +238,8 @@ class Markers:
                         f"marker '{self.names[m]}' is never visible and has no position on the "
                         "body; give its reference_m, or remove it"
                     )
-                nodes, weights = shape.weights_at_nearest_point(back[m])
-                places[m] = weights @ body.nodes_m[nodes]
+            located_body = LocatedBody(body.nodes_m, body)
+            places[~known] = located_body.places_of_points(back[~known])
         nodes_m = body.nodes.points_m
         placement = place_markers(
             places,

@@ -280,6 +280,19 @@ class LocatedBody:
             located = self.weights_at_point(nearest_m)
         return located.nodes, located.weights
 
+    def places_of_points(self, points_m: Array) -> Array:
+        """Return the places (M, 3) on the undeformed body [m] of points (M, 3) [m] that are measured
+        in the configuration of these nodes.
+
+        A point outside the body gets the place of the nearest point of its surface, and a point that
+        is not finite NaN.
+        """
+        places_m = np.full(points_m.shape, np.nan)
+        for m in np.flatnonzero(np.isfinite(points_m).all(axis=1)).tolist():
+            nodes, weights = self.weights_at_nearest_point(points_m[m])
+            places_m[m] = weights @ self.body.nodes_m[nodes]
+        return places_m
+
     def nearest_surface_point(self, point: Array) -> tuple[Array, Array]:
         """Return the nearest point (3,) [m] of the surface of straight triangles, and two
         orthogonal unit tangents of its face as columns (3, 2).

@@ -179,7 +179,7 @@ def order_warnings(specimen: Specimen) -> Iterator[str]:
             "loading and unloading, or several cycles, are mixed; expected rows in the order of "
             "time"
         )
-    if (np.diff(np.abs(strain)) <= 0).all():
+    if is_unloading(strain):
         yield (
             "the strain decreases from the first row to the last: in the order of time, the table "
             "contains only unloading, in which the stress is smaller than in loading (hysteresis); "
@@ -201,6 +201,11 @@ def _reversal_share(specimen: Specimen) -> float:
 
 # Share of the range of the strain that a reversal must exceed to end a cycle.
 HYSTERESIS = 0.1
+
+
+def is_unloading(strain: Array) -> bool:
+    """Return whether the magnitude of the strain (T,) never increases from one row to the next."""
+    return bool((np.diff(np.abs(strain)) <= 0).all())
 
 
 def cycle_starts(strain: Array) -> list[int]:

@@ -616,35 +616,33 @@ def correlation_notes(
         errors != "autocorrelated" and requested != "independent"
     ):
         return []
-    is_slight = dependence.is_slightly_correlated_in_time() and not (
-        dependence.is_correlated_in_space()
-    )
+    is_slight = dependence.is_slightly_correlated_in_time()
     pattern = "are correlated between markers or axes"
     if dependence.is_correlated_in_space():
         pattern = "are correlated between neighbouring points of the surface"
     if dependence.is_correlated_in_time():
-        slightly = (
-            "slightly " if dependence.is_slightly_correlated_in_time() else ""
-        )
+        degree = "slightly " if is_slight else ""
         pattern = (
-            f"are {slightly}correlated between consecutive samples "
+            f"are {degree}correlated between consecutive samples "
             f"(autocorrelation {dependence.lag1:.2f})"
         )
-    if errors == "autocorrelated" and is_slight:
+    if errors != "autocorrelated":
         return [
-            f"the residuals {pattern}: the model or the description of the experiment may lack a "
-            "small effect, such as the mass of markers or the memory of the material. The error "
-            "bars are widened by a model of autocorrelated errors, but do not cover a bias"
+            f"the residuals {pattern}, but error bars for independent errors were requested, which "
+            "are too small; use errors = 'auto'"
         ]
-    if errors == "autocorrelated":
-        return [
-            f"the residuals {pattern}, unlike the noise of most sensors, so the model or the "
-            "description of the experiment lacks an effect. The error bars are widened by a "
-            "model of autocorrelated errors, but do not cover a bias"
-        ]
+    lacking = (
+        ", unlike the noise of most sensors, so the model or the description of the experiment lacks "
+        "an effect"
+    )
+    if is_slight and not dependence.is_correlated_in_space():
+        lacking = (
+            ": the model or the description of the experiment may lack a small effect, such as the "
+            "mass of markers or the memory of the material"
+        )
     return [
-        f"the residuals {pattern}, but error bars for independent errors were requested, which "
-        "are too small; use errors = 'auto'"
+        f"the residuals {pattern}{lacking}. The error bars are widened by a model of autocorrelated "
+        "errors, but do not cover a bias"
     ]
 
 

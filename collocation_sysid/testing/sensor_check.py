@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,11 +18,7 @@ from ..fem.meshes.structured import box_mesh
 from ..problem.code_loader import CodeLoader
 from ..program.collocation import Collocation
 from ..recording.custom_sensor import (
-    GRASP_INPUTS,
-    POINT_INPUTS,
     Gauge,
-    GraspQuantities,
-    PointQuantities,
     stack_values,
 )
 from .program_derivatives import check_program
@@ -129,12 +125,13 @@ class SensorExpression:
         and zeros of velocity and acceleration, (3, P) each; at a grasp ones (3, 1) for force and
         torque.
         """
+        _, *names = (each.name for each in fields(self.sensor.quantities))
         if self.sensor.grasp is not None:
-            return {name: np.ones((3, 1)) for name in GRASP_INPUTS}
+            return {name: np.ones((3, 1)) for name in names}
         points = np.asarray(self.sensor.points_m).T
         return {
             name: points if name == "position_m" else np.zeros_like(points)
-            for name in POINT_INPUTS
+            for name in names
         }
 
     def random_state(self, rng: np.random.Generator) -> Array:
@@ -184,12 +181,9 @@ class SensorExpression:
         named = dict(
             zip(self.sensor.unknowns, map(float, unknowns), strict=True)
         )
-        quantities = (
-            PointQuantities if self.sensor.grasp is None else GraspQuantities
-        )
         now_s = self.t_s if t_s is None else t_s
         # Numbers in place of expressions.
-        at = quantities(now_s, *values)  # type: ignore[arg-type]
+        at = self.sensor.quantities(now_s, *values)  # type: ignore[arg-type]
         reading = stack_values(self.sensor.expression(at, **named))
         return ca.evalf(reading).full().ravel()
 

@@ -343,13 +343,7 @@ class MarkerAssociation:
         (M, 3) array
             Places [m]; NaN where a point is not finite.
         """
-        shape = LocatedBody(nodes_m, self.body)
-        places_m = np.full(points_m.shape, np.nan)
-        for m, point in enumerate(points_m):
-            if np.isfinite(point).all():
-                nodes, weights = shape.weights_at_nearest_point(point)
-                places_m[m] = weights @ self.body.nodes_m[nodes]
-        return places_m
+        return LocatedBody(nodes_m, self.body).places_of_points(points_m)
 
 
 def _second_derivatives(element, local: Array) -> Array:

@@ -205,9 +205,12 @@ class ExperimentAtAnswer:
         """Forces (N, 3n) of the material at the answer with its stress-free shape, without
         γ_m [N].
         """
-        return self.internal_n(
-            body=self.body.with_stress_free(self.stress_free_m)
-        )
+        return self.internal_n(body=self.stress_free_body)
+
+    @cached_property
+    def stress_free_body(self) -> Body:
+        """The body with its stress-free shape at the answer, also of a mesh made under gravity."""
+        return self.body.with_stress_free(self.stress_free_m)
 
     @cached_property
     def stress_free_m(self) -> Array:
@@ -476,11 +479,9 @@ def _density_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
     """Return the effect of a density that increases along an axis (index) of the body, by a share
     at the end farther from the centre of mass, linearly through zero there.
     """
-    place = at.body.nodes_m[:, axis]
-    middle = np.average(place, weights=at.own_mass_kg[::3])
-    mass = at.own_mass_kg * np.repeat(
-        (place - middle) / np.abs(place - middle).max(), 3
-    )
+    place_m = at.body.nodes_m[:, axis]
+    shares = _linear_shares(place_m, at.own_mass_kg[::3], extent_m=place_m)
+    mass = at.own_mass_kg * np.repeat(shares, 3)
     return Effect(at.weight_and_drag(mass), mass)
 
 
@@ -489,13 +490,30 @@ def _stiffness_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
     at the end farther from the middle of its volume, linearly through zero there; damping and
     memory are proportional to the stiffness.
     """
-    body = at.body.with_stress_free(at.stress_free_m)
-    place = at.stress_free_m[:, axis]
-    centres = place[body.cells].mean(axis=1)
-    middle = np.average(centres, weights=body.geometry[..., -1].sum(axis=1))
-    shares = (centres - middle) / np.abs(place - middle).max()
+    body = at.stress_free_body
+    place_m = at.stress_free_m[:, axis]
+    shares = _linear_shares(
+        place_m[body.cells].mean(axis=1),
+        body.geometry[..., -1].sum(axis=1),
+        extent_m=place_m,
+    )
     stiffer = body.with_stiffness_factors(1.0 + shares)
     return Effect(at.internal_n(body=stiffer) - at.internal_force_n)
+
+
+def _linear_shares(place_m: Array, weights: Array, extent_m: Array) -> Array:
+    """Return numbers (k,) that increase linearly along an axis, with a mean of zero and the magnitude
+    one at the farther end of the body.
+
+    Parameters
+    ----------
+    place_m, weights : (k,) arrays
+        Coordinates along the axis [m], and their weights in the mean.
+    extent_m : (n,) array
+        Coordinates of all nodes [m], of which the farthest from the mean is the end.
+    """
+    middle_m = np.average(place_m, weights=weights)
+    return (place_m - middle_m) / np.abs(extent_m - middle_m).max()
 
 
 def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:

@@ -244,9 +244,7 @@ class ModalComparison:
         """Return the misfit of a description with the stiffness and damping that fit best [m], at
         least `floor_m`.
         """
-        return float(
-            self._misfits_m(declared, self.response.predict(declared)).min()
-        )
+        return self._misfit_with(self.response, declared)
 
     def misfit_at_implied_places_m(self, declared: DeclaredMotion) -> float:
         """Return the misfit of a corrected description as `misfit_m` does, with the markers at the
@@ -256,7 +254,14 @@ class ModalComparison:
         grasp carries it; poses with a mistake attach it to a wrong place, and correct poses alone
         would not fit there.
         """
-        response = self._response_at_implied_places(declared)
+        return self._misfit_with(
+            self._response_at_implied_places(declared), declared
+        )
+
+    def _misfit_with(
+        self, response: ModalResponse, declared: DeclaredMotion
+    ) -> float:
+        """Return the misfit [m] of a description as predicted by a response."""
         return float(
             self._misfits_m(declared, response.predict(declared)).min()
         )
@@ -277,14 +282,12 @@ class ModalComparison:
         body = self.experiment.body
         in_grasp_m = declared.to_grasp_frame(declared.tracks_m)
         first_rows = np.isfinite(in_grasp_m[..., 0]).argmax(axis=0)
-        places_m = self.response.places_m.copy()
-        for m in np.flatnonzero(~markers.located).tolist():
-            point_m = in_grasp_m[first_rows[m], m]
-            if np.isfinite(point_m).all():
-                nodes, weights = self._located_body.weights_at_nearest_point(
-                    point_m
-                )
-                places_m[m] = weights @ body.nodes_m[nodes]
+        first_m = in_grasp_m[first_rows, np.arange(len(first_rows))]
+        first_m[markers.located] = np.nan
+        implied_m = self._located_body.places_of_points(first_m)
+        places_m = np.where(
+            np.isnan(implied_m), self.response.places_m, implied_m
+        )
         placement = place_markers(
             places_m,
             body.nodes.points_m,

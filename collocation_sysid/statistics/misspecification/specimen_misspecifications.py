@@ -26,6 +26,7 @@ from ...recording.grasp import Grasp
 from ...recording.homogeneous_deformation import HomogeneousDeformation
 from ...recording.markers import Markers
 from ...recording.specimen import LATERAL_NAME, STRESS_UNIT
+from ...recording.specimen_checks import is_unloading
 from ...recording.specimen_files import specimen_strains
 from .misspecification_hypothesis import Hypothesis, HypothesisTest
 
@@ -113,10 +114,10 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
         smallest_misfit=1.0,
         noise_level=NOISE_LEVEL,
     )
+    slopes_pa = [_initial_slope(each) for each in experiments]
     for index, experiment in enumerate(experiments):
         if len(experiment.t_s) < FEWEST_SAMPLES:
             continue
-        slopes_pa = [_initial_slope(each) for each in experiments]
         other_slopes_pa = slopes_pa[:index] + slopes_pa[index + 1 :]
         for hypothesis in test.accepted(
             _hypotheses(experiment, other_slopes_pa)
@@ -195,14 +196,13 @@ def _is_explained(
     count = sum(len(row) for row in residuals)
     freedom = max(1, count - refit.collocation.nq)
     squares = sum(float(np.sum(row**2)) for row in residuals)
-    stated_squares = count * stated_misfit**2
-    remaining_squares = count * _misfit(refit.parts) ** 2
     phi = np.concatenate([part.phi for part in refit.parts])
+    decrease = count * stated_misfit**2 - squares - float(phi @ phi)
     return bool(
         np.sqrt(squares / freedom) <= EXPLAINED
         and not any(_is_correlated(row) for row in residuals)
         and np.abs(phi).max(initial=0.0) <= PLAUSIBLE_NUISANCE
-        and stated_squares - remaining_squares >= DECISIVE
+        and decrease >= DECISIVE
     )
 
 
@@ -304,8 +304,7 @@ def _hypotheses(
     strain, _ = specimen_strains(experiment)
     areas = area_ratios(deformation, strain)
     # Stresses in unloading are smaller than in loading, like engineering in place of true stresses.
-    is_unloading = bool((np.diff(np.abs(strain)) <= 0).all())
-    if areas is not None and np.ptp(areas) and not is_unloading:
+    if areas is not None and np.ptp(areas) and not is_unloading(strain):
         yield Hypothesis(
             "specimen-true-stress",
             of,
