@@ -9,7 +9,11 @@ from ..errors import listed
 from ..fem.laws.constants import symbol_of
 from ..runs.result_content import Result
 from ..statistics.budget.uncertainty_budget import source_label
-from ..statistics.probes.relaxed_assumptions import EstimateChange, Probe
+from ..statistics.probes.relaxed_assumptions import (
+    EstimateChange,
+    Probe,
+    assumption_name,
+)
 
 # Measures of stiffness, the most important first.
 STIFFNESS_NAMES = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
@@ -100,8 +104,27 @@ def _size_and_ratio(probe: Probe) -> str:
     """
     size = probe.size or 0.0
     error = probe.size_error or 0.0
-    ratio = f", {abs(size) / error:.1f} standard errors" if error else ""
+    ratio = f", {_ratio(probe):.1f} standard errors" if error else ""
     return f"{source_label(probe.name)} ({short(size)} ± {short(error)}{ratio})"
+
+
+def _largest_probes(result: Result) -> list[Probe]:
+    """Return the probe with the most significant size of each assumption, in the order of the
+    assumptions; others are components of the same assumption.
+    """
+    largest: dict[str, Probe] = {}
+    for probe in result.probes:
+        name = assumption_name(probe.name)
+        if name not in largest or _ratio(probe) > _ratio(largest[name]):
+            largest[name] = probe
+    return list(largest.values())
+
+
+def _ratio(probe: Probe) -> float:
+    """Return the absolute size of a relaxed assumption over its standard error; 0 without one."""
+    return (
+        abs(probe.size or 0.0) / probe.size_error if probe.size_error else 0.0
+    )
 
 
 def is_routine(result: Result) -> bool:
@@ -216,7 +239,7 @@ def _conclusions(result: Result) -> Iterator[str]:
         ]:
             yield f"alternative explanations with similar effects: {listed(others)}"
     elif not significant:
-        tested = " or ".join(_size_and_ratio(p) for p in result.probes)
+        tested = " or ".join(map(_size_and_ratio, _largest_probes(result)))
         nothing = "no subset of the data and no relaxed assumption changes the fit significantly"
         yield f"no significant {tested}" if is_routine(result) else nothing
     if not is_routine(result):

@@ -27,8 +27,13 @@ from .concerns import Concern, concern_if
 from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, display_name
 from .misspecification.misspecification_hypothesis import Hypothesis
-from .probes.relaxed_assumptions import DRIFT, Probe
-from .probes.routine_probes import ROUTINE, is_alarming
+from .probes.relaxed_assumptions import (
+    DRIFT,
+    MEMORY,
+    Probe,
+    assumption_name,
+)
+from .probes.routine_probes import is_alarming, is_routine_assumption
 from .residuals.autocorrelation import PERSISTENT
 from .residuals.noise_level import NoiseLevel
 from .residuals.residual_diagnostics import MOST_WILD, MarkerDiagnosis
@@ -89,6 +94,16 @@ MOVED = 2.0
 LAWS_ADVICE = (
     "; a wrong damping or material law has similar effects: compare the laws first, with "
     "compare-models --damping and --materials"
+)
+# The same for a branch of memory with a positive, and with a negative share.
+MEMORY_ADVICE = (
+    "; these estimates are of first order in the share, for a given relaxation time. The moduli "
+    "without memory are too large for slow loads: add a branch to the material ([[object.prony]], "
+    "in Python Body(prony=...)), and estimate it"
+)
+NO_MEMORY_ADVICE = (
+    "; a negative share is not memory: another effect depends on the rate, such as the damping law. "
+    "Compare the laws with compare-models --damping and --materials"
 )
 # Codes of the concern about an estimated, and about a measured discretisation error.
 NUMERICAL = "scheme/step", "mesh/refined"
@@ -354,7 +369,8 @@ def numerical_concerns(
 
 # What is assumed, by the name of the relaxed assumption, for messages.
 RELAXED = {
-    "stiffness_drift": "the stiffness is constant during a recording",
+    DRIFT: "the stiffness is constant during a recording",
+    MEMORY: "the material has no viscoelastic memory",
     "clock_rate": "the clocks of cameras and robot run at the same rate",
     "time_scale": "all clocks run at the right rate",
 }
@@ -387,14 +403,15 @@ def probe_concerns(
     if not alarming:
         return []
     worst, *others = alarming
+    label = source_label(worst.name)
     instead = listed(
         f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in others
     )
     data = {
         "assumption": RELAXED.get(
-            worst.name, f"{source_label(worst.name)} is as stated"
+            assumption_name(worst.name), f"{label} is as stated"
         ),
-        "name": source_label(worst.name),
+        "name": label,
         "size": short(worst.size or 0.0),
         "size_error": short(worst.size_error or 0.0),
         "chi_squared": worst.chi_squared,
@@ -405,9 +422,20 @@ def probe_concerns(
             f"; alternatives that decrease χ² less: {instead}" if others else ""
         )
         + (_hysteresis_text(experiments) if worst.name == DRIFT else "")
-        + (LAWS_ADVICE if worst.name in ROUTINE else ""),
+        + _advice(worst),
     }
     return [Concern("assumption/contradicted", data=data)]
+
+
+def _advice(probe: Probe) -> str:
+    """Return the addition to a message on a relaxed assumption that names what resembles it, or how
+    to estimate it; "" for an assumption that is not probed in every solve.
+    """
+    if not is_routine_assumption(probe.name):
+        return ""
+    if assumption_name(probe.name) != MEMORY:
+        return LAWS_ADVICE
+    return MEMORY_ADVICE if (probe.size or 0.0) > 0 else NO_MEMORY_ADVICE
 
 
 def _hysteresis_text(experiments: Iterable[Experiment]) -> str:

@@ -68,7 +68,9 @@ TRUTH = {"young_pa": 8e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 1.0}
 NOISE_M = 2.5e-4
 # Timesteps of the truth, and of the fit, between two samples: else the scheme's own error shows.
 FINER, SUBSTEPS = 6, 4
-DRIFT, CLOCK = "stiffness_drift", "clock_rate"
+DRIFT, MEMORY, CLOCK = "stiffness_drift", "memory_share", "clock_rate"
+# Relaxation times between the interval of the samples and the duration of the recording.
+MEMORY_PROBES = [f"{MEMORY} τ={tau_s:g}s" for tau_s in (0.01, 0.03, 0.1, 0.3)]
 
 
 @cache
@@ -126,9 +128,13 @@ def named(finished: Run, name: str) -> Probe:
 
 
 @pytest.mark.long
-def test_a_faultless_solve_has_both_probes_and_no_alarm():
+def test_a_faultless_solve_has_all_routine_probes_and_no_alarm():
     faultless = solved()
-    assert [probe.name for probe in faultless.probes] == [DRIFT, CLOCK]
+    assert [probe.name for probe in faultless.probes] == [
+        DRIFT,
+        *MEMORY_PROBES,
+        CLOCK,
+    ]
     assert not any(probe.sentences for probe in faultless.probes)
     assert faultless.trust.verdict == "good"
     assert not is_deeper_check_worthwhile(faultless.result)
@@ -174,7 +180,7 @@ def answered(problem: Problem) -> SolvedFit:
     fit = linearise_fit(collocation, z)
     deviations = probed_deviations(Assumptions().collect_deviations())
     kept = {
-        name: deviations[name] if name in (DRIFT, CLOCK) else None
+        name: deviations[name] if name in (DRIFT, MEMORY, CLOCK) else None
         for name in deviations
     }
     return SolvedFit(
@@ -215,6 +221,7 @@ def test_what_is_stated_as_exact_is_tested_too():
     exact = dict.fromkeys(Assumptions().collect_deviations())
     assert {n: s for n, s in probed_deviations(exact).items() if s} == {
         DRIFT: 0.02,
+        MEMORY: 0.1,
         CLOCK: 1e-4,
     }
     assert probed_deviations({**exact, DRIFT: 0.1})[DRIFT] == 0.1

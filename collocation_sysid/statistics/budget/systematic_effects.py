@@ -42,6 +42,13 @@ from ...recording.homogeneous_deformation import (
 )
 from ...recording.nuisance import DEGREE
 from ...recording.placement import place_markers
+from .memory_effect import (
+    RELAXATION_TIME,
+    RELAXATION_TIMES_S,
+    is_distinguishable,
+    memory_forces_n,
+    supports_memory,
+)
 from .obstacle_effects import (
     contact_changes_by_size_n,
     obstacle_shifts_m,
@@ -272,6 +279,30 @@ class ExperimentAtAnswer:
             self.body, known, correlation=self.surface_correlation
         )
         return thickness_m(self.body) * modes
+
+    @cached_property
+    def forces_of_memory_n(self) -> dict[float, Array]:
+        """Forces (N, 3n) [N] of a branch of memory that the model lacks, with the share one, by the
+        relaxation time [s]; without relaxation times that the recording cannot distinguish from
+        other effects, and empty if memory cannot be added, see `memory_effect`.
+        """
+        experiment = self.iterate.segment.experiment
+        if not supports_memory(self.body, experiment.is_static):
+            return {}
+        sampling_s = float(np.diff(experiment.t_s).min())
+        duration_s = float(np.ptp(experiment.t_s))
+        distinguishable = [
+            tau_s
+            for tau_s in RELAXATION_TIMES_S
+            if is_distinguishable(tau_s, sampling_s, duration_s)
+        ]
+        forces_n = memory_forces_n(
+            self.stress_free_body,
+            self.dynamics,
+            self.iterate.x,
+            relaxation_times_s=distinguishable,
+        )
+        return dict(zip(distinguishable, forces_n, strict=True))
 
     @cached_property
     def likely_support_dofs(self) -> Index:
@@ -560,6 +591,15 @@ def _drift(at: ExperimentAtAnswer, _: int) -> Effect:
     t_s = at.dynamics.evaluated_s
     since = (t_s - t_s.mean()) / max(np.ptp(t_s), 1e-300)
     return Effect(at.internal_n() * since[:, None])
+
+
+def _memory(at: ExperimentAtAnswer, index: int) -> Effect | None:
+    """Return the effect of a branch of memory with one of `RELAXATION_TIMES_S` (index), per unit of
+    its share; None where the model has memory, and if the recording cannot show it, see
+    `ExperimentAtAnswer.forces_of_memory_n`.
+    """
+    force_n = at.forces_of_memory_n.get(RELAXATION_TIMES_S[index])
+    return None if force_n is None else Effect(force_n)
 
 
 def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
@@ -995,6 +1035,18 @@ ASSUMPTIONS = (
         of_specimens=True,
     ),
     Assumption(
+        "memory_share",
+        "1",
+        sigma=None,
+        description="share of a branch of viscoelastic memory (Prony term) that the material lacks, for "
+        "each relaxation time that the recording can show",
+        remedy="add a branch of memory to the material, and estimate its share",
+        effect=_memory,
+        component_names=" ".join(
+            f"{RELAXATION_TIME}{tau_s:g}s" for tau_s in RELAXATION_TIMES_S
+        ),
+    ),
+    Assumption(
         "time_scale",
         "1",
         sigma=1e-4,
@@ -1169,6 +1221,9 @@ class Assumptions:
         Relative difference of the stiffness along one axis from that across it [1].
     stiffness_drift : float or "none"
         Relative change of the stiffness from the beginning to the end of a recording [1].
+    memory_share : float or "none"
+        Share of a branch of viscoelastic memory (Prony term) that the material lacks, for each
+        relaxation time that the recording can show [1].
     time_scale : float or "none"
         Relative error of the rate of all clocks [1].
     poisson : float or "none"
@@ -1287,6 +1342,7 @@ class Assumptions:
     stiffness_gradient: Deviation = 0.05
     anisotropy: Deviation = 0.05
     stiffness_drift: Deviation = 0.02
+    memory_share: Deviation = "none"
     time_scale: Deviation = 0.0001
     poisson: Deviation = 0.02
     damping_law: Deviation = 1.0

@@ -25,6 +25,7 @@ from ..uncertainty import Uncertainty
 from .combined_intervals import NORMAL_95, Interval, combine, widened_interval
 from .consider_analysis import ResidualChanges
 from .discretisation_error import DiscretisationError, estimate_changes
+from .memory_effect import RELAXATION_TIME
 
 NOISE = "noise"
 NUISANCES = "nuisance parameters"
@@ -478,8 +479,8 @@ def main_sources(
 
 
 def source_label(source: str) -> str:
-    """Return the name of a source as text for messages: without a unit suffix such as "_rad", and
-    with spaces for underscores.
+    """Return the name of a source as text for messages: without a unit suffix such as "_rad", with
+    spaces for underscores, and with a relaxation time in parentheses.
     """
     unit = next(
         (
@@ -489,4 +490,6 @@ def source_label(source: str) -> str:
         ),
         "",
     )
-    return source.removesuffix(unit).replace("_", " ")
+    label = source.removesuffix(unit).replace("_", " ")
+    name, _, time = label.partition(f" {RELAXATION_TIME}")
+    return f"{name} ({RELAXATION_TIME}{time})" if time else label

@@ -42,9 +42,9 @@ from .relaxed_assumptions import (
     with_relaxed_assumption,
 )
 from .routine_probes import (
-    ROUTINE,
     WIDENING,
     is_alarming,
+    is_routine_assumption,
     routine_probes,
     significance_limit,
 )
@@ -74,7 +74,9 @@ def routine_probes_with_steps(fit: SolvedFit) -> tuple[Probe, ...]:
         return probes
     worst = max(alarming, key=lambda probe: probe.chi_squared)
     with_steps = replace(
-        _iterate_probe(fit, worst, limit=significance_limit(fit.changes)),
+        _iterate_probe(
+            fit, worst, limit=significance_limit(fit.changes, worst.name)
+        ),
         routine=True,
     )
     return tuple(with_steps if probe is worst else probe for probe in probes)
@@ -92,9 +94,12 @@ def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
     relaxed = [*_relaxed_probes(solved_fit)]
     tests = sum(len(probe.moves) for probe in parts) + len(relaxed)
     limit = float(normal_isf(CHANCE / 2 / max(1, tests)))
-    limits = dict.fromkeys(
-        (probe.name for probe in relaxed), limit
-    ) | dict.fromkeys(ROUTINE, significance_limit(solved_fit.changes))
+    limits = {
+        probe.name: significance_limit(solved_fit.changes, probe.name)
+        if is_routine_assumption(probe.name)
+        else limit
+        for probe in relaxed
+    }
     significant = [p for p in relaxed if p.is_beyond(limits[p.name])]
     with counted_phase(StepUnit.ASSUMPTION, len(significant)):
         iterated = {
@@ -282,4 +287,4 @@ def _widening(name: str) -> float:
     """Return the standard deviation of an assumption's prior, in deviations of the budget, for its
     name with component: `WIDENING` for routine assumptions, else 1.
     """
-    return WIDENING if name in ROUTINE else 1.0
+    return WIDENING if is_routine_assumption(name) else 1.0

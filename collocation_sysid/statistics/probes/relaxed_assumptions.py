@@ -32,6 +32,7 @@ from ..residuals.recording_scatter import TELLING
 from ..uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 DRIFT = "stiffness_drift"
+MEMORY = "memory_share"
 # Share of the range of the load by which it may return in a static recording that still counts as
 # monotonic: measured displacements scatter.
 RETURN = 0.02

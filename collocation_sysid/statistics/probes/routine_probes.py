@@ -1,8 +1,10 @@
-"""Tests of two assumptions in every solve: constant stiffness, and clocks of equal rate.
+"""Tests of three assumptions in every solve: constant stiffness, a material without memory, and
+clocks of equal rate.
 
-A drift of the stiffness and a rate of the cameras' clock join the linearised fit as one more column
-each, see `relaxed_assumptions`. The uncertainty budget needs these columns anyway, so that a probe
-costs one least-squares problem and no simulation. `deep_probes` (``solve --probe``) relaxes all
+A drift of the stiffness, a branch of viscoelastic memory with each of several relaxation times, and
+a rate of the cameras' clock join the linearised fit as one more column each, see
+`relaxed_assumptions`. The columns are computed together with those of the uncertainty budget, so
+that a probe costs one least-squares problem and no simulation. `deep_probes` (``solve --probe``) relaxes all
 other assumptions, refits parts of the data, and follows effects that are too large for one linear
 step.
 
@@ -14,6 +16,7 @@ any change is large.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -23,15 +26,19 @@ from ..budget.systematic_effects import ASSUMPTIONS
 from ..distributions import normal_isf
 from .relaxed_assumptions import (
     DRIFT,
+    MEMORY,
     Probe,
     SolvedFit,
+    assumption_name,
     relaxed_probe,
     with_relaxed_assumption,
 )
 
-# Assumptions that are probed in every solve: both can be wrong while the residuals look white, bias
-# the estimates, and are determined by a single recording.
-ROUTINE = (DRIFT, CLOCK_RATE.name)
+# Assumptions that are probed in every solve: each can be wrong while the residuals look white, biases
+# the estimates, and is determined by a single recording.
+ROUTINE = (DRIFT, MEMORY, CLOCK_RATE.name)
+# Unit of the share of a branch of memory, which is not in the budget by default.
+MEMORY_SHARE = 0.1
 # Probability that any routine probe of a faultless run is significant, as of every other test of
 # the verdict. The first order that a probe rests on is not exact: at a level of 1/200 one of six
 # draws of the noise of one faultless recording was significant.
@@ -58,14 +65,15 @@ def probed_deviations(
         Standard deviation of each assumption or nuisance parameter; None if exact.
     """
     usual = {row.name: row.sigma for row in ASSUMPTIONS}
+    usual[MEMORY] = MEMORY_SHARE
     usual[CLOCK_RATE.name] = CLOCK_RATE.considered or 0.0
     exact = [name for name in ROUTINE if deviations.get(name) is None]
     return {**deviations, **{name: usual[name] for name in exact}}
 
 
 def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
-    """Return the probes that relax each routine assumption by one linear step from the answer, in
-    the order of `ROUTINE`; none is left out because it is not significant.
+    """Return the probes that relax each component of a routine assumption by one linear step from
+    the answer, in the order of the changes; none is left out because it is not significant.
 
     Parameters
     ----------
@@ -78,9 +86,11 @@ def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
     tuple of Probe
         Probes with `routine` set; `sentences` is empty where the amplitude is not significant.
     """
-    limit = significance_limit(solved_fit.changes)
     probes = []
-    for name in ROUTINE:
+    names = dict.fromkeys(
+        name for name in solved_fit.changes.names if is_routine_assumption(name)
+    )
+    for name in names:
         wide = with_relaxed_assumption(
             solved_fit.fit, solved_fit.changes, name=name, widening=WIDENING
         )
@@ -91,23 +101,39 @@ def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
             probe = relaxed_probe(
                 solved_fit, name, wide=wide, p=solved_fit.read_parameters()
             )
+            limit = significance_limit(solved_fit.changes, name)
             significant = (name,) if probe.is_beyond(limit) else ()
             probes.append(replace(probe, routine=True, sentences=significant))
     return tuple(probes)
 
 
-def significance_limit(changes: ResidualChanges) -> float:
+def is_routine_assumption(name: str) -> bool:
+    """Return whether an assumption, given by its name with its component, is probed in every
+    solve.
+    """
+    return assumption_name(name) in ROUTINE
+
+
+def significance_limit(changes: ResidualChanges, name: str) -> float:
     """Return the least significant amplitude of a routine probe, in its standard errors.
 
-    Bonferroni's bound over all amplitudes: a drift has one, the clock rate one for each recording.
+    The probability of a false alarm is divided equally among the routine assumptions, and that of
+    an assumption among its amplitudes (Bonferroni): a drift has one, memory one for each relaxation
+    time, and the clock rate one for each recording. The amplitudes of memory are correlated, so that
+    the bound is conservative.
 
     Parameters
     ----------
     changes : ResidualChanges
-        Changes whose `names` are counted; without a routine assumption, one amplitude is assumed.
+        Changes whose `names` are counted.
+    name : str
+        Name of the assumption, with or without its component.
     """
-    amplitudes = sum(name in ROUTINE for name in changes.names)
-    return float(normal_isf(FALSE_ALARMS / 2 / max(1, amplitudes)))
+    amplitudes = Counter(
+        map(assumption_name, filter(is_routine_assumption, changes.names))
+    )
+    tests = max(1, len(amplitudes)) * max(1, amplitudes[assumption_name(name)])
+    return float(normal_isf(FALSE_ALARMS / 2 / tests))
 
 
 def is_alarming(probe: Probe) -> bool:
