@@ -37,8 +37,7 @@ strain rate if the samples are equilibria without times.
 
 **Intervals** are combined 95 % intervals of noise, discretisation and systematic effects
 ([budget](howto/budget.md)). A constant without an interval was stated in the problem, or the column
-"note" gives the reason. The intervals were computed before the budget contained a gradient of the
-stiffness and the position of the edge of the grasp, which widen those of bodies by about a tenth.
+"note" gives the reason.
 
 **Licences** are those of the recordings ([licences](licences.md)). Measured data are not part of
 this repository unless their problem is in `collocation_sysid/datasets`.

@@ -269,18 +269,27 @@ def table_row(
     is_solved : bool
         Whether the problem is solved.
     """
-    problem = family.make(seed)
+    described: Problem | None = None
     causes: tuple[Hypothesis, ...] = ()
     refusal = ""
     try:
-        if fault is not None:
-            problem = fault(problem, np.random.default_rng(FAULT_SEED))
-        causes = checked_causes(problem)
+        correct = family.make(seed)
+        described = (
+            correct
+            if fault is None
+            else fault(correct, np.random.default_rng(FAULT_SEED))
+        )
+        causes = checked_causes(described)
     except (InputError, SimulationError) as error:
         refusal = f"refused: {error}"
-    report = (
-        solve_report(problem, family) if is_solved else SolveReport("", False)
-    )
+    report = SolveReport("", False)
+    if is_solved:
+        # A description that cannot be built is refused by a solve too.
+        report = (
+            SolveReport(refusal, False)
+            if described is None
+            else solve_report(described, family)
+        )
     return MistakeRow(
         name,
         refusal or causes_text(causes),
