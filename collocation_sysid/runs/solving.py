@@ -11,17 +11,14 @@ from ..common.array_types import Array
 from ..common.step_counting import search_activity
 from ..errors import InputError
 from ..features.registry import FEATURES
-from ..fem.laws.constants import usual_value, without_region
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
 from ..methods.initial_trajectories import associated_at_guess
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Method, Solution, Status, Watch
 from ..methods.stiffness_scan import Scan, rescue, start_problem
-from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..statistics.field_estimates import field_estimates_at
-from ..statistics.linearised import parameter_values
 from .check.cost import require_memory
 from .coarse_start import (
     CoarseStart,
@@ -33,6 +30,7 @@ from .coarse_start import (
     start_note,
     undetermined_names,
 )
+from .second_start import second_start
 from .several_starts import follow_starts
 from .thinned_start import (
     NoThinnedStartError,
@@ -73,11 +71,12 @@ def solve(
 
     There may be several searches, one after another: from the results of a scan, if guesses are
     missing or a search from guesses fails; a second one in reduced space, if the first converges
-    near ν = ½; with correspondences of measurements that the estimates change; with other
-    correlation lengths or phases of fields; and, of a large body, one on a coarser mesh first, see
-    `coarse_start`. `watch` receives the iterations of all of them, and one of them gives the
-    solution: its history and counts are of that search alone, and its times too, with those of the
-    search on a coarser mesh if it started from there. Nothing is written.
+    where a worse optimum is likely, see `second_start`; with correspondences of measurements that
+    the estimates change; with other correlation lengths or phases of fields; and, of a large body,
+    one on a coarser mesh first, see `coarse_start`. `watch` receives the iterations of all of them,
+    and one of them gives the solution: its history and counts are of that search alone, and its
+    times too, with those of the search on a coarser mesh if it started from there. Nothing is
+    written.
 
     Parameters
     ----------
@@ -614,8 +613,8 @@ def _solve_from_scan(
 def best_of_second_start(
     solver: Method, first: Solution, watch: Watch | None
 ) -> Solution:
-    """Return the better of a solution and of the solution from its `second_start_parameters`, with
-    a note if that is the second one.
+    """Return the better of a solution and of the solution from its `second_start`, with a note if
+    that is the second one.
 
     The second is better if it converges with a χ² that is lower by more than `LEAST_GAIN`, an
     absolute difference. If it is not, or there is no second start, `first` itself is returned; after
@@ -633,10 +632,12 @@ def best_of_second_start(
         Called with every iteration of the second search.
     """
     try:
-        other = second_start_parameters(first)
+        other = second_start(first)
         if other is None:
             return first
-        again = associated_at_guess(first.collocation.with_parameters(other))
+        again = associated_at_guess(
+            first.collocation.with_parameters(other.parameters)
+        )
         second = solve_with_renewed_correspondences(solver, again, watch=watch)
     except KeyboardInterrupt:
         return _as_interrupted(first)
@@ -645,10 +646,7 @@ def best_of_second_start(
         return replace(first, status=second.status, message=second.message)
     if not second.status.converged or gain <= LEAST_GAIN:
         return first
-    note = (
-        f"Poisson's ratio ended near one half; a second start, from the usual {USUAL_POISSON}, "
-        f"found a better fit (χ² lower by {gain:.3g})"
-    )
+    note = f"{other.reason} found a better fit (χ² lower by {gain:.3g})"
     return replace(second, notes=(note, *second.notes))
 
 
@@ -697,57 +695,3 @@ def solve_with_renewed_correspondences(
             collocation, watch, collocation.pack(moved, positions)
         )
     return solution
-
-
-# Poisson's ratio above which a second search starts from the usual one at the same Young's modulus:
-# linear elements lock towards ν = ½, so that with a smaller modulus and a ratio near one half a
-# body can move almost like a stiffer, compressible one. Smaller ratios do not lock.
-NEARLY_INCOMPRESSIBLE = 0.42
-# Poisson's ratio of that start.
-USUAL_POISSON = 0.3
-# Names of the constants that determine Young's modulus and Poisson's ratio, two of them at a time.
-LAME = ("young_pa", "poisson", "lambda_pa", "mu_pa")
-
-
-def second_start_parameters(solution: Solution) -> Parameters | None:
-    """Return the parameters at a solution, as guesses, with high Poisson's ratios replaced by the
-    usual one at the same Young's modulus.
-
-    A ratio is high above `NEARLY_INCOMPRESSIBLE`. Only ratios of regions count in which both
-    moduli, or the ratio alone, are estimated. Other estimated parameters have their estimates as
-    guesses. None if no ratio is high, or if a replaced value is not within its bounds.
-    """
-    collocation = solution.collocation
-    values = parameter_values(solution.collocation, solution.q)
-    free = {item.name: item for item in collocation.parameters.free}
-    changed: dict[str, float] = {}
-    for name, ratio in values.items():
-        if without_region(name) == "poisson" and ratio > NEARLY_INCOMPRESSIBLE:
-            region = name.removesuffix("poisson")
-            own = [region + each for each in LAME if region + each in free]
-            if len(own) == 2 or own == [name]:
-                young_pa = values[region + "young_pa"]
-                changed |= {
-                    each: _usual_modulus(each, young_pa) for each in own
-                }
-    if not changed or any(
-        not free[n].lower < v < free[n].upper for n, v in changed.items()
-    ):
-        return None
-    return collocation.parameters.with_estimates(
-        {name: values[name] for name in free} | changed
-    )
-
-
-def _usual_modulus(name: str, young_pa: float) -> float:
-    """Return the starting value of the constant `name`, one of the `LAME` constants with its
-    region: `USUAL_POISSON` for a Poisson's ratio, or the modulus [Pa] that follows from it and from
-    Young's modulus `young_pa`.
-    """
-    value = (
-        USUAL_POISSON
-        if without_region(name) == "poisson"
-        else usual_value(name, young_pa, poisson=USUAL_POISSON)
-    )
-    assert value is not None
-    return value

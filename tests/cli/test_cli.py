@@ -51,6 +51,7 @@ from collocation_sysid.result import run_record
 from collocation_sysid.result import solve_progress as progress_shown
 from collocation_sysid.result.solve_progress import Heartbeat
 from collocation_sysid.runs import forward_simulation, solving
+from collocation_sysid.runs.second_start import SecondStart
 
 RESULT_KEYS = {
     "schema": set(),
@@ -526,8 +527,8 @@ def test_an_interrupt_of_a_second_start_keeps_the_first_answer(
     monkeypatch.setattr(solving, "solve_with_renewed_correspondences", solved)
     monkeypatch.setattr(
         solving,
-        "second_start_parameters",
-        lambda first: first.collocation.parameters,
+        "second_start",
+        lambda first: SecondStart(first.collocation.parameters, "again"),
     )
     method = settings("solver.method=reduced-space")
     outcome = run_command("solve", "problem.toml", *method, "--out", "run")

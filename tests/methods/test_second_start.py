@@ -9,11 +9,13 @@ import pytest
 from kit.problems import hung_cube
 
 import collocation_sysid as cs
-from collocation_sysid.runs.solving import (
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.runs import solving
+from collocation_sysid.runs.second_start import (
     NEARLY_INCOMPRESSIBLE,
-    best_of_second_start,
-    second_start_parameters,
+    second_start,
 )
+from collocation_sysid.runs.solving import best_of_second_start
 
 KNOWN = {"gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
 TRUTH = {"young_pa": 600.0, "poisson": 0.46, **KNOWN}
@@ -33,16 +35,16 @@ def answer(*free: str) -> cs.Solution:
 def test_the_second_start_has_the_usual_ratio_and_the_same_stiffness():
     first = answer("young_pa", "poisson", "gamma_r_s")
     assert first.parameters["poisson"] > NEARLY_INCOMPRESSIBLE
-    start = second_start_parameters(first)
+    start = second_start(first)
     assert start is not None
-    guesses = {item.name: item.guess for item in start.free}
+    guesses = {item.name: item.guess for item in start.parameters.free}
     assert guesses["poisson"] == 0.3
     assert guesses["young_pa"] == pytest.approx(first.parameters["young_pa"])
     assert guesses["gamma_r_s"] == pytest.approx(first.parameters["gamma_r_s"])
 
 
 def test_a_ratio_that_is_known_gives_no_second_start():
-    assert second_start_parameters(answer("young_pa")) is None
+    assert second_start(answer("young_pa")) is None
 
 
 def test_the_better_of_two_answers_counts():
@@ -74,6 +76,71 @@ def test_a_second_start_keeps_a_parameter_at_its_bound():
     )
     assert first.parameters["gamma_m_1_s"] == pytest.approx(5.0)
     assert first.parameters["poisson"] > NEARLY_INCOMPRESSIBLE
-    start = second_start_parameters(first)
+    start = second_start(first)
     assert start is not None
-    assert start.guesses["gamma_m_1_s"] == pytest.approx(5.0)
+    assert start.parameters.guesses["gamma_m_1_s"] == pytest.approx(5.0)
+
+
+def rubber(material: str, largest_stretch: float) -> cs.Problem:
+    """Three tests of rubber up to a stretch, for a law of two terms without guesses."""
+    experiments = cs.datasets.kawabata_1981(
+        material,
+        tests=("uniaxial", "equibiaxial", "planar"),
+        largest_stretch=largest_stretch,
+    )
+    free = dict.fromkeys(
+        ("mu_1_pa", "alpha_1", "mu_2_pa", "alpha_2"), cs.Unknown()
+    )
+    fixed = {"kappa_pa": 1e9, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    return cs.Problem(experiments, {**free, **fixed})
+
+
+@pytest.mark.long
+def test_two_exponents_of_one_sign_are_compared_with_opposite_ones(
+    monkeypatch,
+):
+    problem = rubber("ogden-2", 2.5)
+    with monkeypatch.context() as patch:
+        patch.setattr(solving, "second_start", lambda _: None)
+        first = cs.solve(problem)
+    assert first.parameters["alpha_2"] > 0
+    start = second_start(first)
+    assert start is not None
+    before, after = (
+        each.guesses
+        for each in (first.collocation.parameters, start.parameters)
+    )
+    assert after["alpha_2"] == -2.0
+    assert after["mu_2_pa"] * after["alpha_2"] == pytest.approx(
+        before["mu_2_pa"] * before["alpha_2"]
+    )
+    assert after["mu_1_pa"] == pytest.approx(before["mu_1_pa"])
+    solution = cs.solve(problem)
+    assert solution.parameters["alpha_2"] < 0
+    assert solution.history[-1].loss < first.history[-1].loss - 10
+    assert any("a second start, from -2, found" in n for n in solution.notes)
+    assert second_start(solution) is None
+
+
+@pytest.mark.long
+def test_a_stated_negative_exponent_gives_no_second_start():
+    problem = rubber("ogden-2", 1.3)
+    negative = {
+        "mu_1_pa": cs.Unknown(5e5),
+        "alpha_1": cs.Unknown(1.5),
+        "mu_2_pa": cs.Unknown(-5e4),
+        "alpha_2": cs.Unknown(-1.5),
+    }
+    stated = replace(
+        problem,
+        parameters=Parameters.from_mapping(
+            {
+                **negative,
+                "kappa_pa": 1e9,
+                "gamma_r_s": 0.0,
+                "gamma_m_1_s": 0.0,
+            }
+        ),
+    )
+    solution = cs.solve(stated)
+    assert second_start(solution) is None
