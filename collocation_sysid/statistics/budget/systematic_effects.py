@@ -763,6 +763,23 @@ def _machine_of_specimen(
     return Effect(displacement_m=displacement_m)
 
 
+def _gauge_length(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of a gauge length of a homogeneous specimen that is longer than stated by a
+    share, per unit of that share: all prescribed strains are smaller by it; None for a body.
+    """
+    deformation = at.iterate.segment.experiment.specimen
+    if deformation is None:
+        return None
+    prescribed = at.iterate.equations.prescribed
+    displacement_m = np.zeros_like(prescribed.positions_m)
+    for node in deformation.displaced_nodes():
+        columns = np.searchsorted(prescribed.dofs, 3 * node + np.arange(3))
+        displacement_m[:, columns] = (
+            at.body.nodes_m[node] - prescribed.positions_m[:, columns]
+        )
+    return Effect(displacement_m=displacement_m)
+
+
 def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of friction on nodes that slide along platens, perpendicular to the loading
     axis, per unit of the coefficient; None for a dynamic experiment and without platens.
@@ -1116,6 +1133,16 @@ ASSUMPTIONS = (
         of_specimens=True,
     ),
     Assumption(
+        "gauge_length",
+        "1",
+        sigma=0.01,
+        description="relative error of the length to which the strains of a specimen refer",
+        remedy="measure the length between the marks or grips of the unloaded specimen, or the strain "
+        "with a calibrated extensometer",
+        effect=_gauge_length,
+        of_specimens=True,
+    ),
+    Assumption(
         "platen_friction",
         "",
         sigma=0.1,
@@ -1240,6 +1267,8 @@ class Assumptions:
         Distance by which the gripper holds more or less of the body than the grasped nodes [m].
     machine_compliance_m_n : float, "none" or table
         Compliance of the test bench [m/N].
+    gauge_length : float or "none"
+        Relative error of the length to which the strains of a specimen refer [1].
     platen_friction : float or "none"
         Coefficient of friction of platens between which nodes slide [1].
     platen_slip : float or "none"
@@ -1350,6 +1379,7 @@ class Assumptions:
     grip_layer_m: KnownDeviation = 0.0002
     grasp_edge_m: Deviation = 0.0005
     machine_compliance_m_n: KnownDeviation = 1e-06
+    gauge_length: Deviation = 0.01
     platen_friction: Deviation = 0.1
     platen_slip: Deviation = 1.0
     contact_stiffness: Deviation = 1.0
