@@ -261,16 +261,25 @@ def bench_tables(
         for t in (each.displacement, each.sensor)
         if t
     ]
-    time = (
+    usual_time = (
         OTHER_TIME
         if any(table.columns for table in declared_tables)
         else TIME.column
     )
+    # A time that one table names is also that of the other tables of the same file.
+    time_columns = {
+        table_name(section, table): table.columns[TIME.key]
+        for table in declared_tables
+        if TIME.key in table.columns
+    }
     tables: dict[str, BenchTable] = {}
     for declared, grasp in moved:
         if (layout := declared.displacement) is not None:
             name = table_name(section, layout)
-            table = tables.setdefault(name, BenchTable(grasp.poses.t_s, time))
+            time_column = time_columns.get(name, usual_time)
+            table = tables.setdefault(
+                name, BenchTable(grasp.poses.t_s, time_column)
+            )
             add_displacement(
                 table,
                 layout,
@@ -281,8 +290,8 @@ def bench_tables(
     for declared, grasp in moved:
         if (sensed := declared.sensor) is not None and grasp.has_sensor():
             at_s = grasp.list_load_times_s()
-            table = tables.setdefault(
-                table_name(section, sensed), BenchTable(at_s, time)
-            )
+            name = table_name(section, sensed)
+            time_column = time_columns.get(name, usual_time)
+            table = tables.setdefault(name, BenchTable(at_s, time_column))
             add_loads(table, sensed, at_s=at_s, loads=next(measured))
     return tables

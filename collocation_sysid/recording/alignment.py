@@ -179,6 +179,7 @@ def _cut_to_poses(
             f"poses run {spans}, markers {_span_text(t_s)}: they share {is_inside.sum()} marker "
             f"samples; expected at least {fewest}: check that both belong to the same recording "
             "and use the same clock, and check window_s"
+            + _clock_remedy(moving[0][0].t_s, t_s)
         )
     cut = t_s[is_inside]
     ends = [
@@ -354,6 +355,22 @@ def _rate_hz(t_s: Array) -> float:
     return (len(t_s) - 1) / float(t_s[-1] - t_s[0])
 
 
+def _clock_remedy(pose_times_s: Array, marker_times_s: Array) -> str:
+    """Return the end of a message on poses and markers without a common time: the difference of
+    their starts, for clocks with different zero points; "" if they overlap.
+    """
+    overlap_s = min(pose_times_s[-1], marker_times_s[-1]) - max(
+        pose_times_s[0], marker_times_s[0]
+    )
+    if overlap_s > 0:
+        return ""
+    later_s = pose_times_s[0] - marker_times_s[0]
+    return (
+        f"; if both begin at the same moment, their clocks differ by {abs(later_s):.12g} s: "
+        f"{'subtract this from' if later_s > 0 else 'add this to'} the times of the poses"
+    )
+
+
 def _span_text(t_s: Array) -> str:
     """First and last of times (T,) as text, "from 0 s to 1.5 s"."""
-    return f"from {t_s[0]:.9g} s to {t_s[-1]:.9g} s"
+    return f"from {t_s[0]:.12g} s to {t_s[-1]:.12g} s"

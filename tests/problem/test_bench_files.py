@@ -634,13 +634,26 @@ def test_a_simulated_bench_is_solved_by_its_own_problem(tmp_path, kind):
             "Time (s),displacement_m,F (N)",
         ),
         (
+            'sign = -1, columns = { displacement = "Weg 1 (mm)", t = "T (s)" }',
+            "sign = -1",
+            "T (s),Weg 1 (mm),Force (N)",
+            "T (s),Weg 1 (mm),force_n",
+        ),
+        (
             "sign = -1, scale = 0.5",
             "sign = -1, symmetry = 4",
             "Time (s),Displacement (mm),Force (N)",
             "t_s,displacement_m,force_n",
         ),
     ],
-    ids=["signs", "names", "strain and stress", "a name for one", "half"],
+    ids=[
+        "signs",
+        "names",
+        "strain and stress",
+        "a name for one",
+        "a time for one",
+        "half",
+    ],
 )
 def test_a_simulated_table_reads_back_as_what_was_simulated(
     tmp_path, displacement, wrench, measured, simulated

@@ -222,6 +222,21 @@ def test_equal_clocks_pass_unchanged():
     assert align([moving_poses(t)], moving_table(t)).notes == ()
 
 
+@pytest.mark.parametrize(
+    ("later_s", "remedy"),
+    [
+        (1.7e9, "clocks differ by 1700000000 s: subtract this from the times"),
+        (-40.0, "clocks differ by 40 s: add this to the times of the poses"),
+    ],
+)
+def test_clocks_without_a_common_time_are_named_with_their_difference(
+    later_s, remedy
+):
+    t = 0.01 * np.arange(20)
+    with pytest.raises(InputError, match=remedy):
+        align([moving_poses(t + later_s)], moving_table(t))
+
+
 def test_faster_poses_keep_their_samples_in_between():
     t = 0.02 * np.arange(10)
     found = align(
