@@ -33,6 +33,7 @@ from ..residuals.recording_scatter import (
     single_fits,
 )
 from .relaxed_assumptions import (
+    MEMORY,
     Kind,
     Probe,
     SolvedFit,
@@ -66,13 +67,16 @@ def routine_probes_with_steps(fit: SolvedFit) -> tuple[Probe, ...]:
 
     A linear step suffices to find that an assumption is wrong, but not for estimates that change by
     much of their value. That assumption therefore takes up to `STEPS` further steps, each with a
-    simulation.
+    simulation. Memory takes none: its estimates depend on the relaxation time, which is not
+    estimated, so that a branch has to be added to the material in any case.
     """
     probes = routine_probes(fit)
     alarming = [probe for probe in probes if is_alarming(probe)]
     if not alarming:
         return probes
     worst = max(alarming, key=lambda probe: probe.chi_squared)
+    if assumption_name(worst.name) == MEMORY:
+        return probes
     with_steps = replace(
         _iterate_probe(
             fit, worst, limit=significance_limit(fit.changes, worst.name)
