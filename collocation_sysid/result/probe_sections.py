@@ -239,7 +239,8 @@ def _conclusions(result: Result) -> Iterator[str]:
         ]:
             yield f"alternative explanations with similar effects: {listed(others)}"
     elif not significant:
-        tested = " or ".join(map(_size_and_ratio, _largest_probes(result)))
+        *others, last = map(_size_and_ratio, _largest_probes(result))
+        tested = f"{', '.join(others)} or {last}" if others else last
         nothing = "no subset of the data and no relaxed assumption changes the fit significantly"
         yield f"no significant {tested}" if is_routine(result) else nothing
     if not is_routine(result):

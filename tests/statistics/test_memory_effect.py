@@ -176,7 +176,7 @@ def test_a_recording_shows_times_between_its_sampling_and_its_duration(
 
 def test_memory_is_in_the_budget_only_where_it_is_stated():
     assert Assumptions().memory_share == "none"
-    assert source_label(NAME) == "memory share (τ=0.1s)"
+    assert source_label(NAME) == "memory share (τ = 0.1 s)"
 
 
 # Whole solves -------------------------------------------------------------------------------------

@@ -492,4 +492,4 @@ def source_label(source: str) -> str:
     )
     label = source.removesuffix(unit).replace("_", " ")
     name, _, time = label.partition(f" {RELAXATION_TIME}")
-    return f"{name} ({RELAXATION_TIME}{time})" if time else label
+    return f"{name} (τ = {time.removesuffix('s')} s)" if time else label
