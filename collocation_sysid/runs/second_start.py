@@ -24,7 +24,9 @@ USUAL_POISSON = 0.3
 # Names of the constants that determine Young's modulus and Poisson's ratio, two of them at a time.
 LAME = ("young_pa", "poisson", "lambda_pa", "mu_pa")
 # Factor and exponent of the second term, and the exponent of the third one.
-SECOND_FACTOR, SECOND_EXPONENT, THIRD_EXPONENT = "mu_2_pa", "alpha_2", "alpha_3"
+SECOND_FACTOR = "mu_2_pa"
+SECOND_EXPONENT = "alpha_2"
+THIRD_EXPONENT = "alpha_3"
 # Second exponent of the other start; rubber in tension and compression needs a negative one.
 NEGATIVE_EXPONENT = -2.0
 

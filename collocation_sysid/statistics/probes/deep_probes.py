@@ -66,17 +66,13 @@ def routine_probes_with_steps(fit: SolvedFit) -> tuple[Probe, ...]:
     of χ² is iterated.
 
     A linear step suffices to find that an assumption is wrong, but not for estimates that change by
-    much of their value. That assumption therefore takes up to `STEPS` further steps, each with a
-    simulation. Memory takes none: its estimates depend on the relaxation time, which is not
-    estimated, so that a branch has to be added to the material in any case.
+    much of their value. That assumption therefore takes further steps, see `_iterate_probe`.
     """
     probes = routine_probes(fit)
     alarming = [probe for probe in probes if is_alarming(probe)]
     if not alarming:
         return probes
     worst = max(alarming, key=lambda probe: probe.chi_squared)
-    if assumption_name(worst.name) == MEMORY:
-        return probes
     with_steps = replace(
         _iterate_probe(
             fit, worst, limit=significance_limit(fit.changes, worst.name)
@@ -236,7 +232,9 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
     """Return a significant probe after further steps, from where its first step leads.
 
     The steps end after `STEPS`, if no shared parameter changes by more than `SETTLED`, or if a
-    simulation fails. `sentences` has the name of the assumption if it is still significant.
+    simulation fails. Memory takes no further step: its effect is not linear in the share, and its
+    estimates depend on a relaxation time that is not estimated, so that a branch has to be added to
+    the material in any case. `sentences` has the name of the assumption if it is still significant.
 
     Parameters
     ----------
@@ -247,6 +245,9 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
     limit : float
         Least significant size, in its standard errors.
     """
+    if assumption_name(probe.name) == MEMORY:
+        complete_steps(StepUnit.ASSUMPTION)
+        return replace(probe, sentences=(probe.name,))
     first = len(at.fit.names)
     collocation = at.collocation
     accepted_names = assumption_name(probe.name), CORRELATION_KEY
