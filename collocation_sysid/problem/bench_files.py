@@ -273,15 +273,17 @@ def bench_tables(
         if TIME.key in table.columns
     }
     tables: dict[str, BenchTable] = {}
+
+    def table_of(layout: TableSection, t_s: Array) -> BenchTable:
+        """Return the table of the file of a layout; a new one has the times `t_s`."""
+        name = table_name(section, layout)
+        time_column = time_columns.get(name, usual_time)
+        return tables.setdefault(name, BenchTable(t_s, time_column))
+
     for declared, grasp in moved:
         if (layout := declared.displacement) is not None:
-            name = table_name(section, layout)
-            time_column = time_columns.get(name, usual_time)
-            table = tables.setdefault(
-                name, BenchTable(grasp.poses.t_s, time_column)
-            )
             add_displacement(
-                table,
+                table_of(layout, grasp.poses.t_s),
                 layout,
                 grasp=grasp,
                 rest_length_m=strain_length_m(layout, experiment.body),
@@ -290,8 +292,7 @@ def bench_tables(
     for declared, grasp in moved:
         if (sensed := declared.sensor) is not None and grasp.has_sensor():
             at_s = grasp.list_load_times_s()
-            name = table_name(section, sensed)
-            time_column = time_columns.get(name, usual_time)
-            table = tables.setdefault(name, BenchTable(at_s, time_column))
-            add_loads(table, sensed, at_s=at_s, loads=next(measured))
+            add_loads(
+                table_of(sensed, at_s), sensed, at_s=at_s, loads=next(measured)
+            )
     return tables

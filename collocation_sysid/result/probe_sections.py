@@ -238,11 +238,12 @@ def _conclusions(result: Result) -> Iterator[str]:
             f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]
         ]:
             yield f"alternative explanations with similar effects: {listed(others)}"
-    elif not significant:
+    elif not significant and is_routine(result):
         *others, last = map(_size_and_ratio, _largest_probes(result))
         tested = f"{', '.join(others)} or {last}" if others else last
-        nothing = "no subset of the data and no relaxed assumption changes the fit significantly"
-        yield f"no significant {tested}" if is_routine(result) else nothing
+        yield f"no significant {tested}"
+    elif not significant:
+        yield "no subset of the data and no relaxed assumption changes the fit significantly"
     if not is_routine(result):
         yield from _most_important_assumption(result)
 
@@ -263,12 +264,10 @@ def _most_important_assumption(result: Result) -> Iterator[str]:
     first parameter whose budget contains any, stiffnesses before other parameters.
     """
     significant = {
-        name.partition(" ")[0] for p in result.probes for name in p.sentences
+        assumption_name(name) for p in result.probes for name in p.sentences
     }
     undetermined = {
-        p.name.partition(" ")[0]
-        for p in result.probes
-        if p.kind == "assumption"
+        assumption_name(p.name) for p in result.probes if p.kind == "assumption"
     } - significant
     for name in (
         n for n in (*STIFFNESS_NAMES, *result.parameters) if n in result.budget

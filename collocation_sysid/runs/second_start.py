@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ..fem.laws.constants import usual_value, without_region
@@ -75,16 +76,13 @@ def _usual_poisson_start(solution: Solution) -> SecondStart | None:
                 changed |= {
                     each: _usual_modulus(each, young_pa) for each in own
                 }
-    if not changed or any(
-        not free[n].lower < v < free[n].upper for n, v in changed.items()
-    ):
+    if not changed:
         return None
-    start = collocation.parameters.with_estimates(
-        {name: values[name] for name in free} | changed
-    )
-    return SecondStart(
-        start,
-        "Poisson's ratio ended near one half; a second start, from the usual "
+    return _changed_start(
+        collocation.parameters,
+        values,
+        changed,
+        reason="Poisson's ratio ended near one half; a second start, from the usual "
         f"{USUAL_POISSON},",
     )
 
@@ -131,13 +129,26 @@ def _negative_exponent_start(solution: Solution) -> SecondStart | None:
             * guesses[SECOND_EXPONENT]
             / NEGATIVE_EXPONENT
         )
-    if any(not free[n].lower < v < free[n].upper for n, v in changed.items()):
-        return None
-    start = collocation.parameters.with_estimates(
-        {name: guesses[name] for name in free} | changed
-    )
-    return SecondStart(
-        start,
-        f"the exponent α₂ ended at {ended:.3g}; a second start, from "
+    return _changed_start(
+        collocation.parameters,
+        guesses,
+        changed,
+        reason=f"the exponent α₂ ended at {ended:.3g}; a second start, from "
         f"{NEGATIVE_EXPONENT:g},",
     )
+
+
+def _changed_start(
+    parameters: Parameters,
+    values: Mapping[str, float],
+    changed: Mapping[str, float],
+    reason: str,
+) -> SecondStart | None:
+    """Return the start from values of the estimated parameters, some of them changed, all by name;
+    None if a changed value is not within its bounds.
+    """
+    free = {item.name: item for item in parameters.free}
+    if any(not free[n].lower < v < free[n].upper for n, v in changed.items()):
+        return None
+    start = {name: values[name] for name in free} | dict(changed)
+    return SecondStart(parameters.with_estimates(start), reason)

@@ -9,7 +9,6 @@ import pytest
 from kit.problems import hung_cube
 
 import collocation_sysid as cs
-from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.runs import solving
 from collocation_sysid.runs.second_start import (
     NEARLY_INCOMPRESSIBLE,
@@ -81,10 +80,12 @@ def test_a_second_start_keeps_a_parameter_at_its_bound():
     assert start.parameters.guesses["gamma_m_1_s"] == pytest.approx(5.0)
 
 
-def rubber(material: str, largest_stretch: float) -> cs.Problem:
-    """Three tests of rubber up to a stretch, for a law of two terms without guesses."""
+def rubber(largest_stretch: float, **stated: cs.Unknown) -> cs.Problem:
+    """Three tests of rubber up to a stretch, for two terms of Ogden's law, without guesses but for
+    the stated parameters.
+    """
     experiments = cs.datasets.kawabata_1981(
-        material,
+        "ogden-2",
         tests=("uniaxial", "equibiaxial", "planar"),
         largest_stretch=largest_stretch,
     )
@@ -92,14 +93,14 @@ def rubber(material: str, largest_stretch: float) -> cs.Problem:
         ("mu_1_pa", "alpha_1", "mu_2_pa", "alpha_2"), cs.Unknown()
     )
     fixed = {"kappa_pa": 1e9, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
-    return cs.Problem(experiments, {**free, **fixed})
+    return cs.Problem(experiments, {**free, **stated, **fixed})
 
 
 @pytest.mark.long
 def test_two_exponents_of_one_sign_are_compared_with_opposite_ones(
     monkeypatch,
 ):
-    problem = rubber("ogden-2", 2.5)
+    problem = rubber(2.5)
     with monkeypatch.context() as patch:
         patch.setattr(solving, "second_start", lambda _: None)
         first = cs.solve(problem)
@@ -124,23 +125,12 @@ def test_two_exponents_of_one_sign_are_compared_with_opposite_ones(
 
 @pytest.mark.long
 def test_a_stated_negative_exponent_gives_no_second_start():
-    problem = rubber("ogden-2", 1.3)
-    negative = {
-        "mu_1_pa": cs.Unknown(5e5),
-        "alpha_1": cs.Unknown(1.5),
-        "mu_2_pa": cs.Unknown(-5e4),
-        "alpha_2": cs.Unknown(-1.5),
-    }
-    stated = replace(
-        problem,
-        parameters=Parameters.from_mapping(
-            {
-                **negative,
-                "kappa_pa": 1e9,
-                "gamma_r_s": 0.0,
-                "gamma_m_1_s": 0.0,
-            }
-        ),
+    stated = rubber(
+        1.3,
+        mu_1_pa=cs.Unknown(5e5),
+        alpha_1=cs.Unknown(1.5),
+        mu_2_pa=cs.Unknown(-5e4),
+        alpha_2=cs.Unknown(-1.5),
     )
     solution = cs.solve(stated)
     assert second_start(solution) is None

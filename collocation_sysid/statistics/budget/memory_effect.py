@@ -16,6 +16,7 @@ from ...common.array_types import Array
 from ...fem.body import Body
 from ...fem.laws.materials import Prony
 from ...model.dynamics import Dynamics
+from ...model.viscoelasticity import MemoryState
 
 # Relaxation times of the branches that are considered [s].
 RELAXATION_TIMES_S = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
@@ -66,42 +67,61 @@ def memory_forces_n(
     Each row of time is evaluated alone, so that the memory needed does not grow with the product of
     time steps and elements.
     """
-    tau_s = np.asarray(relaxation_times_s, dtype=float)[:, None]
-    remembering, theta = _with_unit_branch(body, dynamics.theta)
-    stresses = remembering.stresses
-    positions, _ = dynamics.all_evaluation_states(x)
-    intervals_s = dynamics.compute_intervals_to_next_s()
-    loaded_s = dynamics.loaded_since_s
-    forces = np.zeros((len(tau_s), *x.shape))
-    stress = stresses.stress(positions[:1], theta)
-    overstress = np.exp(-loaded_s / tau_s) * stress
-    forces[:, 0] = stresses.memory_force(
-        np.repeat(positions[:1], len(tau_s), axis=0), overstress, theta
+    count = len(relaxation_times_s)
+    forces_n = np.zeros((count, *x.shape))
+    if not count:
+        return forces_n
+    remembering, theta = _with_unit_branches(
+        body, dynamics.theta, relaxation_times_s=relaxation_times_s
     )
-    for row in range(1, len(x)):
-        ratio = intervals_s[row - 1] / tau_s
-        now = stresses.stress(positions[row : row + 1], theta)
-        overstress = np.exp(-ratio) * overstress - np.expm1(-ratio) / ratio * (
-            now - stress
-        )
-        forces[:, row] = stresses.memory_force(
-            np.repeat(positions[row : row + 1], len(tau_s), axis=0),
-            overstress,
+    positions, velocities = dynamics.all_evaluation_states(x)
+    intervals_s = dynamics.compute_intervals_to_next_s()
+    state = MemoryState.at_start(
+        remembering, positions[0], theta, loaded_s=dynamics.loaded_since_s
+    )
+    for row, position in enumerate(positions):
+        if row:
+            state = state.advance(
+                dynamics.forces,
+                position,
+                velocities[row],
+                interval_s=intervals_s[row - 1],
+            )
+        forces_n[:, row] = remembering.stresses.memory_force(
+            np.repeat(position[None], count, axis=0),
+            _overstress_by_time(state, count),
             theta,
         )
-        stress = now
-    return forces
+    return forces_n
 
 
-def _with_unit_branch(body: Body, theta: Array) -> tuple[Body, Array]:
-    """Return the body with one branch of memory in each part, and its constants, in which share and
-    relaxation time of the branches are one.
+def _with_unit_branches(
+    body: Body, theta: Array, relaxation_times_s: Sequence[float]
+) -> tuple[Body, Array]:
+    """Return the body with a branch of memory for each relaxation time in each part, and its
+    constants, in which the shares are one.
     """
-    parts = tuple(
-        replace(part, prony=(Prony("memory"),)) for part in body.parts
-    )
+    count = len(relaxation_times_s)
+    branches = tuple(Prony(f"memory_{k}") for k in range(count))
+    parts = tuple(replace(part, prony=branches) for part in body.parts)
     ends = [
         start + part.law_constant_count
         for start, part in zip(body.starts, body.parts, strict=False)
     ]
-    return body.with_parts(parts), np.insert(theta, np.repeat(ends, 2), 1.0)
+    constants = np.column_stack([np.ones(count), relaxation_times_s]).ravel()
+    return body.with_parts(parts), np.insert(
+        theta, np.repeat(ends, 2 * count), np.tile(constants, len(parts))
+    )
+
+
+def _overstress_by_time(state: MemoryState, count: int) -> Array:
+    """Return the overstress (count, width) [Pa] of all points for each relaxation time alone, of a
+    body of `_with_unit_branches` with this number of relaxation times.
+    """
+    memory = state.body.memory
+    overstress = np.zeros((count, memory.width))
+    for number, branch in enumerate(memory.branches):
+        overstress[number % count, branch.points] = state.overstress[
+            branch.columns
+        ]
+    return overstress

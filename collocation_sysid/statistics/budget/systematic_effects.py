@@ -289,12 +289,12 @@ class ExperimentAtAnswer:
         experiment = self.iterate.segment.experiment
         if not supports_memory(self.body, experiment.is_static):
             return {}
-        sampling_s = float(np.diff(experiment.t_s).min())
-        duration_s = float(np.ptp(experiment.t_s))
         distinguishable = [
             tau_s
             for tau_s in RELAXATION_TIMES_S
-            if is_distinguishable(tau_s, sampling_s, duration_s)
+            if is_distinguishable(
+                tau_s, experiment.timestep_s, experiment.duration_s
+            )
         ]
         forces_n = memory_forces_n(
             self.stress_free_body,

@@ -43,9 +43,10 @@ from .relaxed_assumptions import (
     with_relaxed_assumption,
 )
 from .routine_probes import (
-    WIDENING,
     is_alarming,
     is_routine_assumption,
+    one_step_probes,
+    prior_widening,
     routine_probes,
     significance_limit,
 )
@@ -91,7 +92,7 @@ def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
     are iterated, with simulations, which are reported to the counters of `counted_phase`.
     """
     parts = [*_window_probes(solved_fit), *_recording_probes(solved_fit)]
-    relaxed = [*_relaxed_probes(solved_fit)]
+    relaxed = [*one_step_probes(solved_fit, solved_fit.changes.names)]
     tests = sum(len(probe.moves) for probe in parts) + len(relaxed)
     limit = float(normal_isf(CHANCE / 2 / max(1, tests)))
     limits = {
@@ -215,19 +216,6 @@ def _with_significant_moves(probe: Probe, limit: float) -> Probe:
 # Freed assumptions --------------------------------------------------------------------------------
 
 
-def _relaxed_probes(at: SolvedFit) -> Iterator[Probe]:
-    """Yield a probe for each assumption that changes any residual, relaxed by one linear step."""
-    for name in dict.fromkeys(at.changes.names):
-        wide = with_relaxed_assumption(
-            at.fit, at.changes, name=name, widening=_widening(name)
-        )
-        if any(
-            block.jacobian[..., len(at.fit.names) :].any()
-            for block in wide.blocks
-        ):
-            yield relaxed_probe(at, name, wide=wide, p=at.read_parameters())
-
-
 def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
     """Return a significant probe after further steps, from where its first step leads.
 
@@ -256,7 +244,7 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
         for name, size in at.deviations.items()
     }
     wide = with_relaxed_assumption(
-        at.fit, at.changes, name=probe.name, widening=_widening(probe.name)
+        at.fit, at.changes, name=probe.name, widening=prior_widening(probe.name)
     )
     p = at.read_parameters()
     _, positions = collocation.unpack(at.z)
@@ -275,7 +263,7 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
             b.disturbances for b in at.fit.blocks
         )
         wide = with_relaxed_assumption(
-            there, changes, name=probe.name, widening=_widening(probe.name)
+            there, changes, name=probe.name, widening=prior_widening(probe.name)
         )
         probe = relaxed_probe(at, probe.name, wide=wide, p=p)
         steps += 1
@@ -286,10 +274,3 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
     return replace(
         probe, sentences=(probe.name,) if probe.is_beyond(limit) else ()
     )
-
-
-def _widening(name: str) -> float:
-    """Return the standard deviation of an assumption's prior, in deviations of the budget, for its
-    name with component: `WIDENING` for routine assumptions, else 1.
-    """
-    return WIDENING if is_routine_assumption(name) else 1.0

@@ -4,9 +4,9 @@ clocks of equal rate.
 A drift of the stiffness, a branch of viscoelastic memory with each of several relaxation times, and
 a rate of the cameras' clock join the linearised fit as one more column each, see
 `relaxed_assumptions`. The columns are computed together with those of the uncertainty budget, so
-that a probe costs one least-squares problem and no simulation. `deep_probes` (``solve --probe``) relaxes all
-other assumptions, refits parts of the data, and follows effects that are too large for one linear
-step.
+that a probe costs one least-squares problem and no simulation. `deep_probes` (``solve --probe``)
+relaxes all other assumptions, refits parts of the data, and follows effects that are too large for
+one linear step.
 
 A probe is *significant* if its amplitude is farther from zero than noise explains, and *relevant*
 if relaxing the assumption changes what is reported. Only what is both gives concern, see
@@ -17,7 +17,7 @@ any change is large.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from ...recording.nuisance import CLOCK_RATE
@@ -86,25 +86,48 @@ def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
     tuple of Probe
         Probes with `routine` set; `sentences` is empty where the amplitude is not significant.
     """
-    probes = []
-    names = dict.fromkeys(
-        name for name in solved_fit.changes.names if is_routine_assumption(name)
+    names = filter(is_routine_assumption, solved_fit.changes.names)
+    return tuple(
+        replace(
+            probe,
+            routine=True,
+            sentences=(probe.name,)
+            if probe.is_beyond(
+                significance_limit(solved_fit.changes, probe.name)
+            )
+            else (),
+        )
+        for probe in one_step_probes(solved_fit, names)
     )
-    for name in names:
+
+
+def one_step_probes(
+    solved_fit: SolvedFit, names: Iterable[str]
+) -> Iterator[Probe]:
+    """Yield a probe for each of the named assumptions, with components, that changes any residual,
+    relaxed by one linear step; a name that occurs several times has one probe.
+    """
+    for name in dict.fromkeys(names):
         wide = with_relaxed_assumption(
-            solved_fit.fit, solved_fit.changes, name=name, widening=WIDENING
+            solved_fit.fit,
+            solved_fit.changes,
+            name=name,
+            widening=prior_widening(name),
         )
         if any(
             block.jacobian[..., len(solved_fit.fit.names) :].any()
             for block in wide.blocks
         ):
-            probe = relaxed_probe(
+            yield relaxed_probe(
                 solved_fit, name, wide=wide, p=solved_fit.read_parameters()
             )
-            limit = significance_limit(solved_fit.changes, name)
-            significant = (name,) if probe.is_beyond(limit) else ()
-            probes.append(replace(probe, routine=True, sentences=significant))
-    return tuple(probes)
+
+
+def prior_widening(name: str) -> float:
+    """Return the standard deviation of an assumption's prior, in deviations of the budget, for its
+    name with component: `WIDENING` for routine assumptions, else 1.
+    """
+    return WIDENING if is_routine_assumption(name) else 1.0
 
 
 def is_routine_assumption(name: str) -> bool:
@@ -119,8 +142,8 @@ def significance_limit(changes: ResidualChanges, name: str) -> float:
 
     The probability of a false alarm is divided equally among the routine assumptions, and that of
     an assumption among its amplitudes (Bonferroni): a drift has one, memory one for each relaxation
-    time, and the clock rate one for each recording. The amplitudes of memory are correlated, so that
-    the bound is conservative.
+    time of the table, also for those that the recording cannot show, and the clock rate one for each
+    recording. The amplitudes of memory are correlated, so that the bound is conservative.
 
     Parameters
     ----------
